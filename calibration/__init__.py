@@ -1,0 +1,1 @@
+"""Calibration: from whiteboard and dark frames to the imaging matrix and its uncertainty."""

@@ -1,0 +1,1 @@
+"""Device drivers: transport, codec and device of each protocol, with no other package of the project."""

@@ -1,0 +1,1 @@
+"""The camera model: light fields, masks, cameras, the imaging matrix and the sensor noise."""

@@ -1,0 +1,1 @@
+"""Reconstruction: from frames and the imaging matrix to the light field."""
