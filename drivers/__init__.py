@@ -1,1 +1,1 @@
-"""Device drivers: transport, codec and device of each protocol, with no other package of the project."""
+"""Device drivers: transport, codec and device of each protocol; they import no other package."""

@@ -1,0 +1,170 @@
+"""RAW files: from a camera's bytes to the sensor's mosaic, with what is needed to read it."""
+
+import hashlib
+import io
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rawpy
+import tifffile
+
+from drivers.errors import RawFrameError
+
+Array = np.ndarray
+
+TIFF_MAGICS = (b"II*\x00", b"MM\x00*")
+EXPOSURE_TIME_TAG = 33434
+EXIF_TAG = 34665
+IMAGE_DESCRIPTION_TAG = 270
+SUB_IFDS_TAG = 330
+CFA_TILE_PREFIX = "cfa_tile="
+"""An ImageDescription that begins so names a colour tile that LibRaw's 2x2 phase cannot tell."""
+
+_DAMAGED_TIFF = (
+    tifffile.TiffFileError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    AttributeError,
+    MemoryError,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RawFrame:
+    """One frame as the sensor gave it.
+
+    `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
+    `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
+    `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
+    `exposure_s`: None where the file does not say.
+    `original`: the camera's own bytes, `sha256` their digest in hexadecimal.
+    """
+
+    mosaic: Array
+    black_level_dn: Array
+    white_level_dn: int
+    cfa: str
+    exposure_s: float | None
+    original: bytes
+    sha256: str
+
+
+def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
+    """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
+
+    Raises `RawFrameError` for bytes that are no RAW file, a TIFF-based file (DNG, NEF, CR2, ...)
+    that is torn, or a mosaic whose `(y, x)` is not `expected_shape`. A torn uncompressed DNG
+    decodes without complaint, so the file's own table of contents is checked first. A flipped bit
+    cannot be told from light: keep `sha256`.
+    """
+    if not data:
+        raise RawFrameError("it is empty")
+    exposure_s, tile = _read_tiff(data) if data[:4] in TIFF_MAGICS else (None, None)
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            mosaic = raw.raw_image_visible.copy()
+            black_level_dn, cfa = _read_levels_and_phase(raw)
+            white_level_dn = int(raw.white_level)
+    except rawpy.LibRawError as error:
+        raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
+    if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
+        raise RawFrameError("it holds colour or floating-point pixels, not one mosaic of 16 bits")
+    if expected_shape is not None and mosaic.shape != tuple(expected_shape):
+        raise RawFrameError(
+            f"it has {_size(mosaic.shape)} pixels (y x) instead of {_size(expected_shape)}"
+        )
+    mosaic.flags.writeable = False
+    black_level_dn.flags.writeable = False
+    return RawFrame(
+        mosaic=mosaic,
+        black_level_dn=black_level_dn,
+        white_level_dn=white_level_dn,
+        cfa=tile or cfa,
+        exposure_s=exposure_s,
+        original=data,
+        sha256=hashlib.sha256(data).hexdigest(),
+    )
+
+
+def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
+    """Return the black levels `(2, 2)` in mosaic order, and the CFA phase.
+
+    LibRaw lists black levels by colour, the second green last; the colour of a pixel leads back
+    to its place.
+    """
+    by_colour = np.asarray(raw.black_level_per_channel, dtype=np.float64)
+    if raw.num_colors == 1:
+        return np.full((2, 2), by_colour[0]), "mono"
+    sizes = raw.sizes
+    colours = [
+        [raw.raw_color(sizes.top_margin + row, sizes.left_margin + column) for column in (0, 1)]
+        for row in (0, 1)
+    ]
+    if raw.raw_pattern is not None and raw.raw_pattern.shape == (6, 6):
+        return by_colour[np.array(colours)], "xtrans"
+    letters = raw.color_desc.decode("ascii").lower()
+    return by_colour[np.array(colours)], "".join(letters[c] for pair in colours for c in pair)
+
+
+def _read_tiff(data: bytes) -> tuple[float | None, str | None]:
+    """Return exposure and tile name, having checked that every strip lies inside the file."""
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            pages = list(tiff.pages)
+            for page in pages:
+                pages.extend(page.pages or ())
+            missing = max(_bytes_missing(page, len(data)) for page in pages)
+            tags = tiff.pages.first.tags
+            exposure_s = _exposure_s(tags)
+            description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
+    except _DAMAGED_TIFF as error:
+        raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
+    if missing > 0:
+        raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
+    tile = description.removeprefix(CFA_TILE_PREFIX)
+    return exposure_s, tile if tile != description else None
+
+
+def _bytes_missing(page: Any, file_size: int) -> int:
+    """Return how many bytes of the page's pixels cannot be in a file of that size.
+
+    Either its strips end beyond the file, or they are too short for an uncompressed image.
+    """
+    beyond = [
+        offset + count - file_size
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+    ]
+    short = 0
+    if page.compression == tifffile.COMPRESSION.NONE:
+        pixels = page.imagewidth * page.imagelength * page.samplesperpixel
+        short = (pixels * page.bitspersample + 7) // 8 - sum(page.databytecounts)
+    return max([short, *beyond])
+
+
+def _exposure_s(tags: Any) -> float | None:
+    """Return the exposure time from the first directory or from its EXIF directory."""
+    exif = tags.valueof(EXIF_TAG)
+    rational = tags.valueof(EXPOSURE_TIME_TAG)
+    if rational is None and isinstance(exif, dict):
+        rational = exif.get("ExposureTime")
+    if rational is None:
+        return None
+    numerator, denominator = rational
+    return numerator / denominator
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(str(n) for n in shape)
+
+
+def _text(error: Exception) -> str:
+    """Return an error's message on one line; LibRaw's come as bytes."""
+    message = error.args[0] if error.args else type(error).__name__
+    if isinstance(message, bytes):
+        message = message.decode("utf-8", "replace")
+    return str(message).splitlines()[0] if str(message) else type(error).__name__

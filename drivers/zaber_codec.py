@@ -1,0 +1,141 @@
+"""Zaber ASCII wire format: pure functions between values and bytes.
+
+Source: Zaber ASCII Protocol Manual, "Message Format" (commands `/`, replies `@`, alerts `!`,
+information `#`) and "Message Checksums".
+"""
+
+import re
+from dataclasses import dataclass
+
+from drivers.errors import GarbledReplyError
+
+TERMINATOR = b"\n"
+MESSAGE_IDS = range(1, 100)
+SPEED_SCALE = 1.6384
+"""Speed settings count microsteps per second times this."""
+
+NO_FLAG = "--"
+FLAG_MEANINGS = {
+    "FF": "critical system error",
+    "FE": "limit error",
+    "FH": "emergency stop",
+    "FS": "stalled and stopped",
+    "WR": "no reference position",
+    "WH": "not homed",
+    "NI": "movement interrupted",
+}
+
+_LINE = re.compile(rb"([@!#])([^\r\n]*?)(?::([0-9A-Fa-f]{2}))?\r?\n")
+_REPLY = re.compile(r"(\d{2}) (\d) (?:(\d{2}) )?(OK|RJ) (BUSY|IDLE) (\S{2}) (.*)")
+_ALERT = re.compile(r"(\d{2}) (\d) (BUSY|IDLE) (\S{2})(?: (.*))?")
+_INFO = re.compile(r"(\d{2}) (\d) (?:(\d{2}) )?(.*)")
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An answer to a command; `flag` is the most severe warning flag, or "--"."""
+
+    device: int
+    axis: int
+    message_id: int | None
+    accepted: bool
+    busy: bool
+    flag: str
+    data: str
+
+
+@dataclass(frozen=True)
+class Alert:
+    """A message that a device sent by itself, such as the end of a move."""
+
+    device: int
+    axis: int
+    busy: bool
+    flag: str
+    data: str
+
+
+@dataclass(frozen=True)
+class Info:
+    """A line of text that accompanies a reply."""
+
+    device: int
+    axis: int
+    message_id: int | None
+    data: str
+
+
+def lrc(body: bytes) -> int:
+    """Return the checksum of `body`: the two's complement of the sum of its bytes, 0 to 255."""
+    return -sum(body) & 0xFF
+
+
+def encode_command(device: int, axis: int, message_id: int, data: str = "") -> bytes:
+    """Return the command's bytes, checksum and line end included; no data polls the status.
+
+    Raises `ValueError` for a number that the format cannot carry, or data that would break it.
+    """
+    if not 0 <= device <= 99:
+        raise ValueError(f"device address {device} is not within 0 to 99")
+    if not 0 <= axis <= 9:
+        raise ValueError(f"axis number {axis} is not within 0 to 9")
+    if message_id not in MESSAGE_IDS:
+        raise ValueError(f"message id {message_id} is not within 1 to 99")
+    if not (data.isascii() and data.isprintable()) or ":" in data or "/" in data:
+        raise ValueError(f"command {data!r} is not plain printable text without ':' and '/'")
+    body = f"{device} {axis} {message_id:02d} {data}".rstrip().encode("ascii")
+    return b"/%b:%02X\n" % (body, lrc(body))
+
+
+def decode_message(line: bytes, checksum_required: bool = False) -> Reply | Alert | Info:
+    """Return the message in one line, its line end included.
+
+    A checksum that is there must be right; one that is missing is an error only when
+    `checksum_required`. Raises `GarbledReplyError`.
+    """
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise GarbledReplyError(line, "not a Zaber message")
+    kind, body, checksum = match.groups()
+    if checksum is None and checksum_required:
+        raise GarbledReplyError(line, "the checksum is missing")
+    if checksum is not None and int(checksum, 16) != lrc(body):
+        raise GarbledReplyError(line, "the checksum is wrong")
+    if not body.isascii():
+        raise GarbledReplyError(line, "not plain text")
+    return _DECODERS[kind](line, body.decode("ascii"))
+
+
+def _decode_reply(line: bytes, body: str) -> Reply:
+    match = _REPLY.fullmatch(body)
+    if match is None:
+        raise GarbledReplyError(line, "not a reply")
+    device, axis, message_id, outcome, status, flag, data = match.groups()
+    return Reply(
+        device=int(device),
+        axis=int(axis),
+        message_id=None if message_id is None else int(message_id),
+        accepted=outcome == "OK",
+        busy=status == "BUSY",
+        flag=flag,
+        data=data,
+    )
+
+
+def _decode_alert(line: bytes, body: str) -> Alert:
+    match = _ALERT.fullmatch(body)
+    if match is None:
+        raise GarbledReplyError(line, "not an alert")
+    device, axis, status, flag, data = match.groups()
+    return Alert(int(device), int(axis), status == "BUSY", flag, data or "")
+
+
+def _decode_info(line: bytes, body: str) -> Info:
+    match = _INFO.fullmatch(body)
+    if match is None:
+        raise GarbledReplyError(line, "not an information line")
+    device, axis, message_id, data = match.groups()
+    return Info(int(device), int(axis), None if message_id is None else int(message_id), data)
+
+
+_DECODERS = {b"@": _decode_reply, b"!": _decode_alert, b"#": _decode_info}

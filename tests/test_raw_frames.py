@@ -1,0 +1,200 @@
+"""RAW files: what the sensor read comes back exactly, and what is damaged is not believed."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from drivers.camera import Camera, RawFileCamera
+from drivers.errors import RawFrameError
+from drivers.raw import decode_raw
+from simulators.camera import SimulatedRawCamera
+from simulators.clock import ManualClock
+from simulators.dng import encode_dng
+
+BAYER = ("rggb", "grbg", "gbrg", "bggr")
+BLACK_DN = np.array([[60, 61], [62, 63]])
+
+
+def noise(shape=(40, 48), white_level_dn=4095, seed=0):
+    generator = np.random.default_rng(seed)
+    return generator.integers(0, white_level_dn, shape, dtype=np.uint16, endpoint=True)
+
+
+@pytest.mark.parametrize("cfa", [*BAYER, "mono"])
+@pytest.mark.parametrize("white_level_dn", [255, 4095, 16383, 65535])
+@pytest.mark.parametrize("shape", [(22, 22), (40, 48), (41, 33)])
+def test_a_mosaic_comes_back_exactly(cfa, white_level_dn, shape):
+    mosaic = noise(shape, white_level_dn)
+    frame = decode_raw(encode_dng(mosaic, cfa, 0, white_level_dn, 0.01))
+    np.testing.assert_array_equal(frame.mosaic, mosaic)
+    assert frame.mosaic.dtype == np.uint16
+    assert (frame.cfa, frame.white_level_dn) == (cfa, white_level_dn)
+
+
+@pytest.mark.parametrize("cfa", BAYER)
+def test_each_cfa_position_keeps_its_own_black_level(cfa):
+    frame = decode_raw(encode_dng(noise(), cfa, BLACK_DN, 4095, 0.01))
+    np.testing.assert_array_equal(frame.black_level_dn, BLACK_DN)
+
+
+def test_a_monochrome_sensor_has_one_black_level():
+    frame = decode_raw(encode_dng(noise(), "mono", 64, 4095, 0.01))
+    np.testing.assert_array_equal(frame.black_level_dn, np.full((2, 2), 64))
+    with pytest.raises(ValueError, match="one black level"):
+        encode_dng(noise(), "mono", BLACK_DN, 4095, 0.01)
+
+
+@pytest.mark.parametrize("tile", ["quad_bayer", "xtrans", "rgbw"])
+def test_a_tile_that_is_not_bayer_keeps_its_pixels_levels_and_name(tile):
+    mosaic = noise()
+    frame = decode_raw(encode_dng(mosaic, tile, BLACK_DN, 4095, 0.01))
+    np.testing.assert_array_equal(frame.mosaic, mosaic)
+    np.testing.assert_array_equal(frame.black_level_dn, BLACK_DN)
+    assert frame.cfa == tile
+
+
+@pytest.mark.parametrize("exposure_s", [1 / 8000, 0.0123, 1.0, 30.0])
+def test_the_exposure_is_read_back_to_the_microsecond(exposure_s):
+    frame = decode_raw(encode_dng(noise(), "rggb", 64, 4095, exposure_s))
+    assert frame.exposure_s == pytest.approx(exposure_s, abs=1e-6)
+
+
+def test_a_frame_keeps_the_original_bytes_and_their_digest():
+    data = encode_dng(noise(), "rggb", 64, 4095, 0.01)
+    frame = decode_raw(data)
+    assert frame.original == data
+    assert frame.sha256 == hashlib.sha256(data).hexdigest()
+
+
+def test_a_frame_cannot_be_changed_by_accident():
+    frame = decode_raw(encode_dng(noise(), "rggb", 64, 4095, 0.01))
+    with pytest.raises(ValueError, match="read-only"):
+        frame.mosaic[0, 0] = 1
+
+
+def test_the_same_mosaic_makes_the_same_file():
+    assert encode_dng(noise(), "rggb", 64, 4095, 0.01) == encode_dng(
+        noise(), "rggb", 64, 4095, 0.01
+    )
+
+
+@pytest.mark.parametrize("cfa", ["rggb", "mono"])
+@pytest.mark.parametrize("kept", [0, 3, 8, 100, 500, 0.5, 0.999])
+def test_a_torn_file_is_refused_wherever_it_tore(cfa, kept):
+    data = encode_dng(noise(), cfa, 64, 4095, 0.01)
+    size = kept if isinstance(kept, int) else int(kept * len(data))
+    assert_refused(data[:size])
+
+
+def test_a_file_with_one_byte_missing_in_the_middle_is_refused():
+    data = encode_dng(noise(), "rggb", 64, 4095, 0.01)
+    assert_refused(data[:2000] + data[2001:])
+
+
+@pytest.mark.parametrize("data", [b"GIF89a" + bytes(1000), b"II*\x00" + bytes(1000), b"hello"])
+def test_bytes_that_are_no_raw_file_are_refused(data):
+    assert_refused(data)
+
+
+def test_damage_to_the_header_is_refused_in_one_line_or_leaves_the_size_alone():
+    data = encode_dng(noise(), "rggb", 64, 4095, 0.01)
+    generator = np.random.default_rng(1)
+    messages = []
+    for position in generator.integers(0, len(data) - noise().nbytes, 150):
+        damaged = bytearray(data)
+        damaged[position] ^= int(generator.integers(1, 256))
+        try:
+            assert decode_raw(bytes(damaged), (40, 48)).mosaic.shape == (40, 48)
+        except RawFrameError as error:
+            messages.append(str(error))
+    assert messages
+    assert not any("\n" in message for message in messages)
+
+
+def test_a_frame_of_the_wrong_size_is_refused_with_both_sizes():
+    data = encode_dng(noise((40, 48)), "rggb", 64, 4095, 0.01)
+    with pytest.raises(RawFrameError, match=r"40x48 pixels .y x. instead of 48x40"):
+        decode_raw(data, (48, 40))
+
+
+@pytest.mark.parametrize(
+    ("mosaic", "arguments", "complaint"),
+    [
+        (np.zeros((21, 40), np.uint16), {}, "too small for LibRaw"),
+        (np.zeros((40, 40), np.float32), {}, "uint16"),
+        (np.zeros((40, 40, 3), np.uint16), {}, "uint16"),
+        (np.zeros((40, 40), np.uint16), {"black_level_dn": 63.5}, "whole numbers"),
+        (np.zeros((40, 40), np.uint16), {"exposure_s": 0.0}, "not positive"),
+        (np.zeros((40, 40), np.uint16), {"cfa": ""}, "plain text"),
+    ],
+)
+def test_what_a_dng_cannot_hold_is_refused(mosaic, arguments, complaint):
+    options = {"cfa": "rggb", "black_level_dn": 64, "white_level_dn": 4095, "exposure_s": 0.01}
+    with pytest.raises(ValueError, match=complaint):
+        encode_dng(mosaic, **(options | arguments))
+
+
+def test_a_camera_exposes_for_the_time_it_was_told():
+    clock = ManualClock()
+    asked_s = []
+
+    def render(exposure_s):
+        asked_s.append((exposure_s, clock.now_s()))
+        return noise()
+
+    source = SimulatedRawCamera(render, clock)
+    camera: Camera = RawFileCamera(source, (40, 48), "rggb", exposure_s=0.5)
+    camera.snap()
+    camera.set_exposure_s(0.25)
+    frame = camera.snap()
+    assert asked_s == [(0.5, 0.5), (0.25, 0.75)]
+    assert frame.exposure_s == camera.exposure_s == 0.25
+    np.testing.assert_array_equal(frame.mosaic, noise())
+    np.testing.assert_array_equal(frame.black_level_dn, np.full((2, 2), 64))
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"), [("torn_raw", "torn"), ("wrong_size", "38x48 pixels .y x. instead")]
+)
+def test_a_faulty_frame_is_refused_and_the_next_is_good(fault, reason):
+    source = SimulatedRawCamera(lambda exposure_s: noise(), ManualClock())
+    camera = RawFileCamera(source, (40, 48), "rggb")
+    source.faults.inject(fault)
+    with pytest.raises(RawFrameError, match=reason):
+        camera.snap()
+    np.testing.assert_array_equal(camera.snap().mosaic, noise())
+
+
+def test_a_camera_that_is_not_the_one_described_is_refused():
+    source = SimulatedRawCamera(lambda exposure_s: noise(), ManualClock(), cfa="grbg")
+    with pytest.raises(RawFrameError, match="grbg instead of rggb"):
+        RawFileCamera(source, (40, 48), "rggb").snap()
+
+
+def test_a_camera_that_ignores_the_exposure_is_noticed():
+    class Stuck:
+        def capture(self, exposure_s):
+            return encode_dng(noise(), "rggb", 64, 4095, 0.5)
+
+    with pytest.raises(RawFrameError, match=r"exposed for 0\.5 s instead of 0\.01 s"):
+        RawFileCamera(Stuck(), (40, 48), "rggb", exposure_s=0.01).snap()
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan")])
+def test_an_exposure_that_is_not_positive_is_refused(exposure_s):
+    source = SimulatedRawCamera(lambda exposure_s: noise(), ManualClock())
+    with pytest.raises(ValueError, match="not positive"):
+        RawFileCamera(source, (40, 48), "rggb").set_exposure_s(exposure_s)
+
+
+def test_an_unknown_fault_is_named_with_the_known_ones():
+    source = SimulatedRawCamera(lambda exposure_s: noise(), ManualClock())
+    with pytest.raises(ValueError, match="use one of torn_raw, wrong_size"):
+        source.faults.inject("torn")
+
+
+def assert_refused(data):
+    with pytest.raises(RawFrameError) as caught:
+        decode_raw(data)
+    assert "\n" not in str(caught.value)

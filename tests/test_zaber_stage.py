@@ -1,0 +1,495 @@
+"""The Zaber stage against simulated firmware: the same behaviours in memory and over a pty."""
+
+import errno
+from contextlib import ExitStack
+from dataclasses import replace
+
+import pytest
+import serial
+
+from drivers.errors import (
+    CommandRefusedError,
+    DriverError,
+    GarbledReplyError,
+    LimitExceededError,
+    MoveTimeoutError,
+    NotHomedError,
+    PortBusyError,
+    PortGoneError,
+    PortNotFoundError,
+    PositionMismatchError,
+    StalledError,
+    TransportTimeoutError,
+    UnknownAxisError,
+)
+from drivers.stage import (
+    DEFAULT_SETTINGS,
+    Stage,
+    StageSettings,
+    move_time_limit_s,
+    needs_approach,
+)
+from drivers.transport import SerialTransport, Transport
+from drivers.zaber import ZaberStage
+from simulators.clock import ManualClock
+from simulators.wire import MemoryTransport, PtyServer
+from simulators.zaber import BENCH_AXES, AxisSpec, Motion, ZaberChain
+
+AXES = {"mask_x": (1, 1), "mask_y": (1, 2), "aperture_x": (2, 1), "aperture_y": (2, 2)}
+SPEC = AxisSpec()
+MICROSTEP_UM = SPEC.microstep_um
+TIMEOUT_S = 0.15
+
+
+class Bench:
+    """A simulated chain, the wire to it, and what the wire carried."""
+
+    def __init__(self, chain: ZaberChain, clock: ManualClock, transport: Transport):
+        self.chain = chain
+        self.clock = clock
+        self.transport = transport
+        self.sent = []
+        self._feed = chain.feed
+        chain.feed = self._record
+
+    def _record(self, data):
+        self.sent += data.decode("ascii").splitlines()
+        return self._feed(data)
+
+    def stage(self, settings=DEFAULT_SETTINGS, **arguments) -> Stage:
+        options = {"axes": AXES, "microstep_um": MICROSTEP_UM, "clock": self.clock} | arguments
+        return ZaberStage(self.transport, settings=settings, **options)
+
+    def moves_sent(self):
+        return [line for line in self.sent if " move " in line]
+
+    def stops_sent(self):
+        return [line for line in self.sent if " stop" in line]
+
+
+@pytest.fixture(params=["memory", "pty"])
+def make_bench(request):
+    """Return a function from axes to a bench, on either kind of wire."""
+
+    def make(axes=BENCH_AXES):
+        clock = ManualClock()
+        chain = ZaberChain(clock, axes)
+        if request.param == "memory":
+            transport = chain.transport(TIMEOUT_S)
+        else:
+            server = opened.enter_context(PtyServer(chain))
+            transport = SerialTransport(server.port, timeout_s=TIMEOUT_S)
+        opened.callback(transport.close)
+        return Bench(chain, clock, transport)
+
+    with ExitStack() as opened:
+        yield make
+
+
+@pytest.fixture
+def bench(make_bench):
+    return make_bench()
+
+
+@pytest.fixture
+def stage(bench):
+    homed = bench.stage()
+    homed.home()
+    bench.sent.clear()
+    return homed
+
+
+def test_an_axis_that_was_not_homed_refuses_absolute_and_relative_moves(bench):
+    stage = bench.stage()
+    assert not stage.is_homed("mask_x")
+    with pytest.raises(NotHomedError, match="home it first"):
+        stage.move_to_um({"mask_x": 1000.0})
+    with pytest.raises(NotHomedError):
+        stage.move_by_um({"mask_x": 10.0})
+    assert bench.moves_sent() == []
+
+
+def test_homing_gives_every_axis_its_reference(bench):
+    stage = bench.stage()
+    stage.home()
+    assert all(stage.is_homed(axis) for axis in stage.axes)
+    assert [stage.position_um(axis) for axis in stage.axes] == [0.0] * 4
+
+
+def test_homing_one_axis_leaves_the_others_where_they_are(bench):
+    stage = bench.stage()
+    stage.home(["mask_y"])
+    assert stage.is_homed("mask_y")
+    assert not stage.is_homed("mask_x")
+    assert bench.chain.position_um(1, 1) == SPEC.start_um
+
+
+def test_axes_move_together_and_stand_where_they_read_to_be(stage, bench):
+    targets_um = {"mask_x": 1234.5, "mask_y": 20.0, "aperture_x": 9000.0, "aperture_y": 640.25}
+    read_um = stage.move_to_um(targets_um)
+    for axis, target_um in targets_um.items():
+        assert read_um[axis] == pytest.approx(target_um, abs=MICROSTEP_UM / 2)
+        real_um = bench.chain.position_um(*AXES[axis])
+        assert real_um == pytest.approx(target_um, abs=MICROSTEP_UM / 2)
+
+
+def test_axes_that_move_together_take_as_long_as_the_longest(stage, bench):
+    start_s = bench.clock.now_s()
+    stage.move_to_um({"mask_x": 7000.0, "mask_y": 7000.0, "aperture_x": 7000.0})
+    ideal_s = 7000.0 / SPEC.max_speed_um_s + SPEC.max_speed_um_s / SPEC.acceleration_um_s2
+    settings = DEFAULT_SETTINGS
+    assert ideal_s <= bench.clock.now_s() - start_s <= ideal_s + 2 * settings.poll_s + 0.05
+
+
+@pytest.mark.parametrize("start_um", [50.0, 4000.0, 995.0, 1000.0, 1005.0])
+def test_approach_from_below_takes_up_the_backlash_wherever_a_move_starts(stage, bench, start_um):
+    stage.move_to_um({"mask_x": start_um})
+    stage.move_to_um({"mask_x": 1000.0})
+    assert bench.chain.position_um(1, 1) == pytest.approx(1000.0, abs=MICROSTEP_UM / 2)
+
+
+def test_without_the_approach_a_downward_move_is_off_by_the_backlash(bench):
+    stage = bench.stage(StageSettings(approach_um=0.0))
+    stage.home()
+    stage.move_to_um({"mask_x": 4000.0})
+    read_um = stage.move_to_um({"mask_x": 1000.0})["mask_x"]
+    assert bench.chain.position_um(1, 1) - read_um == pytest.approx(SPEC.backlash_um)
+
+
+def test_a_relative_move_starts_from_where_the_axis_reads_to_be(stage):
+    stage.move_to_um({"mask_x": 500.0})
+    assert stage.move_by_um({"mask_x": -120.0})["mask_x"] == pytest.approx(380.0, abs=MICROSTEP_UM)
+
+
+def test_limits_leave_room_for_the_approach_and_obey_soft_limits(bench):
+    stage = bench.stage(StageSettings(soft_limits_um={"mask_y": (100.0, 900.0)}))
+    low_um, high_um = stage.limits_um("mask_x")
+    assert low_um == 10.0
+    assert high_um == pytest.approx(SPEC.travel_um, abs=MICROSTEP_UM)
+    assert stage.limits_um("mask_y") == (110.0, 900.0)
+
+
+@pytest.mark.parametrize("target_um", [9.9, 25_401.0, float("nan"), float("inf")])
+def test_one_target_beyond_the_limits_and_nothing_is_sent(stage, bench, target_um):
+    with pytest.raises(LimitExceededError, match="mask_y cannot go"):
+        stage.move_to_um({"mask_x": 500.0, "mask_y": target_um})
+    assert bench.sent == []
+
+
+def test_an_unknown_axis_is_named_with_the_known_ones(stage, bench):
+    with pytest.raises(UnknownAxisError, match="use one of mask_x, mask_y"):
+        stage.move_to_um({"mask_z": 500.0})
+    assert bench.sent == []
+
+
+def test_position_lost_at_power_up_is_noticed_before_the_next_move(stage, bench):
+    stage.move_to_um({"mask_x": 500.0})
+    bench.chain.power_cycle()
+    with pytest.raises(NotHomedError):
+        stage.move_to_um({"mask_x": 800.0})
+    stage.home()
+    stage.move_to_um({"mask_x": 800.0})
+    assert bench.chain.position_um(1, 1) == pytest.approx(800.0, abs=MICROSTEP_UM / 2)
+
+
+@pytest.mark.parametrize("fault", ["drop_reply", "garble_reply", "drop_command"])
+def test_a_query_survives_lost_and_garbled_messages(stage, bench, fault):
+    bench.chain.faults.inject(fault, times=2)
+    assert stage.position_um("mask_x") == 0.0
+    assert len(bench.sent) == 3
+
+
+def test_a_query_gives_up_after_three_attempts(stage, bench):
+    bench.chain.faults.inject("drop_reply", times=3)
+    with pytest.raises(TransportTimeoutError, match="check power"):
+        stage.position_um("mask_x")
+    bench.chain.faults.inject("garble_reply", times=3)
+    with pytest.raises(GarbledReplyError):
+        stage.position_um("mask_x")
+
+
+@pytest.mark.parametrize("fault", ["drop_reply", "garble_reply"])
+def test_a_lost_answer_to_a_move_does_not_repeat_the_move(stage, bench, fault):
+    strike_at_first(bench, fault, " move ")
+    stage.move_to_um({"mask_x": 700.0})
+    assert len(bench.moves_sent()) == 1
+    assert bench.chain.position_um(1, 1) == pytest.approx(700.0, abs=MICROSTEP_UM / 2)
+
+
+def test_a_move_that_never_reached_the_device_is_a_position_mismatch(stage, bench):
+    strike_at_first(bench, "drop_command", " move ")
+    with pytest.raises(PositionMismatchError) as caught:
+        stage.move_to_um({"mask_x": 700.0})
+    assert (caught.value.commanded_um, caught.value.read_um) == (700.0, 0.0)
+    assert len(bench.moves_sent()) == 1
+
+
+def test_a_stalled_axis_is_reported_stopped_and_must_be_homed_again(stage, bench):
+    bench.chain.faults.inject("stall")
+    with pytest.raises(StalledError, match="clear the obstacle"):
+        stage.move_to_um({"mask_x": 5000.0})
+    assert len(bench.stops_sent()) == 1
+    with pytest.raises(NotHomedError):
+        stage.move_to_um({"mask_x": 5000.0})
+    stage.home(["mask_x"])
+    assert stage.move_to_um({"mask_x": 5000.0})["mask_x"] == pytest.approx(5000.0, abs=MICROSTEP_UM)
+
+
+def test_homing_that_stalls_leaves_the_axis_unhomed(bench):
+    stage = bench.stage()
+    bench.chain.faults.inject("stall")
+    with pytest.raises(StalledError):
+        stage.home(["mask_x"])
+    assert not stage.is_homed("mask_x")
+
+
+def test_an_interrupt_during_a_move_stops_every_axis_that_moves(stage, bench, monkeypatch):
+    def interrupt(duration_s):
+        ManualClock.sleep(bench.clock, 0.2)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench.clock, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        stage.move_to_um({"mask_x": 20_000.0, "aperture_y": 20_000.0})
+    assert len(bench.stops_sent()) == 2
+    stopped_um = [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)]
+    ManualClock.sleep(bench.clock, 60.0)
+    assert [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)] == stopped_um
+    assert all(0.0 < position_um < 20_000.0 for position_um in stopped_um)
+
+
+def test_an_axis_far_slower_than_it_says_is_stopped_at_its_time_limit(stage, bench):
+    bench.chain.feed(b"/1 1 set maxspeed 2000\n")
+    start_s = bench.clock.now_s()
+    with pytest.raises(MoveTimeoutError):
+        stage.move_to_um({"mask_x": 7000.0})
+    limit_s = move_time_limit_s(7000.0, SPEC.max_speed_um_s)
+    assert limit_s == pytest.approx(3.5)
+    assert bench.clock.now_s() - start_s == pytest.approx(limit_s, abs=0.1)
+    assert len(bench.stops_sent()) == 1
+
+
+def test_an_unplugged_chain_says_so_at_every_command(stage, bench):
+    bench.chain.faults.inject("unplug")
+    with pytest.raises(PortGoneError, match="went away"):
+        stage.position_um("mask_x")
+    with pytest.raises(PortGoneError):
+        stage.stop()
+
+
+def test_unplugging_during_a_move_notes_that_the_axis_could_not_be_stopped(stage, bench):
+    strike_at_first(bench, "unplug", " move ")
+    with pytest.raises(PortGoneError) as caught:
+        stage.move_to_um({"mask_x": 700.0})
+    assert "mask_x could not be stopped" in caught.value.__notes__[0]
+
+
+def test_alerts_between_command_and_reply_are_tolerated(bench):
+    stage = bench.stage()
+    for device in (1, 2):
+        bench.chain.feed(b"/%d 0 set comm.alert 1\n" % device)
+    stage.home()
+    read_um = stage.move_to_um({"mask_x": 300.0, "mask_y": 400.0})
+    assert read_um["mask_y"] == pytest.approx(400.0, abs=MICROSTEP_UM)
+
+
+def test_a_device_that_is_not_there_shows_at_construction(bench):
+    with pytest.raises(TransportTimeoutError):
+        bench.stage(axes={"focus": (7, 1)})
+
+
+def test_an_axis_the_device_does_not_have_shows_at_construction(bench):
+    with pytest.raises(CommandRefusedError, match="check the axis numbers") as caught:
+        bench.stage(axes={"focus": (1, 5)})
+    assert (caught.value.reply, caught.value.axis) == ("BADAXIS", "focus")
+
+
+def test_a_speed_setting_is_microsteps_per_second_times_1_6384(make_bench):
+    slow = replace(SPEC, max_speed_um_s=100.0)
+    bench = make_bench({(1, 1): slow})
+    stage = bench.stage(axes={"mask_x": (1, 1)})
+    stage.home()
+    start_s = bench.clock.now_s()
+    stage.move_to_um({"mask_x": 1000.0})
+    assert bench.clock.now_s() - start_s == pytest.approx(10.0, abs=0.15)
+
+
+def test_waiting_until_settled_outlasts_a_move_that_something_else_started(stage, bench):
+    bench.chain.feed(b"/1 1 move abs 20000\n")
+    stage.wait_until_settled(["mask_x"])
+    assert stage.position_um("mask_x") == pytest.approx(20000 * MICROSTEP_UM)
+
+
+@pytest.mark.parametrize(
+    "stale", [b"@01 1 00 OK IDLE -- 77", b"@02 1 99 OK IDLE -- 7", b"#01 0 hi"]
+)
+def test_a_reply_to_another_message_is_not_taken_for_ours(stale):
+    clock = ManualClock()
+    chain = ZaberChain(clock)
+    stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
+    feed = chain.feed
+    chain.feed = lambda data: with_checksum(stale) + feed(data)
+    assert stage.position_um("mask_x") == 0.0
+
+
+def test_a_reply_without_the_promised_checksum_is_not_believed():
+    clock = ManualClock()
+    chain = ZaberChain(clock)
+    stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
+    feed = chain.feed
+    chain.feed = lambda data: feed(data).partition(b":")[0] + b"\r\n"
+    with pytest.raises(GarbledReplyError, match="missing"):
+        stage.position_um("mask_x")
+
+
+def test_the_firmware_ignores_a_command_whose_checksum_is_wrong():
+    chain = ZaberChain(ManualClock())
+    assert chain.feed(b"/1 1 10 home:00\n") == b""
+    assert chain.feed(b"/1 1 10:FD\n") == b"@01 1 10 OK IDLE WR 0:BC\r\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [
+        (b"/1 0 1 get comm.packet.size.max\n", "@01 0 01 OK IDLE WR 80"),
+        (b"/1 1 1 get comm.packet.size.max\n", "@01 1 01 RJ IDLE WR DEVICEONLY"),
+        (b"/1 0 1 get pos\n", "@01 0 01 OK IDLE WR 0 0"),
+        (b"/2 1 warnings\n", "@02 1 OK IDLE WR 02 WR WH"),
+        (b"/1 1 1 move abs 99999999\n", "@01 1 01 RJ IDLE WR BADDATA"),
+        (b"/1 1 1 move abs x\n", "@01 1 01 RJ IDLE WR BADDATA"),
+        (b"/1 1 1 sing\n", "@01 1 01 RJ IDLE WR BADCOMMAND"),
+        (b"/1 1 1 get limit.min\r\n", "@01 1 01 OK IDLE WR 0"),
+        (b"/1 1 1 home\n", "@01 1 01 OK BUSY WR 0"),
+    ],
+)
+def test_the_firmware_answers_as_the_protocol_says(command, answer):
+    reply = ZaberChain(ManualClock()).feed(command)
+    assert reply.decode("ascii").partition(":")[0] == answer
+
+
+def test_every_device_answers_a_broadcast():
+    replies = ZaberChain(ManualClock()).feed(b"/\n").splitlines()
+    assert [reply[:5] for reply in replies] == [b"@01 0", b"@02 0"]
+
+
+def test_a_command_may_arrive_in_pieces():
+    chain = ZaberChain(ManualClock())
+    assert chain.feed(b"/1 1 10 ge") == b""
+    assert chain.feed(b"t pos\n").startswith(b"@01 1 10 OK IDLE WR 0")
+
+
+@pytest.mark.parametrize("distance_um", [1.0, 100.0, -100.0, 5000.0])
+def test_a_trapezoidal_move_covers_its_distance_in_the_time_of_the_formula(distance_um):
+    speed_um_s, acceleration_um_s2 = 1000.0, 5000.0
+    motion = Motion(10.0, 10.0 + distance_um, 3.0, speed_um_s, acceleration_um_s2)
+    length_um = abs(distance_um)
+    if length_um < speed_um_s**2 / acceleration_um_s2:
+        expected_s = 2 * (length_um / acceleration_um_s2) ** 0.5
+    else:
+        expected_s = length_um / speed_um_s + speed_um_s / acceleration_um_s2
+    assert motion.duration_s == pytest.approx(expected_s)
+    assert motion.position_um(3.0) == 10.0
+    assert motion.position_um(3.0 + expected_s / 2) == pytest.approx(10.0 + distance_um / 2)
+    assert motion.position_um(100.0) == pytest.approx(10.0 + distance_um)
+
+
+@pytest.mark.parametrize(
+    ("start_um", "needed"),
+    [(0.0, False), (90.0, False), (90.1, True), (100.0, True), (500.0, True)],
+)
+def test_an_approach_is_needed_unless_the_move_ends_with_enough_upward_travel(start_um, needed):
+    assert needs_approach(start_um, 100.0, approach_um=10.0) is needed
+
+
+def test_a_tolerance_finer_than_half_a_microstep_is_refused():
+    clock = ManualClock()
+    with pytest.raises(ValueError, match="loosen it"):
+        ZaberStage(ZaberChain(clock).transport(), AXES, 1.0, clock, StageSettings(tolerance_um=0.4))
+
+
+def test_a_port_that_does_not_exist_is_named():
+    with pytest.raises(PortNotFoundError, match="/dev/no-such-port does not exist"):
+        SerialTransport("/dev/no-such-port")
+
+
+def test_a_port_held_by_someone_else_is_named():
+    with PtyServer(ZaberChain(ManualClock())) as server:
+        first = SerialTransport(server.port)
+        with pytest.raises(PortBusyError, match="close the program that holds it"):
+            SerialTransport(server.port)
+        first.close()
+
+
+def test_a_write_that_blocks_is_a_timeout(monkeypatch):
+    with PtyServer(ZaberChain(ManualClock())) as server:
+        transport = SerialTransport(server.port, write_timeout_s=0.01)
+
+        def block(self, data):
+            raise serial.SerialTimeoutException("Write timeout")
+
+        monkeypatch.setattr(serial.Serial, "write", block)
+        with pytest.raises(TransportTimeoutError, match=r"within 0\.01 s"):
+            transport.write(b"/\n")
+        transport.close()
+
+
+def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch):
+    with PtyServer(ZaberChain(ManualClock())) as server:
+        transport = SerialTransport(server.port)
+
+        def fail(self, data):
+            raise OSError(errno.EIO, "Input/output error")
+
+        monkeypatch.setattr(serial.Serial, "write", fail)
+        with pytest.raises(PortGoneError):
+            transport.write(b"/\n")
+        transport.close()
+
+
+def test_bytes_of_an_incomplete_answer_wait_for_the_rest():
+    class Halves:
+        unplugged = False
+        answers = iter([b"@01 1 10 OK", b" IDLE -- 0\r\n"])
+
+        def feed(self, data):
+            return next(self.answers)
+
+    transport = MemoryTransport(Halves(), ManualClock())
+    transport.write(b"/\n")
+    with pytest.raises(TransportTimeoutError) as caught:
+        transport.read_until(b"\n")
+    assert caught.value.partial == b"@01 1 10 OK"
+    transport.write(b"/\n")
+    assert transport.read_until(b"\n") == b"@01 1 10 OK IDLE -- 0\r\n"
+
+
+def test_every_driver_error_is_one_line():
+    errors = [
+        PortNotFoundError("p"),
+        PortBusyError("p", "why"),
+        PortGoneError("p"),
+        TransportTimeoutError("p", 1.0, b"\n"),
+        GarbledReplyError(b"\r\n", "why"),
+        StalledError("a"),
+        NotHomedError("a"),
+    ]
+    assert all(isinstance(error, DriverError) and "\n" not in str(error) for error in errors)
+
+
+def strike_at_first(bench, fault, words):
+    """Arm the fault just before the first command that contains `words` reaches the firmware."""
+    feed = bench.chain.feed
+    armed = []
+
+    def watch(data):
+        if words in data.decode("ascii") and not armed:
+            armed.append(True)
+            bench.chain.faults.inject(fault)
+        return feed(data)
+
+    bench.chain.feed = watch
+
+
+def with_checksum(message):
+    """Return the message as it goes over the wire, with the checksum its body asks for."""
+    return message + b":%02X\r\n" % (-sum(message[1:]) & 0xFF)
