@@ -1,0 +1,408 @@
+"""The equivalent multi-mask camera: a frozen description from YAML, and its imaging matrix Psi.
+
+Source: the paper's Sections IV and V, eq. 4-7. Sizes are those of the light field (rows, columns
+of samples); the sensor has `binning` times fewer pixels along each axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy import sparse
+
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.geometry import (
+    Footprint,
+    cell_weights,
+    centred_grid,
+    fresnel_number,
+    mask_position,
+)
+from emmc_rig.model.masks import AnyPattern, cfa_tile
+from emmc_rig.model.noise import SensorNoise
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings, read_yaml, validated
+
+FILTER_COLOURS = {"none": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
+PARTLY_SEEN_SPLITS = 3
+
+
+class Lens(Settings):
+    """The lens: D, and the aperture cells that the views stand for."""
+
+    distance_mm: float = Field(50.0, gt=0, description="D, from the sensor to the lens")
+    aperture_cell_mm: float = Field(5.0, gt=0, description="between the centres of two views")
+    aperture_fill: float = Field(1.0, ge=0, le=1, description="open width of a cell; 0: a point")
+
+
+class Sensor(Settings):
+    """The sensor: its colour filters, sampling step and pixel size."""
+
+    cfa: str | tuple[str, ...] = "mono"
+    sample_pitch_um: float = Field(24.0, gt=0)
+    pixel_fill: float = Field(1.0, ge=0, le=1, description="sensitive width of a sample; 0: a point")
+    binning: int = Field(1, ge=1, le=16, description="k: a pixel sums k x k samples, r = 1/k^2")
+    noise: SensorNoise = SensorNoise()
+
+    @model_validator(mode="after")
+    def _known_tile(self) -> Sensor:
+        try:
+            cfa_tile(self.cfa)
+        except CameraError as fault:
+            raise ValueError(str(fault)) from fault
+        return self
+
+
+class Mask(Settings):
+    """One coded mask: where it stands, its cells and their pattern."""
+
+    distance_mm: float = Field(ge=0, description="d, from the sensor")
+    cell_um: float = Field(gt=0)
+    pattern: AnyPattern
+    spare_cells: int = Field(8, ge=0, description="beyond the beam, for a misplaced mask")
+
+
+class Shot(Settings):
+    """One exposure: which masks, moved by how much (x, y), behind which colour filter."""
+
+    masks: tuple[str, ...] | None = None
+    offset_um: dict[str, tuple[float, float]] = {}
+    exposure_s: float | None = Field(None, gt=0)
+    filter: Literal["none", "red", "green", "blue"] = "none"
+
+
+class Camera(Settings):
+    """A camera; `total_exposure_s` is shared by the shots that do not name their own."""
+
+    title: str
+    reference: str = ""
+    views: tuple[int, int] = (5, 5)
+    lens: Lens = Lens()
+    sensor: Sensor = Sensor()
+    masks: dict[str, Mask] = {}
+    shots: tuple[Shot, ...] = Field((Shot(),), min_length=1)
+    more_shots_step_um: dict[str, tuple[float, float]] | None = None
+    total_exposure_s: float = Field(0.05, gt=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Camera:
+        if min(self.views) < 1:
+            raise ValueError("'views' needs at least one row and one column")
+        for name, mask in self.masks.items():
+            if mask.distance_mm > self.lens.distance_mm * (1 + 1e-9):
+                raise ValueError(
+                    f"mask '{name}' at {mask.distance_mm:g} mm is further away than the lens "
+                    f"({self.lens.distance_mm:g} mm): use 0 <= distance_mm <= lens.distance_mm"
+                )
+        named = [
+            (name, f"shot {index}")
+            for index, shot in enumerate(self.shots)
+            for name in (*(shot.masks or ()), *shot.offset_um)
+        ] + [(name, "more_shots_step_um") for name in self.more_shots_step_um or {}]
+        for name, where in named:
+            if name not in self.masks:
+                known = ", ".join(self.masks) or "none"
+                raise ValueError(f"{where} names mask '{name}', which is not among: {known}")
+        return self
+
+    def shot_masks(self, shot: int) -> tuple[str, ...]:
+        """Return the names of the masks in the beam during a shot."""
+        chosen = self.shots[shot].masks
+        return tuple(self.masks) if chosen is None else chosen
+
+    @property
+    def moving_masks(self) -> tuple[str, ...]:
+        """Names of the masks that some shot moves: those on the mask stage."""
+        moved = {name for shot in self.shots for name in shot.offset_um}
+        moved.update(self.more_shots_step_um or {})
+        return tuple(name for name in self.masks if name in moved)
+
+    def exposures_s(self) -> NDArray[np.float64]:
+        """Return the exposure of every shot, seconds, shape (shot,)."""
+        named = [shot.exposure_s for shot in self.shots]
+        shared = self.total_exposure_s / len(self.shots)
+        return np.array([shared if exposure is None else exposure for exposure in named])
+
+    def with_shots(self, count: int) -> Camera:
+        """Return the camera with `count` shots: the first ones, or further rounds of them.
+
+        A further round moves the masks by `more_shots_step_um`, and shows the next frames of
+        patterns that have several. Raises CameraError when the camera has no rule for more.
+        """
+        if count < 1:
+            raise CameraError(f"{count} shots: at least one is needed")
+        have = len(self.shots)
+        if count > have and self.more_shots_step_um is None:
+            raise CameraError(
+                f"'{self.title}' has {have} shot(s) and no 'more_shots_step_um' to make {count}"
+            )
+        steps = self.more_shots_step_um or {}
+
+        def moved(index: int) -> Shot:
+            shot, turn = self.shots[index % have], index // have
+            names = {*shot.offset_um, *(steps if turn else ())}
+            offsets = {}
+            for name in names:
+                (x, y), (dx, dy) = shot.offset_um.get(name, (0, 0)), steps.get(name, (0, 0))
+                offsets[name] = (x + turn * dx, y + turn * dy)
+            return shot.model_copy(update={"offset_um": offsets})
+
+        return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
+
+    def warnings(self) -> list[str]:
+        """Return what the model neglects although it matters for this camera."""
+        found = []
+        for name, mask in self.masks.items():
+            number = fresnel_number(mask.cell_um, mask.distance_mm)
+            if number < 1 and mask.distance_mm < self.lens.distance_mm:
+                found.append(
+                    f"mask '{name}': Fresnel number {number:.2g} < 1, diffraction blurs its "
+                    "shadow and is not modelled; whiteboard calibration measures it"
+                )
+        return found
+
+
+def shipped_cameras() -> dict[str, Camera]:
+    """Return the cameras that come with the program, by name."""
+    folder = resources.files("emmc_rig") / "cameras"
+    files = sorted(
+        (item for item in folder.iterdir() if item.name.endswith(".yaml")),
+        key=lambda item: item.name,
+    )
+    return {item.name.removesuffix(".yaml"): load_camera(Path(str(item))) for item in files}
+
+
+def load_camera(path: Path) -> Camera:
+    """Return the camera described by a YAML file; raises CameraError with one line."""
+    return validated(Camera, read_yaml(path, CameraError), str(path), CameraError)
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A mask as manufactured: cells (frame, row, column, colour) of side `cell_um` at `distance_mm`."""
+
+    cells: NDArray[np.float32]
+    cell_um: float
+    distance_mm: float
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One axis of the camera, in um: where samples and views lie and how wide they are."""
+
+    samples_um: NDArray[np.float64]
+    views_um: NDArray[np.float64]
+    sample_width_um: float
+    view_width_um: float
+    lens_um: float
+
+    def split(self, splits: int, sample_part: int, view_part: int) -> _Axis:
+        """Return the axis of one part of `splits` in every sample and every view."""
+
+        def shifted(positions: NDArray[np.float64], width: float, part: int) -> NDArray[np.float64]:
+            return positions + centred_grid(splits, width / splits)[part]
+
+        return _Axis(
+            shifted(self.samples_um, self.sample_width_um, sample_part),
+            shifted(self.views_um, self.view_width_um, view_part),
+            self.sample_width_um / splits,
+            self.view_width_um / splits,
+            self.lens_um,
+        )
+
+    def footprint(self, distance_um: float) -> Footprint:
+        """Return the two boxes through which a mask at a distance is seen."""
+        ratio = distance_um / self.lens_um
+        return Footprint((1 - ratio) * self.sample_width_um, ratio * self.view_width_um)
+
+    def reach_um(self, distance_um: float) -> float:
+        """Return how far from the axis the beam meets a mask at a distance."""
+        edge = mask_position(self.samples_um[-1], self.views_um[-1], distance_um, self.lens_um)
+        return float(edge) + self.footprint(distance_um).half_width_um
+
+    def weights(
+        self, view: int, plate: Plate, cell_count: int, offset_um: float
+    ) -> sparse.csr_array:
+        """Return (sample, cell): the share of every mask cell seen from one view."""
+        distance_um = plate.distance_mm * 1e3
+        meets = mask_position(self.samples_um, self.views_um[view], distance_um, self.lens_um)
+        return cell_weights(
+            meets - offset_um, self.footprint(distance_um), plate.cell_um, cell_count
+        )
+
+
+def _axes(camera: Camera, size: tuple[int, int]) -> tuple[_Axis, _Axis]:
+    """Return the y and the x axis of a camera for a light field of `size` samples."""
+    lens, sensor = camera.lens, camera.sensor
+    cell_um = lens.aperture_cell_mm * 1e3
+
+    def axis(samples: int, views: int) -> _Axis:
+        return _Axis(
+            centred_grid(samples, sensor.sample_pitch_um),
+            centred_grid(views, cell_um),
+            sensor.sample_pitch_um * sensor.pixel_fill,
+            cell_um * lens.aperture_fill,
+            lens.distance_mm * 1e3,
+        )
+
+    return axis(size[0], camera.views[0]), axis(size[1], camera.views[1])
+
+
+def _cell_count(axis: _Axis, mask: Mask, offsets_um: list[float], pitch_um: float) -> int:
+    """Return how many cells a mask needs along an axis, with its spare ones on both sides.
+
+    The parity puts the edges of cells that project onto one sample on the edges of the samples.
+    """
+    reach_um = axis.reach_um(mask.distance_mm * 1e3) + max(abs(offset) for offset in offsets_um)
+    at_lens = mask.distance_mm * 1e3 > 0.5 * axis.lens_um
+    count = int(np.ceil(2 * reach_um / mask.cell_um - 1e-9))
+    if at_lens:
+        return count
+    count += 2 * mask.spare_cells
+    view_span_um = axis.views_um[-1] - axis.views_um[0]
+    span = view_span_um * mask.distance_mm * 1e3 / axis.lens_um + pitch_um * len(axis.samples_um)
+    return count + (count - round(span / mask.cell_um)) % 2
+
+
+def draw_plates(camera: Camera, size: tuple[int, int]) -> dict[str, Plate]:
+    """Return every mask of a camera as manufactured for a light field of `size` (rows, columns)."""
+    axis_y, axis_x = _axes(camera, size)
+    pitch_um = camera.sensor.sample_pitch_um
+    plates = {}
+    for name, mask in camera.masks.items():
+        offsets = [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
+        rows = _cell_count(axis_y, mask, [y for _, y in offsets], pitch_um)
+        columns = _cell_count(axis_x, mask, [x for x, _ in offsets], pitch_um)
+        frames = mask.pattern.frame_count(len(camera.shots))
+        cells = mask.pattern.draw(frames, rows, columns, mask.cell_um)
+        plates[name] = Plate(cells, mask.cell_um, mask.distance_mm)
+    return plates
+
+
+def sensor_response(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return which colours every sample's pixel sees in every shot: (shot, y, x, colour), 0 or 1.
+
+    Raises CameraError when the pixels do not divide the light field.
+    """
+    k = camera.sensor.binning
+    rows, columns = size
+    if rows % k or columns % k:
+        raise CameraError(
+            f"pixels of {k} x {k} samples do not divide a light field of {rows} x {columns}: "
+            f"crop it to {rows // k * k} x {columns // k * k}"
+        )
+    tile = cfa_tile(camera.sensor.cfa)
+    pixels = tile[(np.arange(rows) // k) % tile.shape[0]][
+        :, (np.arange(columns) // k) % tile.shape[1]
+    ]
+    filters = np.array([FILTER_COLOURS[shot.filter] for shot in camera.shots], dtype=np.float32)
+    return pixels[None] * filters[:, None, None, :]
+
+
+def pixel_light(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return how much light each pixel collects (see emmc_rig.model.noise), (shot, pixel_y, pixel_x)."""
+    k = camera.sensor.binning
+    colours = sensor_response(camera, size).sum(axis=-1)[:, ::k, ::k]
+    return colours * k**2
+
+
+def _transmittances(
+    camera: Camera, size: tuple[int, int], plates: dict[str, Plate], shot: int
+) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+    """Yield (v, u, transmittance (y, x, colour)) of all masks together, averaged over footprints.
+
+    One mask whose footprint covers several cells is averaged exactly. The average of the product
+    of two such masks is not the product of their averages: pixels and aperture cells are then
+    split in PARTLY_SEEN_SPLITS along each axis, and the products of the parts averaged.
+    """
+    axes = _axes(camera, size)
+    names = camera.shot_masks(shot)
+
+    def factors(
+        axis: int, splits: int, sample_part: int, view_part: int
+    ) -> dict[tuple[str, int], sparse.csr_array]:
+        part = axes[axis].split(splits, sample_part, view_part)
+        found = {}
+        for name in names:
+            offset = camera.shots[shot].offset_um.get(name, (0.0, 0.0))[1 - axis]
+            for view in range(camera.views[axis]):
+                count = plates[name].cells.shape[1 + axis]
+                try:
+                    found[name, view] = part.weights(view, plates[name], count, offset)
+                except CameraError as fault:
+                    raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
+        return found
+
+    whole = [factors(axis, 1, 0, 0) for axis in (0, 1)]
+    partly = {
+        name
+        for weights in whole
+        for (name, _), matrix in weights.items()
+        if (np.diff(matrix.indptr) > 1).any()
+    }
+    splits = PARTLY_SEEN_SPLITS if len(partly) > 1 else 1
+    parts = [(i, j) for i in range(splits) for j in range(splits)]
+    by_part = [
+        {part: whole[axis] if splits == 1 else factors(axis, splits, *part) for part in parts}
+        for axis in (0, 1)
+    ]
+    rows, columns = size
+    for v in range(camera.views[0]):
+        upper = {
+            (name, part, colour): by_part[0][part][name, v]
+            @ plates[name].cells[shot % len(plates[name].cells), :, :, colour]
+            for name in names
+            for part in parts
+            for colour in range(3)
+        }
+        for u in range(camera.views[1]):
+            total = np.zeros((rows, columns, 3), dtype=np.float32)
+            for part_y in parts:
+                for part_x in parts:
+                    product = np.ones((rows, columns, 3), dtype=np.float32)
+                    for name in names:
+                        right = by_part[1][part_x][name, u]
+                        for colour in range(3):
+                            product[:, :, colour] *= (right @ upper[name, part_y, colour].T).T
+                    total += product
+            yield v, u, total / len(parts) ** 2
+
+
+def build_imaging_matrix(camera: Camera, size: tuple[int, int]) -> ImagingMatrix:
+    """Return Psi of a camera for a light field of `size` (rows, columns) samples (paper, eq. 6, 7).
+
+    Normalised so that the fully open camera reads 1 from a constant white light field, behind its
+    colour filters. Raises CameraError for a mask smaller than the beam, for pixels that do not
+    divide the light field, and for a shot that no light reaches.
+    """
+    response = sensor_response(camera, size)
+    plates = draw_plates(camera, size)
+    colours_seen = response.sum(axis=-1)
+    single = bool((colours_seen <= 1).all())
+    shots, views = len(camera.shots), camera.views
+    shape = (shots, *views, size[0], 1 if single else 3, size[1])
+    weights = np.empty(shape, dtype=np.float32)
+    colour = response.argmax(axis=-1).astype(np.uint8) if single else None
+    scale = views[0] * views[1] * camera.sensor.binning**2
+    for shot in range(shots):
+        seen = np.maximum(colours_seen[shot], 1)[..., None]
+        share = (response[shot] / seen / scale).astype(np.float32)
+        for v, u, passed in _transmittances(camera, size, plates, shot):
+            passed *= share
+            if colour is not None:
+                index = colour[shot][..., None].astype(np.intp)
+                weights[shot, v, u, :, 0, :] = np.take_along_axis(passed, index, axis=-1)[..., 0]
+            else:
+                weights[shot, v, u] = passed.transpose(0, 2, 1)
+        if not weights[shot].any():
+            raise CameraError(
+                f"no light reaches the sensor in shot {shot}: open its masks or change its filter"
+            )
+    return ImagingMatrix(weights, colour, camera.sensor.binning, camera.model_dump_json())

@@ -1,0 +1,114 @@
+"""Where a ray meets a mask, and how much of each mask cell a pixel and an aperture cell see.
+
+A ray through the sensor point x and the lens point u (lens at distance D from the sensor) meets
+a mask at distance d from the sensor at xi = (1 - d/D) x + (d/D) u (paper, eq. 2). A pixel of
+width w_x and an aperture cell of width w_u therefore see the mask through the convolution of two
+boxes, (1 - d/D) w_x and (d/D) w_u wide. On square cells that integral is exact and separable.
+
+Neglected: diffraction (see `fresnel_number`), the thickness of the mask, and the obliquity of the
+rays (cosine falloff), which whiteboard calibration measures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from emmc_rig.model.errors import CameraError
+
+WAVELENGTH_UM = 0.55
+
+
+def centred_grid(count: int, pitch: float) -> NDArray[np.float64]:
+    """Return `count` equally spaced positions around 0, in the unit of `pitch`."""
+    return (np.arange(count) - (count - 1) / 2) * pitch
+
+
+def mask_position(
+    x: NDArray[np.float64] | float,
+    u: NDArray[np.float64] | float,
+    distance: float,
+    lens_distance: float,
+) -> NDArray[np.float64]:
+    """Return where the ray through x (sensor) and u (lens) meets the mask (paper, eq. 2)."""
+    ratio = distance / lens_distance
+    return np.asarray((1 - ratio) * np.asarray(x) + ratio * np.asarray(u))
+
+
+def fresnel_number(cell_um: float, distance_mm: float) -> float:
+    """Return a^2 / (lambda d) of a mask cell of half-width a at 550 nm; below 1 diffraction rules.
+
+    Source: Born & Wolf, Principles of Optics, 8.3; infinite for a mask in contact.
+    """
+    if distance_mm == 0:
+        return float("inf")
+    return (cell_um / 2) ** 2 / (WAVELENGTH_UM * distance_mm * 1e3)
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Two boxes whose convolution weighs the mask: widths in um of the pixel's and the lens' share."""
+
+    pixel_um: float
+    aperture_um: float
+
+    @property
+    def half_width_um(self) -> float:
+        """Half the support of the convolution of the two boxes."""
+        return (self.pixel_um + self.aperture_um) / 2
+
+
+def _covered(edge_um: NDArray[np.float64], footprint: Footprint) -> NDArray[np.float64]:
+    """Return the share of the footprint that lies below `edge_um` (relative to its centre)."""
+    wide = max(footprint.pixel_um, footprint.aperture_um)
+    narrow = min(footprint.pixel_um, footprint.aperture_um)
+    if wide == 0:
+        return np.where(edge_um > 0, 1.0, 0.0)
+    if narrow < 1e-6 * wide:
+        return np.clip(edge_um / wide + 0.5, 0, 1)
+    outer, inner = (wide + narrow) / 2, (wide - narrow) / 2
+    rise = np.clip(edge_um + outer, 0, narrow)
+    fall = np.clip(edge_um - inner, 0, narrow)
+    flat = np.clip(edge_um + inner, 0, 2 * inner)
+    return (rise**2 / 2 / narrow + flat + fall - fall**2 / 2 / narrow) / wide
+
+
+def cell_weights(
+    positions_um: NDArray[np.float64],
+    footprint: Footprint,
+    cell_um: float,
+    cell_count: int,
+) -> sparse.csr_array:
+    """Return how much of each mask cell every footprint covers along one axis.
+
+    positions_um: (n,) centres of the footprints on the mask, 0 at the middle of its
+        `cell_count` cells.
+    Returns a sparse (n, cell_count) matrix whose rows sum to 1.
+    Raises CameraError when a footprint reaches beyond the mask.
+    """
+    half = cell_count * cell_um / 2
+    reach = np.abs(positions_um).max() + footprint.half_width_um
+    if reach > half * (1 + 1e-9):
+        needed = int(np.ceil(2 * reach / cell_um - 1e-9))
+        raise CameraError(
+            f"the mask is smaller than the beam: it has {cell_count} cells of {cell_um:g} um, "
+            f"the beam needs {needed}; enlarge the mask or reduce its offset"
+        )
+    first = np.floor((positions_um - footprint.half_width_um + half) / cell_um + 1e-9).astype(int)
+    first = np.clip(first, 0, cell_count - 1)
+    band = int(np.ceil(2 * footprint.half_width_um / cell_um)) + 2
+    index = first[:, None] + np.arange(band + 1)[None, :]
+    edges_um = index * cell_um - half - positions_um[:, None]
+    below = _covered(edges_um, footprint)
+    below[:, 0] = 0.0
+    values = np.diff(below, axis=1)
+    rows = np.repeat(np.arange(len(positions_um)), band)
+    columns = np.minimum(index[:, :-1].ravel(), cell_count - 1)
+    matrix = sparse.csr_array(
+        (values.ravel(), (rows, columns)), shape=(len(positions_um), cell_count)
+    )
+    matrix.eliminate_zeros()
+    return matrix

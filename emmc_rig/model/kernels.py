@@ -1,0 +1,192 @@
+"""Fused loops of the imaging matrix, over rows of pixels in parallel.
+
+Axes: weights (shot, v, u, y, stored colour, x); light field (v, u, y, colour, x), any strides;
+frames (shot, pixel_y, pixel_x). With one stored colour, `colour` (shot, y, x) says which it is.
+A pixel sums binning x binning samples; samples belong to one pixel only, so Psi Psi^T is one
+small block (shot x shot) per pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, inline="always", fastmath=True)
+def gather_row(weights, colour, light_field, shot, y, total):
+    """Add to total (x,) what one shot sees of row y of the light field."""
+    views_v, views_u, stored, width = (
+        weights.shape[1],
+        weights.shape[2],
+        weights.shape[4],
+        weights.shape[5],
+    )
+    for v in range(views_v):
+        for u in range(views_u):
+            if stored == 1:
+                for x in range(width):
+                    total[x] += (
+                        weights[shot, v, u, y, 0, x] * light_field[v, u, y, colour[shot, y, x], x]
+                    )
+            else:
+                for c in range(3):
+                    for x in range(width):
+                        total[x] += weights[shot, v, u, y, c, x] * light_field[v, u, y, c, x]
+
+
+@njit(cache=True, inline="always", fastmath=True)
+def spread_row(weights, colour, frame_row, shot, y, v, u, light_field):
+    """Add to row y of view (v, u) the transpose of one shot applied to frame_row (x,)."""
+    stored, width = weights.shape[4], weights.shape[5]
+    if stored == 1:
+        for x in range(width):
+            light_field[v, u, y, colour[shot, y, x], x] += (
+                weights[shot, v, u, y, 0, x] * frame_row[x]
+            )
+    else:
+        for c in range(3):
+            for x in range(width):
+                light_field[v, u, y, c, x] += weights[shot, v, u, y, c, x] * frame_row[x]
+
+
+@njit(cache=True, parallel=True)
+def project(weights, colour, light_field, binning, frames):
+    """Set frames = Psi light_field."""
+    width = weights.shape[5]
+    for row in prange(frames.shape[1]):
+        total = np.empty(width, frames.dtype)
+        for shot in range(frames.shape[0]):
+            total[:] = 0
+            for part in range(binning):
+                gather_row(weights, colour, light_field, shot, row * binning + part, total)
+            frames[shot, row, :] = 0
+            for x in range(width):
+                frames[shot, row, x // binning] += total[x]
+
+
+@njit(cache=True, parallel=True)
+def back_project(weights, colour, frames, binning, light_field):
+    """Set light_field = Psi^T frames."""
+    shots, views_v, views_u, _, _, width = weights.shape
+    for row in prange(frames.shape[1]):
+        spread = np.empty(width, frames.dtype)
+        for part in range(binning):
+            y = row * binning + part
+            for v in range(views_v):
+                for u in range(views_u):
+                    light_field[v, u, y] = 0
+        for shot in range(shots):
+            for x in range(width):
+                spread[x] = frames[shot, row, x // binning]
+            for part in range(binning):
+                y = row * binning + part
+                for v in range(views_v):
+                    for u in range(views_u):
+                        spread_row(weights, colour, spread, shot, y, v, u, light_field)
+
+
+@njit(cache=True, parallel=True)
+def data_step(weights, colour, inverse, frames, binning, light_field):
+    """Replace light_field z by z - Psi^T (Psi Psi^T + Lambda)^-1 (Psi z - frames), in place.
+
+    inverse: (shot, shot, pixel_y, pixel_x), the inverted blocks.
+    """
+    shots, views_v, views_u, _, _, width = weights.shape
+    for row in prange(frames.shape[1]):
+        apply_data_step(weights, colour, inverse, frames, binning, light_field, row)
+
+
+@njit(cache=True, inline="always")
+def apply_data_step(weights, colour, inverse, frames, binning, light_field, row):
+    """Do `data_step` for one row of pixels."""
+    shots, views_v, views_u, _, _, width = weights.shape
+    residual = np.zeros((shots, width // binning), frames.dtype)
+    spread = np.empty((shots, width), frames.dtype)
+    total = np.empty(width, frames.dtype)
+    for shot in range(shots):
+        total[:] = 0
+        for part in range(binning):
+            gather_row(weights, colour, light_field, shot, row * binning + part, total)
+        for x in range(width):
+            residual[shot, x // binning] += total[x]
+        for x in range(width // binning):
+            residual[shot, x] -= frames[shot, row, x]
+    for shot in range(shots):
+        total[:] = 0
+        for other in range(shots):
+            for x in range(width // binning):
+                total[x] -= inverse[shot, other, row, x] * residual[other, x]
+        for x in range(width):
+            spread[shot, x] = total[x // binning]
+    for part in range(binning):
+        y = row * binning + part
+        for v in range(views_v):
+            for u in range(views_u):
+                for shot in range(shots):
+                    spread_row(weights, colour, spread[shot], shot, y, v, u, light_field)
+
+
+@njit(cache=True, parallel=True)
+def gram(weights, colour, binning, blocks):
+    """Set blocks (shot, shot, pixel_y, pixel_x), float64, to those of Psi Psi^T."""
+    shots, views_v, views_u, _, stored, width = weights.shape
+    for row in prange(blocks.shape[2]):
+        for a in range(shots):
+            for b in range(a + 1):
+                blocks[a, b, row, :] = 0
+                for part in range(binning):
+                    y = row * binning + part
+                    for v in range(views_v):
+                        for u in range(views_u):
+                            for c in range(stored):
+                                for x in range(width):
+                                    if stored == 3 or colour[a, y, x] == colour[b, y, x]:
+                                        blocks[a, b, row, x // binning] += np.float64(
+                                            weights[a, v, u, y, c, x]
+                                        ) * np.float64(weights[b, v, u, y, c, x])
+                blocks[b, a, row, :] = blocks[a, b, row, :]
+
+
+@njit(cache=True, parallel=True)
+def invert_blocks(blocks, ridge, inverse, failed):
+    """Set inverse to (blocks + diag(ridge))^-1 per pixel, by Cholesky in float64.
+
+    ridge: (shot, pixel_y, pixel_x), may be infinite (a measurement not to use).
+    failed: (pixel_y,) counts the pixels of each row whose block is not positive definite.
+    """
+    shots = blocks.shape[0]
+    for row in prange(blocks.shape[2]):
+        lower = np.zeros((shots, shots))
+        solved = np.zeros((shots, shots))
+        for x in range(blocks.shape[3]):
+            good = True
+            for i in range(shots):
+                for j in range(i + 1):
+                    value = blocks[i, j, row, x]
+                    if i == j:
+                        value += ridge[i, row, x]
+                    for k in range(j):
+                        value -= lower[i, k] * lower[j, k]
+                    if i == j:
+                        scale = blocks[i, i, row, x] + ridge[i, row, x]
+                        if not value > 1e-13 * scale and not np.isinf(scale):
+                            good = False
+                            value = 1.0
+                        lower[i, i] = np.sqrt(value)
+                    else:
+                        lower[i, j] = value / lower[j, j]
+            if not good:
+                failed[row] += 1
+                continue
+            for column in range(shots):
+                for i in range(shots):
+                    value = 1.0 if i == column else 0.0
+                    for k in range(i):
+                        value -= lower[i, k] * solved[k, column]
+                    solved[i, column] = value / lower[i, i]
+            for i in range(shots):
+                for j in range(shots):
+                    value = 0.0
+                    for k in range(max(i, j), shots):
+                        value += solved[k, i] * solved[k, j]
+                    inverse[i, j, row, x] = value

@@ -1,0 +1,254 @@
+"""The imaging matrix Psi as an operator: forward, adjoint, exact per-pixel solve, norms, export.
+
+Light fields have shape (v, u, y, x, c), frames (shot, pixel_y, pixel_x). The columns of Psi follow
+the light field's memory order, its rows the frames'. Every sample of the light field reaches one
+pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per pixel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator
+
+from emmc_rig.model import kernels
+from emmc_rig.model.errors import SensingError
+
+Array = NDArray[np.floating]
+NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
+FORMAT = "emmc-rig imaging matrix 1"
+
+
+def rows_of_colours(light_field: Array) -> Array:
+    """Return a view of a light field (v, u, y, x, c) as the kernels' (v, u, y, c, x)."""
+    return np.moveaxis(light_field, -1, -2)
+
+
+@dataclass(frozen=True)
+class PixelSolve:
+    """(Psi Psi^T + Lambda)^-1, one block per pixel: `inverse` (shot, shot, pixel_y, pixel_x)."""
+
+    inverse: Array
+
+    def __call__(self, frames: Array) -> Array:
+        """Return the solution for frames (shot, pixel_y, pixel_x)."""
+        return np.einsum("styx,tyx->syx", self.inverse, frames)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagingMatrix:
+    """Psi.
+
+    weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
+        pixel sees one colour only, else three.
+    colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
+    binning: k; a pixel sums k x k samples.
+    camera_json: the description of the camera, or "" when unknown.
+    """
+
+    weights: Array
+    colour: NDArray[np.uint8] | None
+    binning: int = 1
+    camera_json: str = ""
+
+    def __post_init__(self) -> None:
+        if self.weights.ndim != 6 or self.weights.shape[4] != (1 if self.colour is not None else 3):
+            raise SensingError(f"weights of shape {self.weights.shape} do not make a Psi")
+        if self.colour is not None and self.colour.shape != (self.shots, *self.size):
+            raise SensingError(f"colour map of shape {self.colour.shape} does not fit the weights")
+        if self.size[0] % self.binning or self.size[1] % self.binning:
+            raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
+        if not np.isfinite(self.weights).all():
+            raise SensingError("the imaging matrix has entries that are not finite")
+
+    @property
+    def shots(self) -> int:
+        """Number of shots."""
+        return self.weights.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the light field."""
+        return self.weights.shape[3], self.weights.shape[5]
+
+    @property
+    def light_field_shape(self) -> tuple[int, int, int, int, int]:
+        """(v, u, y, x, c)."""
+        return self.weights.shape[1], self.weights.shape[2], *self.size, 3
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]:
+        """(shot, pixel_y, pixel_x)."""
+        return self.shots, self.size[0] // self.binning, self.size[1] // self.binning
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of Psi as a matrix."""
+        return int(np.prod(self.frames_shape)), int(np.prod(self.light_field_shape))
+
+    @property
+    def colour_map(self) -> NDArray[np.uint8]:
+        """The colour map as the kernels take it (a dummy when three colours are stored)."""
+        return NO_COLOUR_MAP if self.colour is None else self.colour
+
+    def _checked(self, array: Array, shape: tuple[int, ...], what: str) -> Array:
+        if array.shape != shape:
+            raise SensingError(f"{what} of shape {array.shape} given, Psi needs {shape}")
+        return np.asarray(array, dtype=self.weights.dtype)
+
+    def forward(self, light_field: Array) -> Array:
+        """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c)."""
+        light_field = self._checked(light_field, self.light_field_shape, "a light field")
+        frames = np.empty(self.frames_shape, dtype=self.weights.dtype)
+        kernels.project(
+            self.weights, self.colour_map, rows_of_colours(light_field), self.binning, frames
+        )
+        return frames
+
+    def adjoint(self, frames: Array) -> Array:
+        """Return Psi^T frames, a light field (v, u, y, x, c)."""
+        frames = np.ascontiguousarray(self._checked(frames, self.frames_shape, "frames"))
+        light_field = np.empty(self.light_field_shape, dtype=self.weights.dtype)
+        kernels.back_project(
+            self.weights, self.colour_map, frames, self.binning, rows_of_colours(light_field)
+        )
+        return light_field
+
+    @cached_property
+    def gram(self) -> NDArray[np.float64]:
+        """The blocks of Psi Psi^T: (shot, shot, pixel_y, pixel_x), float64."""
+        blocks = np.empty((self.shots, *self.frames_shape), dtype=np.float64)
+        kernels.gram(self.weights, self.colour_map, self.binning, blocks)
+        return blocks
+
+    def solver(self, ridge: float | Array) -> PixelSolve:
+        """Return the exact solve of (Psi Psi^T + diag(ridge)).
+
+        ridge: a number or an array (shot, pixel_y, pixel_x), at least 0; infinite where a
+            measurement is not to be used.
+        Raises SensingError when a block is singular (repeated or dark shots without ridge).
+        """
+        spread = np.broadcast_to(np.asarray(ridge, dtype=np.float64), self.frames_shape)
+        if not (spread >= 0).all():
+            raise SensingError("the ridge of the per-pixel solve must be at least 0")
+        inverse = np.empty((self.shots, *self.frames_shape), dtype=self.weights.dtype)
+        failed = np.zeros(self.frames_shape[1], dtype=np.int64)
+        kernels.invert_blocks(self.gram, spread, inverse, failed)
+        if failed.any():
+            raise SensingError(
+                f"Psi Psi^T is singular at {failed.sum()} pixels (repeated or dark shots): "
+                "use a ridge above 0"
+            )
+        return PixelSolve(inverse)
+
+    def row_norms(self) -> NDArray[np.float64]:
+        """Return the Euclidean norm of every row of Psi: (shot, pixel_y, pixel_x)."""
+        return np.sqrt(np.einsum("ssyx->syx", self.gram))
+
+    def column_norms(self) -> NDArray[np.float64]:
+        """Return the Euclidean norm of every column of Psi: (v, u, y, x, c)."""
+        squares = np.square(self.weights, dtype=np.float64)
+        if self.colour is None:
+            return np.sqrt(squares.sum(axis=0).transpose(0, 1, 2, 4, 3))
+        seen = self.colour[..., None] == np.arange(3)
+        return np.sqrt(np.einsum("svuyx,syxc->vuyxc", squares[:, :, :, :, 0, :], seen))
+
+    @cached_property
+    def norm(self) -> float:
+        """The operator norm of Psi: the root of the largest eigenvalue of its pixels' blocks."""
+        if self.shots == 1:
+            return float(np.sqrt(self.gram.max()))
+        blocks = self.gram.reshape(self.shots, self.shots, -1).transpose(2, 0, 1)
+        return float(np.sqrt(np.linalg.eigvalsh(blocks)[:, -1].max()))
+
+    def light_efficiency(self) -> float:
+        """Return the reading from a white light field, averaged over shots and pixels."""
+        return float(self.weights.sum(dtype=np.float64) / np.prod(self.frames_shape))
+
+    def to_scipy(self) -> sparse.csr_array:
+        """Return Psi as an explicit sparse matrix without its zeros."""
+        shots, views_v, views_u, rows, stored, columns = self.weights.shape
+        s, v, u, y, k, x = np.indices(self.weights.shape, sparse=True)
+        colour = k if self.colour is None else self.colour[s, y, x]
+        column = (((v * views_u + u) * rows + y) * columns + x) * 3 + colour
+        pixel_y, pixel_x = y // self.binning, x // self.binning
+        row = (s * self.frames_shape[1] + pixel_y) * self.frames_shape[2] + pixel_x
+        shape = self.weights.shape
+        kept = self.weights != 0
+        entries = (
+            self.weights[kept],
+            (np.broadcast_to(row, shape)[kept], np.broadcast_to(column, shape)[kept]),
+        )
+        return sparse.csr_array(entries, shape=self.shape)
+
+    def linear_operator(self) -> LinearOperator:
+        """Return Psi for SciPy's iterative solvers, on flattened light fields and frames."""
+        return LinearOperator(
+            self.shape,
+            matvec=lambda x: self.forward(x.reshape(self.light_field_shape)).ravel(),
+            rmatvec=lambda y: self.adjoint(y.reshape(self.frames_shape)).ravel(),
+            dtype=self.weights.dtype,
+        )
+
+    def relative_difference(self, reference: ImagingMatrix) -> float:
+        """Return |Psi - reference| / |reference| in the Frobenius norm."""
+        if self.weights.shape != reference.weights.shape:
+            raise SensingError("only imaging matrices of the same camera and size compare")
+        difference = np.linalg.norm((self.weights - reference.weights).ravel())
+        return float(difference / np.linalg.norm(reference.weights.ravel()))
+
+    def checksum(self) -> str:
+        """Return the SHA-256 of weights, colours, binning and camera."""
+        digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{self.camera_json}".encode())
+        digest.update(np.ascontiguousarray(self.weights))
+        digest.update(np.ascontiguousarray(self.colour_map))
+        return digest.hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
+        partial = path.with_name(path.name + ".part")
+        try:
+            with h5py.File(partial, "w") as file:
+                file.attrs.update(
+                    format=FORMAT,
+                    binning=self.binning,
+                    camera=self.camera_json,
+                    sha256=self.checksum(),
+                )
+                file["weights"] = self.weights
+                if self.colour is not None:
+                    file["colour"] = self.colour
+            os.replace(partial, path)
+        except OSError as fault:
+            raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+        finally:
+            partial.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: Path) -> ImagingMatrix:
+        """Read a saved Psi; raises SensingError when it is not one, or damaged."""
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != FORMAT:
+                    raise SensingError(f"{path}: not an imaging matrix of this program")
+                colour = np.asarray(file["colour"]) if "colour" in file else None
+                matrix = cls(
+                    np.asarray(file["weights"]),
+                    colour,
+                    int(file.attrs["binning"]),
+                    str(file.attrs["camera"]),
+                )
+                expected = file.attrs["sha256"]
+        except (OSError, KeyError) as fault:
+            raise SensingError(f"{path}: cannot be read as an imaging matrix ({fault})") from fault
+        if matrix.checksum() != expected:
+            raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
+        return matrix
