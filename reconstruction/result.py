@@ -1,0 +1,34 @@
+"""What every reconstruction returns: the light field, how it went, and how long it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of a solver, as given to `on_step`; the objective is None where not evaluated."""
+
+    step: int
+    relative_change: float
+    objective: float | None
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when `status` is converged.
+
+    objective: (step, value) pairs. parameters: what the solver chose or was given.
+    """
+
+    method: str
+    light_field: NDArray[np.float32]
+    status: str
+    advice: str
+    steps: int
+    objective: tuple[tuple[int, float], ...]
+    seconds: float
+    parameters: dict[str, float]
