@@ -1,0 +1,86 @@
+"""Averages of repeated frames, and what they say of the sensor's gain and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+
+LARGEST_CLIPPED_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class MeanFrame:
+    """The mean of `count` frames of one exposure.
+
+    mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
+    the spread between repeats; NaN with one frame.
+    """
+
+    mean_dn: NDArray[np.float32]
+    variance_dn2: float
+    count: int
+    exposure_s: float
+
+
+def average(
+    frames: Iterable[NDArray[np.uint16]], exposure_s: float, white_level_dn: int, what: str
+) -> MeanFrame:
+    """Return the mean of repeated frames (y, x), uint16.
+
+    Raises CalibrationError when there are none, when they differ in size, or when more than
+    LARGEST_CLIPPED_SHARE of the pixels of one are saturated.
+    """
+    total = squares = None
+    count = 0
+    for frame in frames:
+        clipped = float(np.mean(frame >= white_level_dn))
+        if clipped > LARGEST_CLIPPED_SHARE:
+            raise CalibrationError(
+                f"{what}: {clipped:.1%} of the pixels are saturated; shorten the exposure "
+                f"({exposure_s:g} s) or dim the lamp"
+            )
+        values = frame.astype(np.float64)
+        if total is None or squares is None:
+            total, squares = np.zeros_like(values), np.zeros_like(values)
+        if values.shape != total.shape:
+            raise CalibrationError(f"{what}: frames of {values.shape} and {total.shape} differ")
+        total += values
+        squares += values**2
+        count += 1
+    if total is None or squares is None:
+        raise CalibrationError(f"{what}: no frame was taken")
+    spread = np.nan
+    if count > 1:
+        spread = float(np.mean(squares - total**2 / count) / (count - 1))
+    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s)
+
+
+@dataclass(frozen=True)
+class SensorGain:
+    """What the noise of a frame follows from: DN per electron, and the variance in the dark."""
+
+    gain_dn_per_electron: float
+    dark_variance_dn2: float
+
+    def variance_dn2(self, signal_dn: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the variance of one frame whose mean signal above the dark is `signal_dn`."""
+        return self.gain_dn_per_electron * np.maximum(signal_dn, 0) + self.dark_variance_dn2
+
+
+def photon_transfer(dark: MeanFrame, flat: MeanFrame) -> SensorGain:
+    """Return the gain from repeated dark and flat frames (mean-variance method, EMVA 1288, 6.6).
+
+    Raises CalibrationError when either was not repeated, or the flat is not brighter.
+    """
+    if dark.count < 2 or flat.count < 2:
+        raise CalibrationError("the gain needs at least two dark and two bright frames")
+    signal = float(np.mean(flat.mean_dn - dark.mean_dn))
+    if signal <= 0:
+        raise CalibrationError("the whiteboard is no brighter than the dark: is the lamp on?")
+    gain = max((flat.variance_dn2 - dark.variance_dn2) / signal, 1e-9)
+    return SensorGain(gain, dark.variance_dn2)

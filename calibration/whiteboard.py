@@ -1,0 +1,155 @@
+"""Psi from whiteboards: every coefficient measured through a pinhole stepped over the views.
+
+With the pinhole before view j and lamp colour c, a pixel reads its coefficient of (j, c) times
+the lamp. The same pixel with the aperture open and the masks out reads, by Psi's normalisation,
+1 from a white board. So a coefficient is the ratio of the two signals, each divided by its
+exposure, and the lamp's level, the pixel's sensitivity and the lens' falloff cancel.
+
+Where a pixel sums several samples (r < 1) the pinhole measures only their sum: it is shared out
+among them as in the designed Psi.
+
+Source: whiteboard calibration as in Marwah et al. (ACM TOG 2013), supplement, the paper's [17].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.frames import MeanFrame, SensorGain, photon_transfer
+from emmc_rig.model.sensing import ImagingMatrix
+
+Array = NDArray[np.floating]
+LAMP_COLOURS = ("red", "green", "blue")
+DARKEST_REFERENCE_DN = 50.0
+
+
+def lamps_needed(design: ImagingMatrix) -> tuple[str, ...]:
+    """Return the lamp colours to measure under: white alone where a pixel sees one colour only."""
+    return LAMP_COLOURS if design.colour is None else ("white",)
+
+
+@dataclass(frozen=True)
+class Whiteboards:
+    """Everything measured at the whiteboard.
+
+    dark: lamp off. references[shot, lamp]: aperture open, masks out. pinholes[shot, v, u, lamp]:
+    masks in, pinhole before that view.
+    """
+
+    dark: MeanFrame
+    references: Mapping[tuple[int, str], MeanFrame]
+    pinholes: Mapping[tuple[int, int, int, str], MeanFrame]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The measured Psi, how sure it is, and what turns frames into readings.
+
+    deviation: standard deviation of every coefficient, shaped as `psi.weights`.
+    white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor.
+    """
+
+    psi: ImagingMatrix
+    deviation: NDArray[np.float32]
+    dark_dn: NDArray[np.float32]
+    white_dn_per_s: NDArray[np.float32]
+    gain: SensorGain
+
+    def readings(self, frames_dn: Array, exposures_s: Array) -> NDArray[np.float32]:
+        """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""
+        scale = self.white_dn_per_s * np.asarray(exposures_s)[:, None, None]
+        return ((frames_dn - self.dark_dn) / scale).astype(np.float32)
+
+    def reading_variance(self, frames_dn: Array, exposures_s: Array) -> NDArray[np.float64]:
+        """Return the variance of the readings of frames in DN, (shot, y, x)."""
+        scale = self.white_dn_per_s * np.asarray(exposures_s, dtype=np.float64)[:, None, None]
+        return self.gain.variance_dn2(frames_dn - self.dark_dn) / scale**2
+
+
+def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
+    """Return the measured Psi with the standard deviation of every coefficient.
+
+    design: Psi as designed; gives the sizes, the colour of every pixel, and how a pixel's
+    coefficient is shared among its samples. Raises CalibrationError for missing frames, frames
+    of another size, and a whiteboard too dark to divide by.
+    """
+    lamps = lamps_needed(design)
+    views_v, views_u = design.weights.shape[1:3]
+    first = boards.references.get((0, lamps[0]))
+    if first is None:
+        raise CalibrationError("reference whiteboard missing: open the aperture, take the masks out")
+    gain = photon_transfer(boards.dark, first)
+    weights = np.empty_like(design.weights)
+    deviation = np.empty_like(design.weights)
+    white = np.empty(design.frames_shape, dtype=np.float32)
+    for shot in range(design.shots):
+        references = [
+            _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
+            for lamp in lamps
+        ]
+        white[shot] = sum(reference for reference, _ in references)
+        for v in range(views_v):
+            for u in range(views_u):
+                for stored, lamp in enumerate(lamps):
+                    reference, reference_variance = references[stored]
+                    name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
+                    pinhole = boards.pinholes.get((shot, v, u, lamp))
+                    signal, variance = _signal(boards, gain, pinhole, name)
+                    ratio = signal / reference
+                    relative = reference_variance / reference**2
+                    spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
+                    place = (shot, v, u, slice(None), stored)
+                    share = _shares(design.weights[place], design.binning)
+                    weights[place] = share * _samples(np.maximum(ratio, 0), design.binning)
+                    deviation[place] = share * _samples(spread, design.binning)
+        weights[shot] /= len(lamps)
+        deviation[shot] /= len(lamps)
+    psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
+    return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
+
+
+def _signal(
+    boards: Whiteboards, gain: SensorGain, frame: MeanFrame | None, what: str
+) -> tuple[Array, Array]:
+    """Return DN per second above the dark and its variance, (y, x)."""
+    if frame is None:
+        raise CalibrationError(f"whiteboard missing: {what}; capture it before measuring Psi")
+    dark = boards.dark
+    if frame.mean_dn.shape != dark.mean_dn.shape:
+        raise CalibrationError(f"whiteboard {what}: another size than the dark frame")
+    signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
+    variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
+    return signal / frame.exposure_s, variance / frame.exposure_s**2
+
+
+def _bright(
+    boards: Whiteboards, gain: SensorGain, frame: MeanFrame | None, what: str
+) -> tuple[Array, Array]:
+    """Return `_signal` of a reference whiteboard; refuses one too dark to divide by."""
+    signal, variance = _signal(boards, gain, frame, f"{what}, open aperture without masks")
+    if frame is not None and float(signal.min()) * frame.exposure_s < DARKEST_REFERENCE_DN:
+        raise CalibrationError(
+            f"the reference whiteboard ({what}) has pixels less than {DARKEST_REFERENCE_DN:g} DN "
+            "above the dark: raise the lamp or the exposure"
+        )
+    return signal, variance
+
+
+def _samples(pixels: Array, binning: int) -> Array:
+    return np.repeat(np.repeat(pixels, binning, axis=0), binning, axis=1)
+
+
+def _shares(designed: Array, binning: int) -> Array:
+    """Return what share of its pixel's coefficient each sample has in the design, (y, x)."""
+    if binning == 1:
+        return np.ones_like(designed)
+    rows, columns = designed.shape[0] // binning, designed.shape[1] // binning
+    sums = designed.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
+    whole = _samples(sums, binning)
+    even = 1 / binning**2
+    return np.where(whole > 0, designed / np.where(whole > 0, whole, 1), even)

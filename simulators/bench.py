@@ -1,0 +1,232 @@
+"""The simulated bench: what the camera's sensor reads, ray by ray, where everything really stands.
+
+This is an independent account of the physics in `emmc_rig.model.camera`: it follows single rays
+from points inside every pixel to points inside every aperture cell, looks each mask up where the
+ray meets it (misplaced, turned and stretched by errors that nobody is told), and takes the light
+from a scene sampled finer than the light field that will be reconstructed. Nothing here uses the
+imaging matrix, so that no reconstruction is tested on data made by the operator it inverts.
+
+Source: paper, eq. 2, 4 and 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.stats.qmc import Sobol
+
+from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
+
+Array = NDArray[np.floating]
+LAMPS = {
+    "off": (0.0, 0.0, 0.0),
+    "white": (1.0, 1.0, 1.0),
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}
+RAYS_PER_VIEW = 128
+
+
+@dataclass(frozen=True)
+class MountingErrors:
+    """How the masks really sit, which the program is not told."""
+
+    offset_um: tuple[float, float] = (6.5, -4.0)
+    rotation_deg: float = 0.03
+    stretch: float = 1.0004
+
+
+NO_ERRORS = MountingErrors((0.0, 0.0), 0.0, 1.0)
+
+
+def ray_points(views: tuple[int, int], count: int) -> NDArray[np.float64]:
+    """Return where the rays of every view start in a pixel and an aperture cell, in [0, 1).
+
+    Sobol points, scrambled differently for every view: (v, u, count, 4), the last axis x, y, u, v.
+    """
+    shape = (views[0] * views[1], count, 4)
+    points = [Sobol(4, rng=np.random.default_rng(view)).random(count) for view in range(shape[0])]
+    return np.reshape(points, (*views, count, 4))
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def trace(
+    scene, finer, response, lamp, points, lengths_um, pinhole_um, cells, starts, shapes, plates, readings
+):
+    """Set readings (y, x), per sample, to the mean over rays of lamp x masks x scene x response.
+
+    scene: (v f, u f, y g, x g, colour) with finer = (f, g); or 1 x 1 x 1 x 1 x 3 for a whiteboard.
+    points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
+    open width of a cell. pinhole_um: (x, y, half side) of the open square at the lens; half side 0:
+    no plate. cells: (all cells, colour); starts, shapes: where each mask lies in it, (rows,
+    columns). plates: per mask distance_um, cell_um, x_um, y_um, cosine, sine of its turn.
+    """
+    rows, columns = readings.shape
+    views_v, views_u, count = points.shape[0], points.shape[1], points.shape[2]
+    lens_um, pitch_um, width_um, cell_um, open_um = lengths_um
+    board = scene.shape[2] == 1
+    f, g = finer
+    for y in prange(rows):
+        passed = np.empty((3, columns), np.float32)
+        total = np.zeros(columns)
+        for v in range(views_v):
+            for u in range(views_u):
+                for ray in range(count):
+                    in_x, in_y, in_u, in_v = points[v, u, ray]
+                    ray_u = (u - (views_u - 1) / 2) * cell_um + (in_u - 0.5) * open_um
+                    ray_v = (v - (views_v - 1) / 2) * cell_um + (in_v - 0.5) * open_um
+                    if pinhole_um[2] > 0 and (
+                        abs(ray_u - pinhole_um[0]) > pinhole_um[2]
+                        or abs(ray_v - pinhole_um[1]) > pinhole_um[2]
+                    ):
+                        continue
+                    first_x = -(columns - 1) / 2 * pitch_um + (in_x - 0.5) * width_um
+                    ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
+                    for c in range(3):
+                        passed[c, :] = lamp[c]
+                    for mask in range(plates.shape[0]):
+                        ratio = plates[mask, 0] / lens_um
+                        size = plates[mask, 1]
+                        cosine, sine = plates[mask, 4], plates[mask, 5]
+                        at_x = (1 - ratio) * first_x + ratio * ray_u - plates[mask, 2]
+                        at_y = (1 - ratio) * ray_y + ratio * ray_v - plates[mask, 3]
+                        height, width = shapes[mask, 0], shapes[mask, 1]
+                        column = (cosine * at_x + sine * at_y) / size + width / 2
+                        row = (cosine * at_y - sine * at_x) / size + height / 2
+                        along = (1 - ratio) * pitch_um * cosine / size
+                        across = -(1 - ratio) * pitch_um * sine / size
+                        start = starts[mask]
+                        for x in range(columns):
+                            j = int(np.floor(column + along * x))
+                            i = int(np.floor(row + across * x))
+                            if i < 0 or j < 0 or i >= height or j >= width:
+                                for c in range(3):
+                                    passed[c, x] = 0
+                            else:
+                                for c in range(3):
+                                    passed[c, x] *= cells[start + i * width + j, c]
+                    fine_v, fine_u = v * f + int(in_v * f), u * f + int(in_u * f)
+                    fine_y, fine_x = y * g + int(in_y * g), int(in_x * g)
+                    for c in range(3):
+                        if board:
+                            for x in range(columns):
+                                total[x] += passed[c, x] * response[y, x, c]
+                        else:
+                            line = scene[fine_v, fine_u, fine_y]
+                            for x in range(columns):
+                                total[x] += (
+                                    passed[c, x] * response[y, x, c] * line[fine_x + x * g, c]
+                                )
+        for x in range(columns):
+            readings[y, x] = total[x] / (count * views_v * views_u)
+
+
+class Bench:
+    """Scene or whiteboard, lamp, masks, pinhole plate and sensor of a camera, as they really are.
+
+    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1.
+    positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
+        axis), aperture_x, aperture_y (0: the pinhole on the axis).
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        scene: NDArray[np.float32],
+        size: tuple[int, int],
+        positions_um: Callable[[], Mapping[str, float]],
+        rng: np.random.Generator,
+        errors: MountingErrors | None = None,
+        rays_per_view: int = RAYS_PER_VIEW,
+    ) -> None:
+        views = camera.views
+        finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
+        expected = (views[0] * finer[0], views[1] * finer[0], size[0] * finer[1], size[1] * finer[1])
+        if scene.shape != (*expected, 3):
+            raise ValueError(f"a scene of shape {scene.shape} is no finer grid of {views} x {size}")
+        self.lamp = "off"
+        self.target = "scene"
+        self.shot = 0
+        self.masks_in = True
+        self.pinhole_in = False
+        self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
+        self._positions_um, self._rng = positions_um, rng
+        self._errors = MountingErrors() if errors is None else errors
+        self._points = ray_points(views, rays_per_view)
+        self._plates = draw_plates(camera, size)
+        self._response = sensor_response(camera, size)
+        self._light = pixel_light(camera, size)
+        self._seen: tuple[tuple, Array] | None = None
+
+    def readings(self) -> Array:
+        """Return the noise-free readings (pixel_y, pixel_x) of the bench as it now stands."""
+        at_um = self._positions_um()
+        state = (self.lamp, self.target, self.shot, self.masks_in, self.pinhole_in, *at_um.values())
+        if self._seen is None or self._seen[0] != state:
+            self._seen = (state, self._trace(at_um))
+        return self._seen[1]
+
+    def expose(self, exposure_s: float) -> NDArray[np.uint16]:
+        """Return one noisy frame (pixel_y, pixel_x) in DN."""
+        noise, light = self._camera.sensor.noise, self._light[self.shot]
+        return noise.expose_dn(self.readings(), exposure_s, light, self._rng)
+
+    def _trace(self, at_um: Mapping[str, float]) -> Array:
+        camera = self._camera
+        lens, sensor = camera.lens, camera.sensor
+        cell_um = lens.aperture_cell_mm * 1e3
+        names = camera.shot_masks(self.shot) if self.masks_in else ()
+        cells, starts, shapes, plates = [np.zeros((0, 3), np.float32)], [], [], []
+        turn = np.deg2rad(self._errors.rotation_deg)
+        for name in names:
+            plate = self._plates[name]
+            frame = plate.cells[self.shot % len(plate.cells)]
+            starts.append(sum(len(part) for part in cells))
+            shapes.append(frame.shape[:2])
+            cells.append(frame.reshape(-1, 3))
+            moves = name in camera.moving_masks
+            at_lens = plate.distance_mm >= lens.distance_mm
+            off_x, off_y = (0.0, 0.0) if at_lens else self._errors.offset_um
+            stretch = 1.0 if at_lens else self._errors.stretch
+            plates.append(
+                (
+                    plate.distance_mm * 1e3,
+                    plate.cell_um * stretch,
+                    off_x + (at_um["mask_x"] if moves else 0.0),
+                    off_y + (at_um["mask_y"] if moves else 0.0),
+                    1.0 if at_lens else np.cos(turn),
+                    0.0 if at_lens else np.sin(turn),
+                )
+            )
+        scene = np.ones((1, 1, 1, 1, 3), np.float32) if self.target == "whiteboard" else self._scene
+        response = self._response[self.shot]
+        seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
+        samples = np.empty(self._size)
+        trace(
+            scene,
+            self._finer,
+            (response / seen).astype(np.float32),
+            np.array(LAMPS[self.lamp]),
+            self._points,
+            (
+                lens.distance_mm * 1e3,
+                sensor.sample_pitch_um,
+                sensor.sample_pitch_um * sensor.pixel_fill,
+                cell_um,
+                cell_um * lens.aperture_fill,
+            ),
+            np.array([at_um["aperture_x"], at_um["aperture_y"], cell_um / 2 * self.pinhole_in]),
+            np.concatenate(cells),
+            np.array(starts, dtype=np.int64),
+            np.array(shapes, dtype=np.int64).reshape(-1, 2),
+            np.array(plates, dtype=np.float64).reshape(-1, 6),
+            samples,
+        )
+        k = sensor.binning
+        rows, columns = self._size[0] // k, self._size[1] // k
+        return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
