@@ -26,6 +26,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 Array = NDArray[np.floating]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
+IDEAL_DN = 1e6
 
 
 def lamps_needed(design: ImagingMatrix) -> tuple[str, ...]:
@@ -82,7 +83,7 @@ def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
     views_v, views_u = design.weights.shape[1:3]
     first = boards.references.get((0, lamps[0]))
     if first is None:
-        raise CalibrationError("reference whiteboard missing: open the aperture, take the masks out")
+        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
     gain = photon_transfer(boards.dark, first)
     weights = np.empty_like(design.weights)
     deviation = np.empty_like(design.weights)
@@ -111,6 +112,27 @@ def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
         deviation[shot] /= len(lamps)
     psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
+
+
+def ideal_boards(
+    readings: Mapping[tuple[int, int, int, str], Array],
+    lamps: tuple[str, ...],
+    design: ImagingMatrix,
+) -> Whiteboards:
+    """Return the whiteboards of a noise-free sensor from what a simulated bench really reads.
+
+    readings: (pixel_y, pixel_x) through the pinhole, by (shot, v, u, lamp); 1 is a white board
+    before the open camera, of which each of several lamp colours gives its share.
+    """
+
+    def frame(reading: Array) -> MeanFrame:
+        return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
+
+    size = design.frames_shape[1:]
+    white = np.full(size, 1 / len(lamps))
+    references = {(shot, lamp): frame(white) for shot in range(design.shots) for lamp in lamps}
+    pinholes = {key: frame(reading) for key, reading in readings.items()}
+    return Whiteboards(frame(np.zeros(size)), references, pinholes)
 
 
 def _signal(

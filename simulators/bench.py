@@ -30,6 +30,7 @@ LAMPS = {
     "blue": (0.0, 0.0, 1.0),
 }
 RAYS_PER_VIEW = 128
+WINDOW_MARGIN = 0.05
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,26 @@ def ray_points(views: tuple[int, int], count: int) -> NDArray[np.float64]:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def trace(
-    scene, finer, response, lamp, points, lengths_um, pinhole_um, cells, starts, shapes, plates, readings
+    scene,
+    finer,
+    response,
+    lamp,
+    points,
+    lengths_um,
+    openings_um,
+    cells,
+    starts,
+    shapes,
+    plates,
+    readings,
 ):
     """Set readings (y, x), per sample, to the mean over rays of lamp x masks x scene x response.
 
     scene: (v f, u f, y g, x g, colour) with finer = (f, g); or 1 x 1 x 1 x 1 x 3 for a whiteboard.
     points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
-    open width of a cell. pinhole_um: (x, y, half side) of the open square at the lens; half side 0:
-    no plate. cells: (all cells, colour); starts, shapes: where each mask lies in it, (rows,
-    columns). plates: per mask distance_um, cell_um, x_um, y_um, cosine, sine of its turn.
+    open width of a cell. openings_um: (opening, 3), x, y and half side of the squares at the lens
+    that the aperture plate leaves open. cells: (all cells, colour); starts, shapes: where each
+    mask lies in it, (rows, columns). plates: per mask distance_um, cell_um, x_um, y_um, cosine, sine of its turn.
     """
     rows, columns = readings.shape
     views_v, views_u, count = points.shape[0], points.shape[1], points.shape[2]
@@ -80,10 +92,14 @@ def trace(
                     in_x, in_y, in_u, in_v = points[v, u, ray]
                     ray_u = (u - (views_u - 1) / 2) * cell_um + (in_u - 0.5) * open_um
                     ray_v = (v - (views_v - 1) / 2) * cell_um + (in_v - 0.5) * open_um
-                    if pinhole_um[2] > 0 and (
-                        abs(ray_u - pinhole_um[0]) > pinhole_um[2]
-                        or abs(ray_v - pinhole_um[1]) > pinhole_um[2]
-                    ):
+                    blocked = True
+                    for opening in openings_um:
+                        if (
+                            abs(ray_u - opening[0]) <= opening[2]
+                            and abs(ray_v - opening[1]) <= opening[2]
+                        ):
+                            blocked = False
+                    if blocked:
                         continue
                     first_x = -(columns - 1) / 2 * pitch_um + (in_x - 0.5) * width_um
                     ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
@@ -132,6 +148,8 @@ class Bench:
     scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1.
     positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
         axis), aperture_x, aperture_y (0: the pinhole on the axis).
+    window_um: the stage's x that brings the plate's window, as large as the aperture, onto the
+        axis; but for it and the pinhole of one aperture cell the plate is opaque.
     """
 
     def __init__(
@@ -140,22 +158,27 @@ class Bench:
         scene: NDArray[np.float32],
         size: tuple[int, int],
         positions_um: Callable[[], Mapping[str, float]],
+        window_um: float,
         rng: np.random.Generator,
         errors: MountingErrors | None = None,
         rays_per_view: int = RAYS_PER_VIEW,
     ) -> None:
         views = camera.views
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
-        expected = (views[0] * finer[0], views[1] * finer[0], size[0] * finer[1], size[1] * finer[1])
+        expected = (
+            views[0] * finer[0],
+            views[1] * finer[0],
+            size[0] * finer[1],
+            size[1] * finer[1],
+        )
         if scene.shape != (*expected, 3):
             raise ValueError(f"a scene of shape {scene.shape} is no finer grid of {views} x {size}")
         self.lamp = "off"
         self.target = "scene"
         self.shot = 0
         self.masks_in = True
-        self.pinhole_in = False
         self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
-        self._positions_um, self._rng = positions_um, rng
+        self._positions_um, self._window_um, self._rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
         self._points = ray_points(views, rays_per_view)
         self._plates = draw_plates(camera, size)
@@ -166,7 +189,7 @@ class Bench:
     def readings(self) -> Array:
         """Return the noise-free readings (pixel_y, pixel_x) of the bench as it now stands."""
         at_um = self._positions_um()
-        state = (self.lamp, self.target, self.shot, self.masks_in, self.pinhole_in, *at_um.values())
+        state = (self.lamp, self.target, self.shot, self.masks_in, *at_um.values())
         if self._seen is None or self._seen[0] != state:
             self._seen = (state, self._trace(at_um))
         return self._seen[1]
@@ -220,7 +243,7 @@ class Bench:
                 cell_um,
                 cell_um * lens.aperture_fill,
             ),
-            np.array([at_um["aperture_x"], at_um["aperture_y"], cell_um / 2 * self.pinhole_in]),
+            self._openings(at_um["aperture_x"], at_um["aperture_y"]),
             np.concatenate(cells),
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),
@@ -230,3 +253,14 @@ class Bench:
         k = sensor.binning
         rows, columns = self._size[0] // k, self._size[1] // k
         return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
+
+    def _openings(self, x_um: float, y_um: float) -> Array:
+        """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
+        cell_um = self._camera.lens.aperture_cell_mm * 1e3
+        window_half_um = max(self._camera.views) * cell_um / 2
+        return np.array(
+            [
+                (x_um, y_um, cell_um / 2),
+                (x_um - self._window_um, y_um, window_half_um * (1 + WINDOW_MARGIN)),
+            ]
+        )

@@ -267,7 +267,8 @@ def _cell_count(axis: _Axis, mask: Mask, offsets_um: list[float], pitch_um: floa
         return count
     count += 2 * mask.spare_cells
     view_span_um = axis.views_um[-1] - axis.views_um[0]
-    span = view_span_um * mask.distance_mm * 1e3 / axis.lens_um + pitch_um * len(axis.samples_um)
+    ratio = mask.distance_mm * 1e3 / axis.lens_um
+    span = view_span_um * ratio + (1 - ratio) * pitch_um * len(axis.samples_um)
     return count + (count - round(span / mask.cell_um)) % 2
 
 

@@ -66,23 +66,29 @@ def project(weights, colour, light_field, binning, frames):
 
 @njit(cache=True, parallel=True)
 def back_project(weights, colour, frames, binning, light_field):
-    """Set light_field = Psi^T frames."""
-    shots, views_v, views_u, _, _, width = weights.shape
+    """Set light_field = Psi^T frames; every row is gathered in cache and written once."""
+    shots, views_v, views_u, _, stored, width = weights.shape
     for row in prange(frames.shape[1]):
-        spread = np.empty(width, frames.dtype)
+        spread = np.empty((shots, width), frames.dtype)
+        line = np.empty((width, 3), frames.dtype)
+        for shot in range(shots):
+            for x in range(width):
+                spread[shot, x] = frames[shot, row, x // binning]
         for part in range(binning):
             y = row * binning + part
             for v in range(views_v):
                 for u in range(views_u):
-                    light_field[v, u, y] = 0
-        for shot in range(shots):
-            for x in range(width):
-                spread[x] = frames[shot, row, x // binning]
-            for part in range(binning):
-                y = row * binning + part
-                for v in range(views_v):
-                    for u in range(views_u):
-                        spread_row(weights, colour, spread, shot, y, v, u, light_field)
+                    line[:] = 0
+                    for shot in range(shots):
+                        for c in range(stored):
+                            weight = weights[shot, v, u, y, c]
+                            for x in range(width):
+                                where = c if stored == 3 else colour[shot, y, x]
+                                line[x, where] += weight[x] * spread[shot, x]
+                    out = light_field[v, u, y]
+                    for x in range(width):
+                        for c in range(3):
+                            out[c, x] = line[x, c]
 
 
 @njit(cache=True, parallel=True)

@@ -219,8 +219,8 @@ def _as_frames(cells: object, ndim: int) -> NDArray[np.float32]:
     """Return nested lists as (frame, row, column, colour); `ndim` says which axes they have."""
     try:
         array = np.asarray(cells, dtype=np.float32)
-    except ValueError as fault:
-        raise ValueError("the rows have different lengths") from fault
+    except (TypeError, ValueError) as fault:
+        raise ValueError("rows of different lengths, or cells that are not numbers") from fault
     if array.ndim == ndim:
         array = np.repeat(array[..., None], 3, axis=-1)
     if array.ndim != ndim + 1 or array.shape[-1] != 3 or array.size == 0:

@@ -7,6 +7,7 @@ pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per pixel.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from dataclasses import dataclass
@@ -64,6 +65,8 @@ class ImagingMatrix:
             raise SensingError(f"weights of shape {self.weights.shape} do not make a Psi")
         if self.colour is not None and self.colour.shape != (self.shots, *self.size):
             raise SensingError(f"colour map of shape {self.colour.shape} does not fit the weights")
+        if self.colour is not None and self.colour.max() > 2:
+            raise SensingError("the colour map names colours beyond red, green and blue")
         if self.size[0] % self.binning or self.size[1] % self.binning:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
         if not np.isfinite(self.weights).all():
@@ -230,7 +233,8 @@ class ImagingMatrix:
         except OSError as fault:
             raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
         finally:
-            partial.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                partial.unlink()
 
     @classmethod
     def load(cls, path: Path) -> ImagingMatrix:
@@ -248,7 +252,8 @@ class ImagingMatrix:
                 )
                 expected = file.attrs["sha256"]
         except (OSError, KeyError) as fault:
-            raise SensingError(f"{path}: cannot be read as an imaging matrix ({fault})") from fault
+            why = " ".join(str(fault).split())
+            raise SensingError(f"{path}: cannot be read as an imaging matrix ({why})") from fault
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix

@@ -57,8 +57,12 @@ def _tags(node: dict[str, Any]) -> list[str]:
 
 
 def explain(error: ValidationError, cls: type[BaseModel]) -> str:
-    """Return the first fault of a failed validation as one line for the user."""
-    first = error.errors()[0]
+    """Return the first fault of a failed validation as one line for the user.
+
+    An unknown key comes before others: a misspelt key that is required is also a missing one.
+    """
+    faults = error.errors()
+    first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), faults[0])
     where = ".".join(str(part) for part in first["loc"]) or "the file"
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])

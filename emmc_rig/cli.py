@@ -1,0 +1,298 @@
+"""The command line: arguments in, exit code out; 0 done, 1 failed, 2 wrong usage, 130 Ctrl-C."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+
+from calibration.errors import CalibrationError
+from drivers.errors import DriverError
+from emmc_rig import __version__
+from emmc_rig.errors import AppError
+from emmc_rig.model.errors import ModelError
+from reconstruction.errors import ReconstructionError
+
+ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
+DEFAULT_SCENE = "deep-occlusions"
+DEFAULT_CAMERA = "rgbw-bayer-3shots"
+
+app = typer.Typer(
+    name="emmc-rig",
+    help="Compressed light-field acquisition: model, rig, calibration, reconstruction.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console(stderr=True)
+
+SceneOption = Annotated[
+    str,
+    typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),
+]
+CameraOption = Annotated[
+    str, typer.Option("--camera", help="a shipped camera (see `emmc-rig cameras`) or a YAML file")
+]
+ShotsOption = Annotated[
+    int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
+]
+SizeOption = Annotated[
+    str | None, typer.Option("--size", help="ROWSxCOLUMNS: the middle of a scene, or its size")
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
+OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+
+
+class Bars:
+    """A `Watcher` that draws progress bars on a terminal, and plain lines elsewhere."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._task: TaskID | None = None
+
+    def begin(self, stage: str, steps: int | None) -> None:
+        """Finish the stage before and start a bar."""
+        self.finish()
+        self._task = self._progress.add_task(stage, total=steps, detail="")
+        if not console.is_terminal:
+            console.print(stage)
+
+    def step(self, detail: str) -> None:
+        """Advance the current bar."""
+        if self._task is not None:
+            self._progress.update(self._task, advance=1, detail=detail)
+
+    def finish(self) -> None:
+        """Fill the current bar: a solver may stop before its last step."""
+        if self._task is not None:
+            done = self._progress.tasks[-1].completed or 1
+            self._progress.update(self._task, total=done, completed=done, detail="")
+
+
+def _progress() -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[detail]}"),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def _shown(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    rows, cross, columns = text.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise AppError(f"--size {text}: write ROWSxCOLUMNS, for instance 192x256")
+    return int(rows), int(columns)
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
+) -> None:
+    """Compressed light-field acquisition: model, rig, calibration, reconstruction."""
+    if version:
+        typer.echo(f"emmc-rig {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    scene: SceneOption = DEFAULT_SCENE,
+    camera: CameraOption = DEFAULT_CAMERA,
+    shots: ShotsOption = None,
+    seed: SeedOption = 0,
+    size: SizeOption = None,
+    out: OutOption = Path("emmc-demo"),
+) -> None:
+    """Run the whole loop on the simulated rig, and write a report."""
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.demo import DemoSettings, run_demo
+    from emmc_rig.output import result_folder
+
+    described = find_camera(camera)
+    if shots is not None:
+        described = described.with_shots(shots)
+    settings = DemoSettings(scene, camera, described, _size(size), seed)
+    for warning in described.warnings():
+        console.print(f"[yellow]warning:[/] {warning}", highlight=False)
+    with result_folder(out) as folder, _progress() as progress:
+        bars = Bars(progress)
+        metrics = run_demo(settings, folder, bars)
+        bars.finish()
+    gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
+    typer.echo(
+        f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
+        f"copied centre view; SSIM {metrics['ssim']:.3f}; Psi to "
+        f"{metrics['psi_relative_error']:.2%}; {metrics['status']}"
+        + (f" ({metrics['advice']})" if metrics["advice"] else "")
+    )
+    typer.echo(f"open {out / 'report.html'}")
+
+
+@app.command()
+def cameras(
+    name: Annotated[
+        str | None, typer.Argument(help="a shipped camera or a YAML file; none: list all")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder for the drawing and its metrics")
+    ] = None,
+) -> None:
+    """List the cameras known, or draw one: masks, weights, sampling, condition."""
+    from emmc_rig.camera_sheet import (
+        camera_figures,
+        camera_rows,
+        draw_camera,
+        find_camera,
+    )
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    if name is None:
+        table = Table("name", "title", "sensor", "shots", "masks", "sampling", "light")
+        for row in camera_rows():
+            table.add_row(
+                row.name,
+                row.title,
+                row.sensor,
+                str(row.shots),
+                str(row.masks),
+                row.sampling_rate,
+                f"{row.light_percent:.0f} %",
+            )
+        Console().print(table)
+        return
+    camera = find_camera(name)
+    figures = camera_figures(camera)
+    folder_name = out or Path(f"camera-{Path(name).stem}")
+    with result_folder(folder_name) as folder:
+        draw_camera(camera, folder / "camera.png")
+        write_metrics(folder, {**figures, "command": command_line(), "versions": versions()})
+    table = Table("figure", "value", title=camera.title)
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            for mask, measured in value.items():
+                for what, figure in measured.items():
+                    table.add_row(f"{mask}: {what}", _shown(figure))
+        else:
+            table.add_row(key, _shown(value))
+    Console().print(table)
+    typer.echo(f"open {folder_name / 'camera.png'}")
+
+
+@app.command()
+def simulate(
+    scene: SceneOption = DEFAULT_SCENE,
+    camera: CameraOption = DEFAULT_CAMERA,
+    shots: ShotsOption = None,
+    seed: SeedOption = 0,
+    size: SizeOption = None,
+    out: OutOption = Path("emmc-frames"),
+) -> None:
+    """Make frames of a light field through any camera, without a rig."""
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import result_folder
+    from emmc_rig.simulate import simulate as run
+
+    described = find_camera(camera)
+    if shots is not None:
+        described = described.with_shots(shots)
+    with result_folder(out) as folder:
+        metrics = run(scene, camera, described, _size(size), seed, folder)
+    typer.echo(
+        f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "
+        f"efficiency {metrics['light_efficiency']:.1%}; in {out}"
+    )
+
+
+@app.command()
+def chart(
+    kernels: Annotated[
+        bool, typer.Option("--kernels", help="time the kernels against a memory triad")
+    ] = False,
+    camera: CameraOption = "rgbw-bayer-1shot",
+    size: SizeOption = "593x840",
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
+    out: OutOption = Path("emmc-kernels"),
+) -> None:
+    """Measure speed: `--kernels` prints every kernel as a ratio to its memory bound."""
+    from emmc_rig.benchmark import kernel_timings, reconstruction_memory
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    if not kernels:
+        raise typer.BadParameter("say what to chart: --kernels")
+    described, shape = find_camera(camera), _size(size)
+    assert shape is not None
+    table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
+    rows = []
+    with result_folder(out) as folder:
+        seconds, peak_gib = reconstruction_memory(camera, shape)
+        for timing in kernel_timings(described, shape, repeats):
+            rows.append(timing.as_dict())
+            table.add_row(
+                timing.name,
+                f"{timing.gigabytes:.3f}",
+                f"{timing.seconds * 1e3:.1f}",
+                f"{timing.gigabytes / timing.seconds:.1f}",
+                f"{timing.ratio:.2f}",
+            )
+        metrics = {
+            "camera": camera,
+            "size": list(shape),
+            "kernels": rows,
+            "reconstruction_seconds": seconds,
+            "reconstruction_peak_gib": peak_gib,
+            "command": command_line(),
+            "versions": versions(),
+        }
+        write_metrics(folder, metrics)
+    Console().print(table)
+    typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+
+
+def main() -> None:
+    """Run the program; never shows a traceback for a fault that the user can mend."""
+    try:
+        sys.exit(app(standalone_mode=False) or 0)
+    except KeyboardInterrupt:
+        _fail("stopped by Ctrl-C; nothing was written", 130)
+    except ERRORS as fault:
+        _fail(str(fault), 1)
+    except MemoryError:
+        _fail("not enough memory: use a smaller --size or fewer shots", 1)
+    except Exception as fault:
+        show, code = getattr(fault, "show", None), getattr(fault, "exit_code", None)
+        if type(fault).__name__ == "Abort":
+            _fail("stopped by Ctrl-C; nothing was written", 130)
+        if show is None or code is None:
+            raise
+        show()
+        sys.exit(code)
+
+
+def _fail(message: str, code: int) -> None:
+    console.print(f"[bold red]emmc-rig:[/] {message}", highlight=False, soft_wrap=True)
+    sys.exit(code)

@@ -1,0 +1,254 @@
+"""The whole loop on the simulated rig: whiteboards -> Psi -> shots -> light field -> report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.frames import MeanFrame
+from calibration.whiteboard import (
+    Calibration,
+    ideal_boards,
+    lamps_needed,
+    measure_psi,
+)
+from emmc_rig.capture import capture_shots, capture_whiteboards, whiteboard_exposures
+from emmc_rig.hardware import simulated_rig
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.lightfield import (
+    focus_disparities,
+    psnr_db,
+    replicate_centre,
+    save_hdf5,
+    ssim,
+)
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.report import ReportContent, write_report
+from emmc_rig.scene import fine_scene
+from reconstruction.result import Progress, Reconstruction
+from reconstruction.tv import TVSettings, reconstruct_tv
+
+APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
+Array = NDArray[np.floating]
+
+
+class Watcher(Protocol):
+    """Whoever shows the progress of a long run."""
+
+    def begin(self, stage: str, steps: int | None) -> None:
+        """A stage begins; steps is None where it is not known how many there will be."""
+        ...
+
+    def step(self, detail: str) -> None:
+        """One step of the current stage is done."""
+        ...
+
+
+class Silent:
+    """A watcher that shows nothing."""
+
+    def begin(self, stage: str, steps: int | None) -> None:
+        """Ignore it."""
+
+    def step(self, detail: str) -> None:
+        """Ignore it."""
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """What to run: scene and camera with their names, size (rows, columns) or None, seed."""
+
+    scene: str
+    camera_name: str
+    camera: Camera
+    size: tuple[int, int] | None = None
+    seed: int = 0
+    whiteboard_repeats: int = 2
+    solver: TVSettings = field(default_factory=TVSettings)
+
+
+@dataclass
+class _Stages:
+    """The seconds that each stage took, in order."""
+
+    watcher: Watcher
+    clock: Callable[[], float] = time.perf_counter
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str, steps: int | None = None) -> Iterator[None]:
+        self.watcher.begin(name, steps)
+        started = self.clock()
+        yield
+        self.seconds[name] = self.clock() - started
+
+
+def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = None) -> dict:
+    """Run the demo into an existing folder and return its metrics.
+
+    Writes light_field.h5, psi.h5, frames.h5, metrics.json and report.html. Raises the errors of
+    the layers below, each one line.
+    """
+    watcher = watcher or Silent()
+    stages = _Stages(watcher)
+    camera = settings.camera
+    with stages("scene"):
+        fine = fine_scene(
+            settings.scene,
+            APERTURE_FACTOR,
+            PIXEL_FACTOR,
+            size=settings.size,
+            views=camera.views,
+            seed=settings.seed,
+        )
+        truth = fine.scene.light_field
+        size = (truth.shape[2], truth.shape[3])
+    with stages("design"):
+        design = build_imaging_matrix(camera, size)
+        rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
+    lamps = lamps_needed(design)
+    seen: dict[tuple[int, int, int, str], Array] = {}
+    with stages("whiteboards", whiteboard_exposures(camera, lamps, settings.whiteboard_repeats)):
+        boards = capture_whiteboards(
+            rig,
+            camera,
+            lamps,
+            settings.whiteboard_repeats,
+            on_frame=watcher.step,
+            on_setting=lambda key: seen.__setitem__(key, bench.readings()),
+        )
+    with stages("psi"):
+        calibration = measure_psi(boards, design)
+        exact = exact_psi(design, seen, lamps)
+        psi_error = calibration.psi.relative_difference(exact)
+        design_error = design.relative_difference(exact)
+    with stages("capture", design.shots):
+        frames_dn = capture_shots(rig, camera, watcher.step)
+    with stages("reconstruct", settings.solver.max_steps):
+        readings = calibration.readings(frames_dn, camera.exposures_s())
+        usable = frames_dn < camera.sensor.noise.white_level_dn
+        variance = calibration.reading_variance(frames_dn, camera.exposures_s())
+        sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
+
+        def reconstruct(psi: ImagingMatrix) -> Reconstruction:
+            return reconstruct_tv(
+                psi, readings, sigma, settings.solver, usable, lambda p: watcher.step(_told(p))
+            )
+
+        result = reconstruct(calibration.psi)
+    with stages("exact Psi, for comparison", settings.solver.max_steps):
+        compared = reconstruct(exact)
+    with stages("evaluate"):
+        estimate = result.light_field
+        exact_psnr = psnr_db(compared.light_field, truth)
+        metrics = {
+            "scene": settings.scene,
+            "scene_provenance": fine.scene.provenance,
+            "camera": settings.camera_name,
+            "shots": design.shots,
+            "size": list(size),
+            "psnr_db": psnr_db(estimate, truth),
+            "ssim": ssim(estimate, truth),
+            "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
+            "psi_relative_error": psi_error,
+            "design_relative_error": design_error,
+            "psi_mean_deviation": float(calibration.deviation.mean()),
+            "exact_psi_psnr_db": exact_psnr,
+            "calibration_cost_db": exact_psnr - psnr_db(estimate, truth),
+            "noise_sigma": sigma,
+            "saturated_share": float(1 - usable.mean()),
+            "whiteboard_frames": whiteboard_exposures(camera, lamps, settings.whiteboard_repeats),
+            "method": result.method,
+            "status": result.status,
+            "advice": result.advice,
+            "steps": result.steps,
+            "parameters": result.parameters,
+            "seed": settings.seed,
+            "warnings": camera.warnings(),
+            "command": command_line(),
+            "versions": versions(),
+        }
+    with stages("write"):
+        save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": metrics["psnr_db"]})
+        calibration.psi.save(folder / "psi.h5")
+        metrics["seconds"] = dict(stages.seconds)
+        write_report(
+            folder / "report.html",
+            _report(settings, metrics, truth, result, readings, calibration, boards.pinholes),
+        )
+    metrics["seconds"] = dict(stages.seconds)
+    write_metrics(folder, metrics)
+    return metrics
+
+
+def exact_psi(
+    design: ImagingMatrix,
+    readings: dict[tuple[int, int, int, str], Array],
+    lamps: tuple[str, ...],
+) -> ImagingMatrix:
+    """Return the Psi that noise-free whiteboards of the bench would give.
+
+    readings: (pixel_y, pixel_x) by (shot, v, u, lamp), as the bench computes them without noise.
+    """
+    return measure_psi(ideal_boards(readings, lamps, design), design).psi
+
+
+def _told(progress: Progress) -> str:
+    return f"change {progress.relative_change:.1e}"
+
+
+def _report(
+    settings: DemoSettings,
+    metrics: dict,
+    truth: Array,
+    result: Reconstruction,
+    readings: Array,
+    calibration: Calibration,
+    pinholes: dict[tuple[int, int, int, str], MeanFrame],
+) -> ReportContent:
+    camera = settings.camera
+    weights, deviation = (
+        array[0].sum(axis=3) for array in (calibration.psi.weights, calibration.deviation)
+    )
+    keys = list(pinholes)
+    chosen = [keys[0], keys[len(keys) // 2], keys[-1]]
+    boards = [
+        (
+            f"shot {shot + 1}, view ({v}, {u}), {lamp} lamp",
+            pinholes[shot, v, u, lamp].mean_dn - calibration.dark_dn,
+        )
+        for shot, v, u, lamp in chosen
+    ]
+    peak = max(float(np.percentile(board, 99.9)) for _, board in boards)
+    front, _, back = focus_disparities(truth)
+    return ReportContent(
+        title=f"{settings.scene} through {settings.camera_name}",
+        scene=settings.scene,
+        camera=settings.camera_name,
+        camera_line=camera.title,
+        camera_reference=camera.reference,
+        estimate=result.light_field,
+        truth=truth,
+        frames=readings,
+        cfa=camera.sensor.cfa if isinstance(camera.sensor.cfa, str) else "custom",
+        cfa_tile=cfa_tile(camera.sensor.cfa),
+        whiteboards=[(label, board / peak) for label, board in boards],
+        psi=weights,
+        psi_std=deviation,
+        metrics=metrics,
+        stage_s=metrics["seconds"],
+        objective=[value for _, value in result.objective],
+        disparity_range_px=(min(front, back), max(front, back)),
+        warnings=metrics["warnings"],
+        command=metrics["command"],
+    )

@@ -1,0 +1,522 @@
+"""A light field is a float32 array (v, u, y, x, c): read it, write it, look into it, compare two.
+
+Views come first, rows of views before columns; colours are linear RGB in [0, 1]. The centre view
+is view (V // 2, U // 2). Disparity is signed, in pixels per view step: a point at x in the centre
+view is at x + disparity (u - U // 2) in view u, and likewise along (v, y). Picture files hold the
+linear values themselves, with no gamma.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from emmc_rig.model.errors import SceneError
+
+_DATASET = "light_field"
+_VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+
+
+def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
+    """Return `lf` as contiguous float32, or say what keeps it from being a light field.
+
+    Args:
+        lf: anything; right is a floating (v, u, y, x, 3) array in [0, 1] of 2x2 views or more.
+        source: where it came from, for the message.
+
+    Raises:
+        SceneError: wrong shape or type, or a sample that is not finite or not in [0, 1].
+    """
+    lf = np.asarray(lf)
+    if lf.ndim != 5:
+        raise SceneError(f"{source}: shape {lf.shape} is not (v, u, y, x, c)")
+    if min(lf.shape[:2]) < 2:
+        raise SceneError(f"{source}: {lf.shape[0]}x{lf.shape[1]} views, needs 2x2 or more")
+    if lf.shape[4] != 3:
+        raise SceneError(f"{source}: {lf.shape[4]} colours, needs 3 (RGB)")
+    if lf.size == 0:
+        raise SceneError(f"{source}: views of {lf.shape[2]}x{lf.shape[3]} pixels hold nothing")
+    if not np.issubdtype(lf.dtype, np.floating):
+        raise SceneError(f"{source}: values are {lf.dtype}, needs floating values in [0, 1]")
+    if not (lf.min() >= 0 and lf.max() <= 1):
+        wrong = ~((lf >= 0) & (lf <= 1))
+        v, u, y, x, c = (int(i[0]) for i in np.nonzero(wrong))
+        raise SceneError(
+            f"{source}: {np.count_nonzero(wrong)} samples are not in [0, 1], the first "
+            f"{lf[v, u, y, x, c]:.4g} at view ({v}, {u}), y {y}, x {x}, colour {c}"
+        )
+    return np.ascontiguousarray(lf, dtype=np.float32)
+
+
+def load_views(folder: str | os.PathLike) -> np.ndarray:
+    """Read a folder of pictures `view_ROW_COL.png`, 8 or 16 bits, RGB or grey.
+
+    Returns:
+        (v, u, y, x, 3), code values divided by the full scale.
+
+    Raises:
+        SceneError: no such folder, no views in it, views missing, a file that is no whole PNG,
+            or pictures of different sizes.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder")
+    paths: dict[tuple[int, int], Path] = {}
+    for path in sorted(folder.iterdir()):
+        if match := _VIEW_NAME.fullmatch(path.name):
+            place = int(match[1]), int(match[2])
+            if place in paths:
+                raise SceneError(f"{folder}: {paths[place].name} and {path.name} are the same view")
+            paths[place] = path
+    if not paths:
+        raise SceneError(f"{folder}: no views; they are named view_ROW_COL.png")
+    rows, columns = (
+        range(min(place[k] for place in paths), max(place[k] for place in paths) + 1)
+        for k in (0, 1)
+    )
+    missing = [f"view_{r}_{c}.png" for r in rows for c in columns if (r, c) not in paths]
+    if missing:
+        rest = f" and {len(missing) - 6} more" if len(missing) > 6 else ""
+        raise SceneError(
+            f"{folder}: {len(missing)} of {len(rows)}x{len(columns)} views missing: "
+            f"{', '.join(missing[:6])}{rest}"
+        )
+    with ThreadPoolExecutor() as pool:
+        views = list(pool.map(_read_picture, (paths[r, c] for r in rows for c in columns)))
+    for path, view in zip((paths[r, c] for r in rows for c in columns), views, strict=True):
+        if view.shape != views[0].shape:
+            raise SceneError(
+                f"{path}: {view.shape[0]}x{view.shape[1]} pixels, but the first view "
+                f"has {views[0].shape[0]}x{views[0].shape[1]}"
+            )
+    lf = np.stack(views).reshape(len(rows), len(columns), *views[0].shape)
+    return check_light_field(lf, str(folder))
+
+
+def save_views(folder: str | os.PathLike, lf: np.ndarray) -> None:
+    """Write every view as an 8-bit `view_ROW_COL.png`; values outside [0, 1] are clipped.
+
+    Args:
+        folder: created where missing.
+        lf: (v, u, y, x, 3).
+
+    Raises:
+        SceneError: the folder holds views of a larger grid, which would mix with these, or it
+            cannot be written.
+    """
+    folder = _make_folder(folder)
+    pictures = {
+        f"view_{v}_{u}.png": lf[v, u] for v in range(lf.shape[0]) for u in range(lf.shape[1])
+    }
+    for path in sorted(folder.iterdir()):
+        if _VIEW_NAME.fullmatch(path.name) and path.name not in pictures:
+            raise SceneError(f"{folder}: already holds {path.name} of another grid; empty it first")
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(_write_picture, (folder / name for name in pictures), pictures.values()))
+
+
+def load_hdf5(path: str | os.PathLike) -> np.ndarray:
+    """Read the dataset `light_field` of an HDF5 file: floating in [0, 1], or 8- or 16-bit codes.
+
+    Returns:
+        (v, u, y, x, 3).
+
+    Raises:
+        SceneError: no such file, not HDF5 or cut short, no such dataset, or not a light field.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            dataset = file.get(_DATASET)
+            if not isinstance(dataset, h5py.Dataset):
+                raise SceneError(
+                    f"{path}: no dataset '{_DATASET}'; it holds {', '.join(sorted(file)) or 'none'}"
+                )
+            lf = np.asarray(dataset[()])
+    except (OSError, RuntimeError) as error:
+        raise SceneError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from error
+    if lf.dtype in (np.uint8, np.uint16):
+        lf = lf.astype(np.float32) / np.iinfo(lf.dtype).max
+    return check_light_field(lf, str(path))
+
+
+def save_hdf5(
+    path: str | os.PathLike, lf: np.ndarray, attributes: Mapping[str, str | int | float]
+) -> None:
+    """Write float32 dataset `light_field`; the file appears whole or not at all.
+
+    Args:
+        path: its folder is created where missing.
+        lf: (v, u, y, x, 3); values outside [0, 1], which no light field has, are clipped.
+        attributes: kept on the dataset.
+
+    Raises:
+        SceneError: not a light field even when clipped, or the file cannot be written.
+    """
+    path = Path(path)
+    lf = check_light_field(np.clip(lf, 0, 1), str(path))
+    partial = _make_folder(path.parent) / f".{path.name}.{os.getpid()}.partial"
+    try:
+        with h5py.File(partial, "w") as file:
+            dataset = file.create_dataset(_DATASET, data=lf)
+            dataset.attrs.update(attributes)
+        os.replace(partial, path)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({_one_line(error)})") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def centre_view(lf: np.ndarray) -> np.ndarray:
+    """View (V // 2, U // 2): (v, u, y, x, c) -> (y, x, c)."""
+    return lf[lf.shape[0] // 2, lf.shape[1] // 2]
+
+
+def replicate_centre(lf: np.ndarray) -> np.ndarray:
+    """The centre view in place of every view: the estimate without parallax that others must beat.
+
+    Returns:
+        (v, u, y, x, c), a read-only view of `lf`'s memory.
+    """
+    return np.broadcast_to(centre_view(lf), lf.shape)
+
+
+def epi_horizontal(lf: np.ndarray, v: int, y: int) -> np.ndarray:
+    """Row `y` of every view of row `v`: (u, x, c); disparity is the lines' slope dx/du."""
+    return lf[v, :, y]
+
+
+def epi_vertical(lf: np.ndarray, u: int, x: int) -> np.ndarray:
+    """Column `x` of every view of column `u`: (v, y, c); disparity is the lines' slope dy/dv."""
+    return lf[:, u, :, x]
+
+
+def shear(lf: np.ndarray, disparity_px: float) -> np.ndarray:
+    """Shift every view so that points of this disparity stay where the centre view has them.
+
+    Args:
+        lf: (v, u, y, x, c).
+        disparity_px: pixels per view step.
+
+    Returns:
+        (v, u, y, x, c) float32: lf[v, u, y + d (v - V // 2), x + d (u - U // 2)], as `shifted`
+        interpolates it.
+    """
+    sheared = np.empty(lf.shape, np.float32)
+    for v, u in np.ndindex(lf.shape[:2]):
+        sheared[v, u] = _aligned_view(lf, v, u, disparity_px)
+    return sheared
+
+
+def shifted(view: np.ndarray, shift_y_px: float, shift_x_px: float) -> np.ndarray:
+    """Sample a view between its pixels, at (y + shift_y_px, x + shift_x_px).
+
+    Catmull-Rom interpolation: exact for whole pixels and for polynomials of the second degree;
+    may overshoot a little at edges. Beyond the view's edge its last pixel continues.
+
+    Args:
+        view: (y, x, c) float32.
+        shift_y_px: downwards.
+        shift_x_px: to the right.
+
+    Returns:
+        (y, x, c) float32.
+    """
+    height, width = view.shape[:2]
+    # OpenCV's warps round coordinates to 1/32 pixel; a constant shift, a convolution, need not.
+    # Further out than the picture is long, every sample is the edge pixel.
+    shift_y_px = float(np.clip(shift_y_px, -height - 2, height + 2))
+    shift_x_px = float(np.clip(shift_x_px, -width - 2, width + 2))
+    down, right = int(np.floor(shift_y_px)), int(np.floor(shift_x_px))
+    above, below = max(0, 1 - down), max(0, down + 2)
+    before, after = max(0, 1 - right), max(0, right + 2)
+    framed = cv2.copyMakeBorder(view, above, below, before, after, cv2.BORDER_REPLICATE)
+    framed = framed.reshape(*framed.shape[:2], -1)
+    top, left = above + down - 1, before + right - 1
+    blended = cv2.sepFilter2D(
+        framed[top : top + height + 3, left : left + width + 3],
+        cv2.CV_32F,
+        _catmull_rom(shift_x_px - right),
+        _catmull_rom(shift_y_px - down),
+        anchor=(1, 1),
+    )
+    return blended[1 : 1 + height, 1 : 1 + width].reshape(view.shape)
+
+
+def refocus(lf: np.ndarray, disparity_px: float) -> np.ndarray:
+    """The photograph of a full aperture focused on this disparity: the mean over `shear`ed views.
+
+    Ng et al. 2005, "Light field photography with a hand-held plenoptic camera", eq. 5.
+
+    Args:
+        lf: (v, u, y, x, c).
+        disparity_px: pixels per view step.
+
+    Returns:
+        (y, x, c) float32.
+    """
+    total = np.zeros(lf.shape[2:], np.float32)
+    for v, u in np.ndindex(lf.shape[:2]):
+        total += _aligned_view(lf, v, u, disparity_px)
+    return total / (lf.shape[0] * lf.shape[1])
+
+
+def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
+    """Estimate where the scene's back, middle and front are, by a plane sweep over the views.
+
+    The disparity at which the views agree best is found per textured pixel, on views shrunk to
+    at most 256 columns and within 4 % of the width; the 5th, 50th and 95th percentiles come back,
+    after two sweeps over the range just found. Good enough to choose a focus, not a depth map.
+
+    Returns:
+        (back, middle, front) in pixels per view step, ascending.
+    """
+    width = lf.shape[3]
+    shrink = max(1.0, width / 256)
+    grey = lf.mean(axis=4, dtype=np.float32)
+    size = max(2, round(width / shrink)), max(2, round(lf.shape[2] / shrink))
+    small = np.stack(
+        [
+            cv2.resize(np.ascontiguousarray(grey[v, u]), size, interpolation=cv2.INTER_AREA)
+            for v, u in np.ndindex(grey.shape[:2])
+        ]
+    ).reshape(*grey.shape[:2], size[1], size[0], 1)
+    slope_y, slope_x = np.gradient(centre_view(small)[..., 0])
+    steepness = np.hypot(slope_y, slope_x)
+    # Near an edge the sheared views hold nothing of the scene.
+    inner = tuple(slice(n // 10, n - n // 10) for n in steepness.shape)
+    textured = steepness[inner] >= np.median(steepness[inner])
+    front = 0.04 * size[0]
+    back, middle, margin = -front, 0.0, 0.0
+    for _ in range(3):
+        candidates = np.linspace(back - margin, front + margin, 41)
+        spread = np.stack([_disagreement(small, float(d)) for d in candidates])
+        best = candidates[spread.argmin(axis=0)][inner][textured]
+        back, middle, front = (float(d) for d in np.percentile(best, (5, 50, 95)))
+        margin = float(candidates[1] - candidates[0])
+    return back * shrink, middle * shrink, front * shrink
+
+
+def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio for peak 1 over all samples; infinite when they are equal.
+
+    Args:
+        estimate: any shape.
+        truth: the same shape.
+
+    Raises:
+        SceneError: the shapes differ.
+    """
+    _check_same_shape(estimate, truth)
+    squares = 0.0
+    for one, other in zip(estimate, truth, strict=True):
+        error = np.subtract(one, other, dtype=np.float64).ravel()
+        squares += float(error @ error)
+    if squares == 0:
+        return float("inf")
+    return float(10 * np.log10(truth.size / squares))
+
+
+def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity, the mean over views, colours and every window inside a view.
+
+    Wang et al. 2004, eq. 13: Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01,
+    K2 = 0.03, dynamic range 1.
+
+    Args:
+        estimate: (v, u, y, x, c).
+        truth: the same shape.
+
+    Raises:
+        SceneError: the shapes differ, or a view is smaller than the window.
+    """
+    _check_same_shape(estimate, truth)
+    if min(truth.shape[2:4]) < _SSIM_WINDOW_PX:
+        raise SceneError(
+            f"SSIM needs views of {_SSIM_WINDOW_PX}x{_SSIM_WINDOW_PX} pixels or more, "
+            f"these have {truth.shape[2]}x{truth.shape[3]}"
+        )
+    with ThreadPoolExecutor() as pool:
+        means = list(
+            pool.map(
+                lambda place: _view_ssim(estimate[place], truth[place]),
+                np.ndindex(truth.shape[:2]),
+            )
+        )
+    return float(np.mean(means))
+
+
+def save_parallax_animation(path: str | os.PathLike, lf: np.ndarray) -> None:
+    """Write an endless animation that walks in a circle over the outer views.
+
+    Args:
+        path: `.webp` (small, recommended), `.gif` or `.png`.
+        lf: (v, u, y, x, 3).
+
+    Raises:
+        SceneError: a file name with another ending, or the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in (".webp", ".gif", ".png"):
+        raise SceneError(f"{path}: an animation ends in .webp, .gif or .png")
+    _make_folder(path.parent)
+    walk = _circular_walk(lf.shape[0], lf.shape[1])
+    animation = cv2.Animation()
+    animation.frames = [_to_codes(lf[place]) for place in walk]
+    animation.durations = [max(60, 1600 // len(walk))] * len(walk)
+    if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 92]):
+        raise SceneError(f"{path}: cannot be written")
+
+
+def export_pictures(
+    folder: str | os.PathLike, lf: np.ndarray, disparities_px: tuple[float, float, float]
+) -> dict[str, Path]:
+    """Write what a person wants to see of a light field, for any picture viewer.
+
+    Args:
+        folder: created where missing.
+        lf: (v, u, y, x, 3); values outside [0, 1] are clipped.
+        disparities_px: back, middle and front focus in pixels per view step; where they are
+            unknown, `focus_disparities(lf)`.
+
+    Returns:
+        What was written: `views` (a folder), `parallax`, `epi_horizontal`, `epi_vertical`
+        (through the centre, each view's line repeated to be visible), `refocus_back`,
+        `refocus_middle`, `refocus_front`.
+
+    Raises:
+        SceneError: something cannot be written.
+    """
+    folder = _make_folder(folder)
+    n_v, n_u, height, width, _ = lf.shape
+    save_views(folder / "views", lf)
+    save_parallax_animation(folder / "parallax.webp", lf)
+    pictures = {
+        "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
+        "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
+    }
+    for name, disparity_px in zip(("back", "middle", "front"), disparities_px, strict=True):
+        pictures[f"refocus_{name}"] = refocus(lf, disparity_px)
+    for name, picture in pictures.items():
+        _write_picture(folder / f"{name}.png", picture)
+    return {
+        "views": folder / "views",
+        "parallax": folder / "parallax.webp",
+        **{name: folder / f"{name}.png" for name in pictures},
+    }
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    """One PNG file as float32 (y, x, 3) in [0, 1]."""
+    content = path.read_bytes()
+    if not content.startswith(_PNG_START):
+        raise SceneError(f"{path}: not a PNG picture")
+    codes = None
+    # OpenCV prints its own complaint about a file that is cut short: see that it has an end first.
+    if _PNG_END in content[-32:]:
+        codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if codes is None:
+        raise SceneError(f"{path}: a PNG picture cut short or damaged; copy it again")
+    full_scale = 255 if codes.dtype == np.uint8 else 65535
+    if codes.ndim == 3 and codes.shape[2] == 4:
+        if np.any(codes[..., 3] != full_scale):
+            raise SceneError(f"{path}: partly transparent; save it without an alpha channel")
+        codes = codes[..., :3]
+    if codes.ndim == 2:
+        codes = np.repeat(codes[..., np.newaxis], 3, axis=2)
+    return codes[..., ::-1].astype(np.float32) / full_scale
+
+
+def _write_picture(path: Path, picture: np.ndarray) -> None:
+    """Write (y, x, 3) as an 8-bit PNG."""
+    if not cv2.imwrite(str(path), _to_codes(picture)):
+        raise SceneError(f"{path}: cannot be written")
+
+
+def _to_codes(picture: np.ndarray) -> np.ndarray:
+    """(y, x, 3) RGB values, clipped to [0, 1], as OpenCV's 8-bit BGR."""
+    codes = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    return np.ascontiguousarray(codes[..., ::-1])
+
+
+def _make_folder(folder: str | os.PathLike) -> Path:
+    """Create the folder where missing."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be made a folder ({error.strerror})") from error
+    return folder
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _aligned_view(lf: np.ndarray, v: int, u: int, disparity_px: float) -> np.ndarray:
+    """View (v, u) moved onto the centre view for points of this disparity: (y, x, c)."""
+    steps_v, steps_u = v - lf.shape[0] // 2, u - lf.shape[1] // 2
+    view = np.ascontiguousarray(lf[v, u], dtype=np.float32)
+    return shifted(view, disparity_px * steps_v, disparity_px * steps_u)
+
+
+def _catmull_rom(fraction: float) -> np.ndarray:
+    """Weights of the samples at -1, 0, 1, 2 for a value at `fraction` in [0, 1)."""
+    f = fraction
+    return np.array(
+        [
+            ((-0.5 * f + 1) * f - 0.5) * f,
+            (1.5 * f - 2.5) * f * f + 1,
+            ((-1.5 * f + 2) * f + 0.5) * f,
+            (0.5 * f - 0.5) * f * f,
+        ]
+    )
+
+
+def _disagreement(lf: np.ndarray, disparity_px: float) -> np.ndarray:
+    """Variance over the views sheared to this disparity, averaged over 5x5 pixels: (y, x)."""
+    return cv2.blur(shear(lf, disparity_px).var(axis=(0, 1))[..., 0], (5, 5))
+
+
+def _check_same_shape(estimate: np.ndarray, truth: np.ndarray) -> None:
+    if estimate.shape != truth.shape:
+        raise SceneError(f"estimate has shape {estimate.shape}, the truth {truth.shape}")
+
+
+def _view_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """SSIM of one (y, x, c) view; float64, as variances are differences of near-equal numbers."""
+
+    def window_mean(picture: np.ndarray) -> np.ndarray:
+        edge = _SSIM_WINDOW_PX // 2
+        size = _SSIM_WINDOW_PX, _SSIM_WINDOW_PX
+        return cv2.GaussianBlur(picture, size, _SSIM_SIGMA_PX)[edge:-edge, edge:-edge]
+
+    a, b = estimate.astype(np.float64), truth.astype(np.float64)
+    mean_a, mean_b = window_mean(a), window_mean(b)
+    means_product = mean_a * mean_b
+    means_squares = mean_a * mean_a + mean_b * mean_b
+    covariance = window_mean(a * b) - means_product
+    variances = window_mean(a * a + b * b) - means_squares
+    similarity = ((2 * means_product + _SSIM_C1) * (2 * covariance + _SSIM_C2)) / (
+        (means_squares + _SSIM_C1) * (variances + _SSIM_C2)
+    )
+    return float(similarity.mean())
+
+
+def _circular_walk(n_v: int, n_u: int) -> list[tuple[int, int]]:
+    """The views nearest to an ellipse through the outer views, once around, none twice in a row."""
+    angles = np.linspace(0, 2 * np.pi, 8 * max(n_v, n_u), endpoint=False)
+    rows = np.rint((n_v - 1) / 2 * (1 + np.sin(angles))).astype(int)
+    columns = np.rint((n_u - 1) / 2 * (1 + np.cos(angles))).astype(int)
+    walk = list(zip(rows.tolist(), columns.tolist(), strict=True))
+    return [place for i, place in enumerate(walk) if place != walk[i - 1]]

@@ -1,0 +1,92 @@
+"""Folders of results: written beside their final place, and renamed when they are whole."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+
+from emmc_rig import __version__
+from emmc_rig.errors import AppError
+
+METRICS = "metrics.json"
+VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
+
+
+@contextmanager
+def result_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder to write into; it takes the name `out` only when the block succeeds.
+
+    An earlier result (a folder with a metrics.json) is replaced; anything else that is in the
+    way raises AppError, as does a place that cannot be written. After a failure nothing is left.
+    """
+    out = Path(os.path.abspath(out))
+    if out.is_file():
+        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / METRICS).is_file():
+        raise AppError(
+            f"--out {out}: the folder holds something else than an earlier result; "
+            "choose another folder or empty it"
+        )
+    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+    try:
+        yield partial
+        _take_place(partial, out)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _take_place(partial: Path, out: Path) -> None:
+    """Rename `partial` to `out`, the folder of that name set aside until it is done."""
+    old = out.with_name(f".{out.name}.{os.getpid()}.old")
+    if out.exists():
+        os.replace(out, old)
+    try:
+        os.replace(partial, out)
+    except OSError:
+        if old.exists():
+            os.replace(old, out)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
+    """Write metrics.json; values that are not finite become null, as JSON has none."""
+    text = json.dumps(_finite(metrics), indent=2, allow_nan=False)
+    (folder / METRICS).write_text(text + "\n", encoding="utf-8")
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    found = {"emmc-rig": __version__, "python": platform.python_version()}
+    for name in VERSIONED:
+        found[name] = metadata.version(name)
+    return found
+
+
+def command_line() -> str:
+    """Return the command as it was typed."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -1,0 +1,534 @@
+"""Light fields: reading, writing, shearing, refocusing and comparing, against theory."""
+
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from scipy.signal import correlate2d
+
+from emmc_rig.model.errors import SceneError
+from emmc_rig.model.lightfield import (
+    centre_view,
+    check_light_field,
+    epi_horizontal,
+    epi_vertical,
+    export_pictures,
+    focus_disparities,
+    load_hdf5,
+    load_views,
+    psnr_db,
+    refocus,
+    replicate_centre,
+    save_hdf5,
+    save_parallax_animation,
+    save_views,
+    shear,
+    ssim,
+)
+
+RNG_SEED = 7
+
+
+def random_light_field(*shape: int) -> np.ndarray:
+    return np.random.default_rng(RNG_SEED).random((*shape, 3), dtype=np.float32)
+
+
+def texture(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A smooth colour picture, known at every real coordinate."""
+    waves = (
+        np.sin(0.31 * x + 0.17 * y) + np.sin(0.23 * y - 0.4 * x),
+        np.sin(0.52 * y) + np.sin(0.45 * x),
+        np.sin(0.37 * (x + y)) + np.cos(0.2 * x),
+    )
+    return np.stack([0.5 + 0.2 * w for w in waves], axis=-1).astype(np.float32)
+
+
+def plane_light_field(
+    disparity_px: float, views: tuple[int, int] = (5, 5), size: tuple[int, int] = (48, 64)
+) -> np.ndarray:
+    """A plane: a point at x in the centre view is at x + disparity (u - U // 2) in view u."""
+    y, x = np.indices(size)
+    return np.stack(
+        [
+            np.stack(
+                [
+                    texture(
+                        y - disparity_px * (v - views[0] // 2),
+                        x - disparity_px * (u - views[1] // 2),
+                    )
+                    for u in range(views[1])
+                ]
+            )
+            for v in range(views[0])
+        ]
+    )
+
+
+def write_png(path: Path, codes: np.ndarray) -> None:
+    assert cv2.imwrite(str(path), codes)
+
+
+def message_of(error: pytest.ExceptionInfo[SceneError]) -> str:
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# Comparing
+
+
+def test_an_error_of_a_tenth_everywhere_is_20_db():
+    truth = random_light_field(2, 3, 12, 14) * 0.5
+    assert psnr_db(truth + np.float32(0.1), truth) == pytest.approx(20, abs=1e-4)
+
+
+def test_psnr_counts_every_sample_once():
+    truth = np.zeros((2, 2, 8, 8, 3), np.float32)
+    estimate = truth.copy()
+    estimate[1, 0, 3, 4, 2] = 1
+    assert psnr_db(estimate, truth) == pytest.approx(10 * np.log10(truth.size), abs=1e-9)
+
+
+def test_psnr_of_equal_light_fields_is_infinite():
+    truth = random_light_field(2, 2, 8, 8)
+    assert psnr_db(truth.copy(), truth) == float("inf")
+
+
+def test_psnr_sums_millions_of_small_squares_without_loss():
+    truth = np.zeros((2, 2, 600, 700, 3), np.float32)
+    assert psnr_db(np.full_like(truth, 1e-4), truth) == pytest.approx(80, abs=1e-5)
+
+
+def test_ssim_of_equal_light_fields_is_one():
+    truth = random_light_field(2, 2, 16, 18)
+    assert ssim(truth, truth) == pytest.approx(1, abs=1e-12)
+
+
+def test_ssim_of_two_constants_is_its_luminance_term():
+    a, b = 0.3, 0.7
+    shape = (2, 2, 16, 16, 3)
+    value = ssim(np.full(shape, a, np.float32), np.full(shape, b, np.float32))
+    assert value == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-6)
+
+
+def test_ssim_agrees_with_the_definition_written_out():
+    truth = random_light_field(2, 2, 17, 20)
+    estimate = np.clip(truth + 0.2 * random_light_field(2, 2, 17, 20)[..., ::-1], 0, 1)
+    offset = np.arange(11) - 5
+    window = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def mean(picture: np.ndarray) -> np.ndarray:
+        return correlate2d(picture.astype(np.float64), window, mode="valid")
+
+    values = []
+    for v, u, c in np.ndindex(2, 2, 3):
+        a, b = (lf[v, u, ..., c].astype(np.float64) for lf in (estimate, truth))
+        ma, mb = mean(a), mean(b)
+        va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
+        values.append(
+            (2 * ma * mb + 0.01**2)
+            * (2 * cov + 0.03**2)
+            / ((ma**2 + mb**2 + 0.01**2) * (va + vb + 0.03**2))
+        )
+    assert ssim(estimate, truth) == pytest.approx(float(np.mean(values)), abs=1e-9)
+
+
+@pytest.mark.parametrize("compare", [psnr_db, ssim])
+def test_light_fields_of_different_shapes_are_not_compared(compare):
+    with pytest.raises(SceneError) as error:
+        compare(random_light_field(2, 2, 12, 12), random_light_field(2, 2, 12, 13))
+    assert "(2, 2, 12, 12, 3)" in message_of(error)
+    assert "(2, 2, 12, 13, 3)" in message_of(error)
+
+
+def test_ssim_refuses_views_smaller_than_its_window():
+    small = random_light_field(2, 2, 10, 40)
+    with pytest.raises(SceneError, match="11x11 pixels or more, these have 10x40"):
+        ssim(small, small)
+
+
+# Views, EPIs, shearing, refocusing
+
+
+@pytest.mark.parametrize("views", [(3, 3), (4, 5), (2, 2)])
+def test_the_centre_view_is_the_one_that_shearing_leaves_alone(views):
+    lf = random_light_field(*views, 12, 14)
+    np.testing.assert_allclose(centre_view(shear(lf, 1.37)), centre_view(lf), atol=1e-7)
+
+
+def test_replicating_the_centre_makes_all_views_equal_it():
+    lf = random_light_field(3, 5, 6, 7)
+    copies = replicate_centre(lf)
+    assert copies.shape == lf.shape
+    for v, u in np.ndindex(3, 5):
+        np.testing.assert_array_equal(copies[v, u], lf[1, 2])
+
+
+def test_a_point_draws_a_line_of_slope_disparity_through_both_epis():
+    lf = np.zeros((5, 5, 31, 33, 3), np.float32)
+    y, x, disparity_px = 15, 16, -3
+    for v, u in np.ndindex(5, 5):
+        lf[v, u, y + disparity_px * (v - 2), x + disparity_px * (u - 2)] = 1
+    across, down = epi_horizontal(lf, 2, y), epi_vertical(lf, 2, x)
+    assert across.shape == (5, 33, 3)
+    assert down.shape == (5, 31, 3)
+    np.testing.assert_array_equal(np.diff(across[..., 0].argmax(axis=1)), disparity_px)
+    np.testing.assert_array_equal(np.diff(down[..., 0].argmax(axis=1)), disparity_px)
+
+
+def test_shearing_by_zero_changes_nothing():
+    lf = random_light_field(3, 3, 9, 11)
+    np.testing.assert_allclose(shear(lf, 0.0), lf, atol=1e-7)
+
+
+def test_shearing_by_whole_pixels_moves_samples_exactly():
+    lf = random_light_field(3, 3, 12, 15)
+    sheared = shear(lf, -2.0)
+    np.testing.assert_array_equal(sheared[0, 2, :10, 2:], lf[0, 2, 2:, :13])
+
+
+def test_shearing_interpolates_a_parabola_exactly():
+    """Catmull-Rom reproduces polynomials up to the second degree."""
+    y, x = np.indices((20, 24)).astype(np.float64)
+
+    def parabola(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return 0.2 + 0.01 * x + 0.0008 * x * x + 0.0005 * y * y - 0.0004 * x * y
+
+    lf = np.broadcast_to(parabola(y, x)[..., None], (3, 3, 20, 24, 3)).astype(np.float32)
+    sheared = shear(lf, 1.3)[2, 0, 3:-3, 3:-3, 1]
+    expected = parabola(y + 1.3, x - 1.3)[3:-3, 3:-3]
+    np.testing.assert_allclose(sheared, expected, atol=3e-6)
+
+
+def test_beyond_its_edge_a_view_continues_with_its_last_pixel():
+    lf = random_light_field(3, 3, 8, 9)
+    far = shear(lf, 1e6)
+    assert np.all(far[1, 2] == lf[1, 2, :, -1:])
+    assert np.all(far[0, 1] == lf[0, 1, :1])
+
+
+@pytest.mark.parametrize("disparity_px", [0.0, 1.0, -1.5, 0.37])
+def test_a_plane_refocused_at_its_disparity_is_its_texture(disparity_px):
+    lf = plane_light_field(disparity_px)
+    picture = refocus(lf, disparity_px)
+    inner = (slice(6, -6), slice(6, -6))
+    np.testing.assert_allclose(picture[inner], centre_view(lf)[inner], atol=2e-3)
+
+
+def test_a_plane_refocused_elsewhere_is_the_mean_of_its_shifted_textures():
+    lf = plane_light_field(2.0)
+    y, x = np.indices(lf.shape[2:4])
+    shifts = 2.0 * (np.arange(5) - 2)
+    expected = np.mean([texture(y - a, x - b) for a in shifts for b in shifts], axis=0)
+    np.testing.assert_allclose(refocus(lf, 0.0), expected, atol=1e-6)
+    assert refocus(lf, 0.0).std() < 0.6 * refocus(lf, 2.0).std()
+
+
+def test_refocusing_is_the_mean_of_the_sheared_views():
+    lf = random_light_field(3, 4, 10, 12)
+    np.testing.assert_allclose(refocus(lf, 0.7), shear(lf, 0.7).mean(axis=(0, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("disparity_px", [-1.6, 0.2, 0.9])
+def test_the_focus_of_a_plane_is_found_at_its_disparity(disparity_px):
+    found = focus_disparities(plane_light_field(disparity_px, size=(60, 80)))
+    np.testing.assert_allclose(found, disparity_px, atol=0.06)
+
+
+def test_the_focus_of_two_planes_is_found_at_both():
+    front, back = plane_light_field(1.5, size=(80, 100)), plane_light_field(-1.0, size=(80, 100))
+    both = np.concatenate([back[:, :, :, :50], front[:, :, :, 50:]], axis=3)
+    low, middle, high = focus_disparities(both)
+    assert low == pytest.approx(-1.0, abs=0.15)
+    assert high == pytest.approx(1.5, abs=0.15)
+    assert low <= middle <= high
+
+
+# Checking
+
+
+@pytest.mark.parametrize(
+    ("shape", "complaint"),
+    [
+        ((5, 5, 8, 8), "shape (5, 5, 8, 8) is not (v, u, y, x, c)"),
+        ((1, 5, 8, 8, 3), "1x5 views, needs 2x2"),
+        ((2, 2, 8, 8, 4), "4 colours, needs 3"),
+        ((2, 2, 0, 8, 3), "0x8 pixels"),
+    ],
+)
+def test_an_array_of_another_shape_is_no_light_field(shape, complaint):
+    with pytest.raises(SceneError) as error:
+        check_light_field(np.zeros(shape, np.float32), "a.h5")
+    assert message_of(error).startswith("a.h5: ")
+    assert complaint in message_of(error)
+
+
+def test_integers_are_no_light_field():
+    with pytest.raises(SceneError, match="values are int64"):
+        check_light_field(np.zeros((2, 2, 8, 8, 3), np.int64), "a.h5")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.25, 1.5])
+def test_a_sample_outside_zero_to_one_is_named_with_its_place(value):
+    lf = random_light_field(2, 3, 8, 9)
+    lf[1, 2, 3, 4, 0] = value
+    with pytest.raises(SceneError) as error:
+        check_light_field(lf, "somewhere")
+    assert "1 samples" in message_of(error)
+    assert f"{value:.4g} at view (1, 2), y 3, x 4, colour 0" in message_of(error)
+
+
+def test_a_checked_light_field_is_contiguous_float32():
+    checked = check_light_field(random_light_field(2, 2, 8, 9).astype(np.float64)[..., ::-1], "a")
+    assert checked.dtype == np.float32
+    assert checked.flags.c_contiguous
+
+
+# Folders of views
+
+
+def test_views_come_back_from_a_folder_within_half_a_code(tmp_path):
+    lf = random_light_field(3, 4, 10, 12)
+    save_views(tmp_path / "new" / "views", lf)
+    loaded = load_views(tmp_path / "new" / "views")
+    assert loaded.shape == lf.shape
+    assert loaded.dtype == np.float32
+    assert np.abs(loaded - lf).max() <= 0.5 / 255 + 1e-6
+
+
+def test_saved_views_are_clipped_to_what_a_picture_holds(tmp_path):
+    lf = np.full((2, 2, 8, 8, 3), 1.5, np.float32)
+    lf[0] = -0.5
+    save_views(tmp_path, lf)
+    loaded = load_views(tmp_path)
+    assert np.all(loaded[0] == 0)
+    assert np.all(loaded[1] == 1)
+
+
+def test_16_bit_pictures_are_divided_by_their_full_scale(tmp_path):
+    codes = np.random.default_rng(RNG_SEED).integers(0, 65536, (2, 2, 6, 7, 3)).astype(np.uint16)
+    for v, u in np.ndindex(2, 2):
+        write_png(tmp_path / f"view_{v}_{u}.png", codes[v, u][..., ::-1])
+    np.testing.assert_allclose(load_views(tmp_path), codes / 65535, atol=1e-7)
+
+
+def test_grey_pictures_become_three_equal_colours(tmp_path):
+    codes = np.random.default_rng(RNG_SEED).integers(0, 256, (2, 2, 6, 7)).astype(np.uint8)
+    for v, u in np.ndindex(2, 2):
+        write_png(tmp_path / f"view_{v}_{u}.png", codes[v, u])
+    loaded = load_views(tmp_path)
+    for c in range(3):
+        np.testing.assert_allclose(loaded[..., c], codes / 255, atol=1e-7)
+
+
+def test_view_numbers_may_start_anywhere_and_have_leading_zeros(tmp_path):
+    lf = random_light_field(2, 2, 6, 7)
+    save_views(tmp_path, lf)
+    expected = load_views(tmp_path)
+    for v, u in np.ndindex(2, 2):
+        (tmp_path / f"view_{v}_{u}.png").rename(tmp_path / f"view_{v + 9:02d}_{u + 9:02d}.png")
+    np.testing.assert_array_equal(load_views(tmp_path), expected)
+
+
+def test_an_opaque_alpha_channel_is_dropped_and_a_transparent_one_refused(tmp_path):
+    save_views(tmp_path, np.full((2, 2, 6, 7, 3), 0.5, np.float32))
+    codes = np.full((6, 7, 4), 128, np.uint8)
+    codes[..., 3] = 255
+    write_png(tmp_path / "view_0_0.png", codes)
+    np.testing.assert_allclose(load_views(tmp_path), 128 / 255, atol=1e-6)
+    codes[2, 2, 3] = 10
+    write_png(tmp_path / "view_0_0.png", codes)
+    with pytest.raises(SceneError, match=r"view_0_0\.png: partly transparent"):
+        load_views(tmp_path)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(SceneError, match="nowhere: no such folder"):
+        load_views(tmp_path / "nowhere")
+
+
+def test_a_folder_without_views_says_how_they_are_named(tmp_path):
+    (tmp_path / "IMG_0001.png").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"no views; they are named view_ROW_COL\.png"):
+        load_views(tmp_path)
+
+
+def test_missing_views_are_named(tmp_path):
+    save_views(tmp_path, random_light_field(3, 3, 6, 7))
+    (tmp_path / "view_0_2.png").unlink()
+    (tmp_path / "view_2_1.png").unlink()
+    with pytest.raises(SceneError) as error:
+        load_views(tmp_path)
+    assert "2 of 3x3 views missing: view_0_2.png, view_2_1.png" in message_of(error)
+
+
+def test_many_missing_views_are_counted_in_one_short_line(tmp_path):
+    save_views(tmp_path, random_light_field(2, 2, 6, 7))
+    (tmp_path / "view_1_1.png").rename(tmp_path / "view_8_8.png")
+    with pytest.raises(SceneError) as error:
+        load_views(tmp_path)
+    assert "77 of 9x9 views missing" in message_of(error)
+    assert "and 71 more" in message_of(error)
+
+
+def test_one_view_under_two_names_is_refused(tmp_path):
+    save_views(tmp_path, random_light_field(2, 2, 6, 7))
+    (tmp_path / "view_00_1.png").write_bytes((tmp_path / "view_0_1.png").read_bytes())
+    with pytest.raises(SceneError, match="are the same view"):
+        load_views(tmp_path)
+
+
+def test_a_file_that_is_no_picture_is_named(tmp_path):
+    save_views(tmp_path, random_light_field(2, 2, 6, 7))
+    (tmp_path / "view_1_0.png").write_text("a letter")
+    with pytest.raises(SceneError, match=r"view_1_0\.png: not a PNG picture"):
+        load_views(tmp_path)
+
+
+def test_a_picture_cut_short_is_named(tmp_path):
+    save_views(tmp_path, random_light_field(2, 2, 30, 40))
+    path = tmp_path / "view_0_1.png"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SceneError, match=r"view_0_1\.png: a PNG picture cut short"):
+        load_views(tmp_path)
+
+
+def test_views_of_different_sizes_are_refused_with_both_sizes(tmp_path):
+    save_views(tmp_path, random_light_field(2, 2, 6, 7))
+    write_png(tmp_path / "view_1_1.png", np.zeros((6, 8, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"view_1_1\.png: 6x8 pixels, but .* has 6x7"):
+        load_views(tmp_path)
+
+
+def test_views_are_not_mixed_with_those_of_a_larger_grid(tmp_path):
+    save_views(tmp_path, random_light_field(3, 3, 6, 7))
+    with pytest.raises(SceneError, match=r"already holds view_0_2\.png"):
+        save_views(tmp_path, random_light_field(2, 2, 6, 7))
+    save_views(tmp_path, random_light_field(3, 3, 6, 7))
+
+
+def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(SceneError) as error:
+        save_views(tmp_path / "taken" / "views", random_light_field(2, 2, 6, 7))
+    assert "cannot be made a folder" in message_of(error)
+
+
+# HDF5
+
+
+def test_a_light_field_comes_back_from_hdf5_exactly_with_its_attributes(tmp_path):
+    lf = random_light_field(2, 3, 8, 9)
+    path = tmp_path / "new" / "lf.h5"
+    save_hdf5(path, lf, {"scene": "dragon", "seed": 4, "gain": 1.5})
+    np.testing.assert_array_equal(load_hdf5(path), lf)
+    with h5py.File(path) as file:
+        assert dict(file["light_field"].attrs) == {"scene": "dragon", "seed": 4, "gain": 1.5}
+    assert [p.name for p in path.parent.iterdir()] == ["lf.h5"]
+
+
+def test_a_reconstruction_outside_zero_to_one_is_saved_clipped(tmp_path):
+    lf = random_light_field(2, 2, 8, 9) * 1.2 - 0.1
+    save_hdf5(tmp_path / "lf.h5", lf, {})
+    np.testing.assert_array_equal(load_hdf5(tmp_path / "lf.h5"), np.clip(lf, 0, 1))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_integer_codes_in_hdf5_are_divided_by_their_full_scale(tmp_path, dtype):
+    top = np.iinfo(dtype).max
+    codes = np.random.default_rng(RNG_SEED).integers(0, top, (2, 2, 6, 7, 3), endpoint=True)
+    with h5py.File(tmp_path / "lf.h5", "w") as file:
+        file["light_field"] = codes.astype(dtype)
+    np.testing.assert_allclose(load_hdf5(tmp_path / "lf.h5"), codes / top, atol=1e-7)
+
+
+def test_a_failed_save_leaves_the_file_that_was_there(tmp_path):
+    lf = random_light_field(2, 2, 8, 9)
+    path = tmp_path / "lf.h5"
+    save_hdf5(path, lf, {})
+    with pytest.raises(SceneError, match="not in"):
+        save_hdf5(path, np.full_like(lf, np.nan), {})
+    np.testing.assert_array_equal(load_hdf5(path), lf)
+    assert [p.name for p in tmp_path.iterdir()] == ["lf.h5"]
+
+
+def test_a_save_that_breaks_off_half_way_leaves_nothing_behind(tmp_path, monkeypatch):
+    def disk_full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", disk_full)
+    with pytest.raises(SceneError, match=r"cannot be written.*No space left"):
+        save_hdf5(tmp_path / "lf.h5", random_light_field(2, 2, 8, 9), {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_hdf5_file_is_named(tmp_path):
+    with pytest.raises(SceneError, match=r"lf\.h5: no such file"):
+        load_hdf5(tmp_path / "lf.h5")
+
+
+@pytest.mark.parametrize("kept", [0, 100, 3000])
+def test_an_hdf5_file_cut_short_is_one_clear_line(tmp_path, kept):
+    path = tmp_path / "lf.h5"
+    save_hdf5(path, random_light_field(2, 2, 20, 30), {})
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(SceneError) as error:
+        load_hdf5(path)
+    assert "lf.h5: not a whole HDF5 file" in message_of(error)
+
+
+def test_an_hdf5_file_without_the_dataset_says_what_it_holds(tmp_path):
+    with h5py.File(tmp_path / "lf.h5", "w") as file:
+        file["psi"] = np.zeros(3)
+        file["a"] = 1
+    with pytest.raises(SceneError, match="no dataset 'light_field'; it holds a, psi"):
+        load_hdf5(tmp_path / "lf.h5")
+
+
+def test_an_hdf5_dataset_of_text_is_no_light_field(tmp_path):
+    with h5py.File(tmp_path / "lf.h5", "w") as file:
+        file["light_field"] = "hello"
+    with pytest.raises(SceneError, match="shape"):
+        load_hdf5(tmp_path / "lf.h5")
+
+
+# Pictures for people
+
+
+def test_the_parallax_animation_circles_once_over_the_outer_views(tmp_path):
+    lf = np.zeros((5, 5, 24, 32, 3), np.float32)
+    for v, u in np.ndindex(5, 5):
+        lf[v, u] = (v / 4, u / 4, 0.5)
+    save_parallax_animation(tmp_path / "walk.webp", lf)
+    read, animation = cv2.imreadanimation(str(tmp_path / "walk.webp"))
+    assert read
+    places = [
+        (round(4 * float(f[..., 2].mean()) / 255), round(4 * float(f[..., 1].mean()) / 255))
+        for f in animation.frames
+    ]
+    assert len(set(places)) == len(places)
+    assert {v for v, _ in places} == {u for _, u in places} == set(range(5))
+    assert (2, 2) not in places
+    for (v0, u0), (v1, u1) in zip(places, places[1:] + places[:1], strict=True):
+        assert max(abs(v1 - v0), abs(u1 - u0)) == 1
+
+
+def test_an_animation_of_an_unknown_kind_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"ends in \.webp, \.gif or \.png"):
+        save_parallax_animation(tmp_path / "walk.avi", random_light_field(2, 2, 16, 16))
+
+
+def test_exported_pictures_are_where_they_are_said_to_be(tmp_path):
+    lf = plane_light_field(1.0)
+    written = export_pictures(tmp_path / "pictures", lf, (-1.0, 0.0, 1.0))
+    assert all(path.exists() for path in written.values())
+    assert load_views(written["views"]).shape == lf.shape
+    front = cv2.imread(str(written["refocus_front"]))
+    assert front is not None
+    np.testing.assert_allclose(front[..., ::-1] / 255, refocus(lf, 1.0), atol=0.51 / 255)
+    epi = cv2.imread(str(written["epi_horizontal"]))
+    assert epi is not None
+    assert epi.shape[1] == lf.shape[3]
+    assert epi.shape[0] % lf.shape[1] == 0

@@ -1,0 +1,301 @@
+import base64
+import json
+import os
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from emmc_rig.report import DisplayCurve, ReportContent, render, write_report
+
+VIEWS, HEIGHT, WIDTH = 5, 48, 64
+
+
+@pytest.fixture
+def content() -> ReportContent:
+    rng = np.random.default_rng(3)
+    smooth = cv2.GaussianBlur(rng.random((HEIGHT, WIDTH, 3)), (0, 0), 4)
+    truth = np.empty((VIEWS, VIEWS, HEIGHT, WIDTH, 3), np.float32)
+    for v, u in np.ndindex(VIEWS, VIEWS):
+        truth[v, u] = np.roll(smooth, (v - 2, u - 2), axis=(0, 1))
+    psi = rng.random((VIEWS, VIEWS, HEIGHT, WIDTH)).astype(np.float32) / 25
+    return ReportContent(
+        title="First light",
+        scene="near-planar",
+        camera="bayer-rgbw",
+        camera_line="Bayer sensor behind a random RGBW mask",
+        camera_reference="the paper, Section V-C",
+        estimate=truth + np.float32(0.1),
+        truth=truth,
+        frames=rng.random((3, HEIGHT, WIDTH)).astype(np.float32),
+        cfa="rggb",
+        cfa_tile=np.eye(3, dtype=np.float32)[[[0, 1], [1, 2]]],
+        whiteboards=[("View v 0, u 0", psi[0, 0]), ("Dark", np.zeros((HEIGHT, WIDTH)))],
+        psi=psi,
+        psi_std=psi / 50,
+        metrics={
+            "psnr_db": 20.0,
+            "ssim": 0.9312,
+            "replicate_psnr_db": 17.5,
+            "psi_relative_error": 0.0213,
+            "exact_psi_psnr_db": 20.4,
+            "calibration_cost_db": 0.4,
+            "method": "tv",
+            "status": "converged",
+            "advice": "",
+            "seed": 7,
+            "versions": {"numpy": "2.0.0"},
+        },
+        stage_s={"whiteboards": 1.5, "reconstruction": 2.5},
+        objective=[10.0, 4.0, 2.0, 1.9],
+        disparity_range_px=(-1.0, 1.0),
+        warnings=["Diffraction: Fresnel number 1.8"],
+        command="emmc-rig demo --seed 7",
+    )
+
+
+class References(HTMLParser):
+    """Collects what a browser would fetch: src, href, srcset and the like."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.found: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        fetching = {"src", "href", "srcset", "data", "poster", "action", "xlink:href"}
+        self.found += [value or "" for name, value in attrs if name in fetching]
+
+
+def page_data(page: str) -> dict:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+def picture(uri: str) -> np.ndarray:
+    encoded = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    return decoded[..., ::-1] if decoded.ndim == 3 else decoded
+
+
+def test_the_report_is_one_file_that_refers_to_nothing_outside_itself(content, tmp_path):
+    write_report(tmp_path / "report.html", content)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert not re.search(r"https?://|url\(|@import|fetch\(|XMLHttpRequest|WebSocket", page)
+    references = References(page).found
+    assert references
+    assert all(ref.startswith(("data:", "#")) for ref in references)
+    assert "default-src 'none'" in page
+    assert not re.search(r"\{\{\w+\}\}", page)
+
+
+def test_a_report_replaces_an_older_one(content, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("older")
+    write_report(path, content)
+    assert path.read_text("utf-8").startswith("<!doctype html>")
+
+
+@pytest.mark.parametrize("failing", ["write", "replace"])
+def test_a_write_that_fails_leaves_nothing_new_behind(content, tmp_path, monkeypatch, failing):
+    path = tmp_path / "report.html"
+    path.write_text("older")
+
+    def full_disk(self, data):
+        with open(self, "wb") as half_written:
+            half_written.write(data[:100])
+        raise OSError(28, "No space left on device")
+
+    def refused(*_):
+        raise OSError(13, "Permission denied")
+
+    if failing == "write":
+        monkeypatch.setattr(Path, "write_bytes", full_disk)
+    else:
+        monkeypatch.setattr(os, "replace", refused)
+    with pytest.raises(OSError, match=r"No space|Permission"):
+        write_report(path, content)
+    assert [left.name for left in tmp_path.iterdir()] == ["report.html"]
+    assert path.read_text() == "older"
+
+
+def test_names_from_outside_are_shown_not_run(content):
+    attack = "<script>alert('x')</script>&\"'</script>"
+    hostile = replace(
+        content,
+        title=attack,
+        scene=attack,
+        camera=attack,
+        camera_line=attack,
+        camera_reference=attack,
+        cfa=attack,
+        command=attack,
+        warnings=[attack],
+        whiteboards=[(attack, content.whiteboards[0][1])],
+        stage_s={attack: 1.0},
+        metrics={**content.metrics, attack: attack, "status": attack, "versions": {attack: attack}},
+    )
+    page = render(hostile)
+    assert "<script>alert" not in page
+    assert page.count("<script") == render(content).count("<script") == 2
+    assert page.count("</script") == 2
+    assert page_data(page)["whiteboards"][0]["label"] == attack
+
+
+def test_text_that_looks_like_a_placeholder_stays_text(content):
+    assert "<h1>{{data}}</h1>" in render(replace(content, title="{{data}}"))
+
+
+def test_without_a_truth_there_is_no_comparison(content):
+    page = render(
+        replace(content, truth=None, metrics={"status": "converged", "psnr_db": float("nan")})
+    )
+    data = page_data(page)
+    assert data["truth"] is None
+    assert data["error"] is None
+    assert 'class="has-truth-no"' in page
+    assert "no true light field to compare with" in page
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(float("nan"), "not a number"), (float("inf"), "infinite"), (None, "not measured")],
+)
+def test_a_figure_that_is_not_finite_is_said_in_words(content, value, shown):
+    names = ("psnr_db", "ssim", "replicate_psnr_db", "psi_relative_error", "calibration_cost_db")
+    page = render(replace(content, metrics={**content.metrics, **dict.fromkeys(names, value)}))
+    assert page.count(f'<td class="figure">{shown}</td>') == len(names)
+    assert not re.search(r">\s*-?(nan|inf)\b", page)
+
+
+def test_headline_figures_are_written_with_their_units(content):
+    page = render(content)
+    values = re.findall(r'<p class="value">(.*?)</p>', page)
+    assert values == ["20.00 dB", "+2.50 dB", "0.9312", "2.13 %", "0.40 dB", "4.0 s", "converged"]
+
+
+def test_values_that_are_not_finite_in_the_estimate_are_counted(content):
+    estimate = content.estimate.copy()
+    estimate[0, 0, :2, :3, 0] = np.nan
+    page = render(replace(content, estimate=estimate))
+    assert "6 values that are not finite" in page
+
+
+def test_every_tile_of_the_sprite_is_its_view(content):
+    data = page_data(render(content))
+    assert data["views"] == {"rows": 5, "columns": 5, "height": HEIGHT, "width": WIDTH}
+    curve = DisplayCurve.fitted_to(content.truth)
+    sprite = picture(data["truth"]).astype(int)
+    assert sprite.shape == (5 * HEIGHT, 5 * WIDTH, 3)  # both sides are whole JPEG blocks
+    for v, u in np.ndindex(5, 5):
+        tile = sprite[v * HEIGHT : (v + 1) * HEIGHT, u * WIDTH : (u + 1) * WIDTH]
+        assert np.abs(tile - curve.encode(content.truth[v, u]).astype(int)).mean() < 2
+
+
+def test_views_are_padded_to_whole_jpeg_blocks(content):
+    narrow = content.truth[:, :, :45, :50]
+    data = page_data(render(replace(content, truth=narrow, estimate=narrow)))
+    assert picture(data["truth"]).shape == (5 * 48, 5 * 64, 3)
+
+
+def test_frames_survive_to_within_a_screen_level(content):
+    for shown, frame in zip(page_data(render(content))["shots"], content.frames, strict=True):
+        levels = picture(shown["picture"]).astype(float) / 255
+        value = shown["white"] * levels ** shown["gamma"]
+        unclipped = frame < shown["white"]
+        slope = shown["gamma"] * shown["white"] / 255
+        assert np.abs(value - frame)[unclipped].max() < 0.6 * slope
+
+
+def test_a_uniform_error_gives_a_flat_map_and_its_textbook_psnr(content):
+    page = render(content)
+    assert re.findall(r'aria-label="View row \d, column \d: (.*?) dB"', page) == ["20.0"] * 25
+    error = page_data(page)["error"]
+    levels = picture(error["mean"])
+    assert np.allclose(levels / 255 * error["scale"], 0.1, atol=error["scale"] / 255)
+
+
+def test_scales_end_at_readable_values(content):
+    scales = set()
+    for offset in np.geomspace(0.004, 0.5, 9, dtype=np.float32):
+        shown = replace(content, estimate=content.truth + offset)
+        error = page_data(render(shown))["error"]
+        assert offset <= error["scale"] * 1.0001
+        scales.add(f"{error['scale']}")
+    assert all(len(scale.rstrip("0").lstrip("0.")) <= 2 for scale in scales)
+
+
+def test_a_perfect_estimate_is_called_exact(content):
+    page = render(replace(content, estimate=content.truth))
+    assert page.count(": exact dB") == 25
+    assert "no error" in page
+
+
+def test_the_refocus_slider_reaches_beyond_the_scene(content):
+    low, high = page_data(render(content))["disparity"]
+    assert low < -1
+    assert high > 1
+    flat = page_data(render(replace(content, disparity_range_px=(0.5, 0.5))))["disparity"]
+    assert flat[0] < 0.5 < flat[1]
+    unknown = page_data(render(replace(content, disparity_range_px=(np.nan, 1.0))))["disparity"]
+    assert unknown == page_data(render(replace(content, disparity_range_px=None)))["disparity"]
+
+
+@pytest.mark.parametrize(
+    "objective",
+    [[], [1.0], [float("nan")] * 4, [5.0, 5.0, 5.0], [3.0, -1.0, -2.0], [1e6, 1.0, 1e-6], [0, 0]],
+)
+def test_any_objective_history_can_be_drawn(content, objective):
+    page = render(replace(content, objective=objective))
+    assert not re.search(r'points="[^"]*(nan|inf)', page)
+
+
+def test_a_bare_monochrome_run_can_be_shown(content):
+    page = render(
+        ReportContent(
+            title="t",
+            scene="s",
+            camera="c",
+            camera_line="",
+            camera_reference="",
+            estimate=content.estimate[..., :1],
+            frames=content.frames[:1],
+            cfa="mono",
+            metrics={},
+        )
+    )
+    assert picture(page_data(page)["estimate"]).shape[-1] == 3
+    assert "None" not in re.sub(r"<script.*", "", page, flags=re.S)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("estimate", (5, 5, 48, 64), "expected axes"),
+        ("estimate", (5, 5, 48, 64, 4), "4 colours"),
+        ("truth", (5, 5, 47, 64, 3), "differ"),
+        ("frames", (48, 64), "expected axes"),
+        ("frames", (0, 48, 64), "expected axes"),
+        ("psi_std", (5, 5, 48, 63), "same shape"),
+        ("cfa_tile", (2, 2), "expected axes"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(content, name, shape, message):
+    with pytest.raises(ValueError, match=message):
+        replace(content, **{name: np.zeros(shape, np.float32)})
+
+
+def test_a_dark_scene_is_lifted_and_its_highlights_stay_below_white():
+    dark = np.geomspace(0.001, 0.2, 5000).astype(np.float32)
+    curve = DisplayCurve.fitted_to(dark)
+    levels = curve.encode(dark)
+    assert levels.max() == 255
+    assert (levels == 255).mean() < 0.02
+    assert np.median(levels) > 64

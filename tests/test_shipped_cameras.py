@@ -1,0 +1,241 @@
+"""Every camera that comes with the program: what its Psi must be, and what its file refuses."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emmc_rig.model.camera import (
+    Camera,
+    build_imaging_matrix,
+    draw_plates,
+    load_camera,
+    shipped_cameras,
+)
+from emmc_rig.model.errors import CameraError
+
+NAMES = (
+    "coded-aperture-cosines",
+    "coded-aperture-random",
+    "coded-aperture-sequential-random",
+    "conventional",
+    "dual-mask-sinusoids",
+    "learned-aperture",
+    "moving-colour-mask",
+    "programmable-aperture",
+    "rgbw-bayer-1shot",
+    "rgbw-bayer-2shots",
+    "rgbw-bayer-3shots",
+    "rgbw-mono",
+    "scenario-i-rgb",
+    "scenario-ii-cfa",
+    "scenario-iii-mono",
+    "sensor-side-binary",
+    "sensor-side-gaussian",
+)
+SCENARIOS = ("scenario-i-rgb", "scenario-ii-cfa", "scenario-iii-mono")
+AT_LENS = (
+    "coded-aperture-cosines",
+    "coded-aperture-random",
+    "coded-aperture-sequential-random",
+    "learned-aperture",
+    "programmable-aperture",
+)
+SHIPPED = shipped_cameras()
+EPS = float(np.finfo(np.float32).eps)
+
+every_camera = pytest.mark.parametrize("name", NAMES)
+every_binning = pytest.mark.parametrize("binning", [1, 2])
+every_scenario = pytest.mark.parametrize("name", SCENARIOS)
+
+
+def binned(camera: Camera, binning: int) -> Camera:
+    sensor = camera.sensor.model_copy(update={"binning": binning})
+    return camera.model_copy(update={"sensor": sensor})
+
+
+def transmittance(camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """Return the share of light that passes (shot, v, u, y, stored colour, x)."""
+    psi = build_imaging_matrix(camera, size)
+    colours_seen = psi.weights.shape[4]
+    return psi.weights * (camera.views[0] * camera.views[1] * colours_seen)
+
+
+def test_the_cameras_of_the_papers_section_v_c_are_shipped() -> None:
+    assert tuple(SHIPPED) == NAMES
+
+
+@every_camera
+def test_a_shipped_camera_names_the_reference_it_stands_for(name: str) -> None:
+    camera = SHIPPED[name]
+    assert camera.title
+    assert "paper" in camera.reference
+    assert camera.views == (5, 5)
+
+
+@every_camera
+@every_binning
+def test_forward_and_adjoint_equal_the_dense_matrix(name: str, binning: int) -> None:
+    psi = build_imaging_matrix(binned(SHIPPED[name], binning), (6, 4))
+    dense = psi.to_scipy().toarray().astype(np.float64)
+    rng = np.random.default_rng(1)
+    light_field = rng.random(psi.light_field_shape, dtype=np.float32)
+    frames = rng.standard_normal(psi.frames_shape).astype(np.float32)
+
+    seen = psi.forward(light_field)
+    spread = psi.adjoint(frames)
+    expected_seen = (dense @ light_field.ravel()).reshape(seen.shape)
+    expected_spread = (dense.T @ frames.ravel()).reshape(spread.shape)
+
+    assert np.linalg.norm(seen - expected_seen) <= 4 * EPS * np.linalg.norm(expected_seen)
+    assert np.linalg.norm(spread - expected_spread) <= 4 * EPS * np.linalg.norm(expected_spread)
+    mismatch = abs(np.vdot(seen, frames) - np.vdot(light_field, spread))
+    assert mismatch <= 4 * EPS * np.linalg.norm(seen) * np.linalg.norm(frames)
+
+
+@every_camera
+def test_an_odd_size_builds_and_no_pixel_reads_more_than_the_open_camera(name: str) -> None:
+    psi = build_imaging_matrix(SHIPPED[name], (21, 25))
+    whiteboard = psi.forward(np.ones(psi.light_field_shape, dtype=np.float32))
+    assert psi.weights.min() >= 0
+    assert whiteboard.max() <= 1 + 25 * EPS
+    assert 0 < psi.light_efficiency() <= 1 + 25 * EPS
+    assert psi.light_efficiency() == pytest.approx(whiteboard.mean(), rel=1e-5)
+
+
+def test_the_conventional_camera_reads_one_and_sees_all_views_alike() -> None:
+    psi = build_imaging_matrix(SHIPPED["conventional"], (20, 24))
+    whiteboard = psi.forward(np.ones(psi.light_field_shape, dtype=np.float32))
+    np.testing.assert_allclose(whiteboard, 1, rtol=25 * EPS)
+    assert (psi.weights == np.float32(1 / 25)).all()
+
+
+@pytest.mark.parametrize("name", AT_LENS)
+def test_a_mask_at_the_lens_gives_each_view_one_value_its_own_cell(name: str) -> None:
+    camera = SHIPPED[name]
+    passed = transmittance(camera, (6, 8))
+    plates = draw_plates(camera, (6, 8))
+    for shot in range(len(camera.shots)):
+        (mask,) = camera.shot_masks(shot)
+        cells = plates[mask].cells
+        expected = cells[shot % len(cells)].transpose(2, 0, 1)
+        for colour in range(3):
+            seen = passed[shot, :, :, :, colour]
+            np.testing.assert_allclose(
+                seen, np.broadcast_to(expected[colour, ..., None, None], seen.shape), atol=1e-6
+            )
+
+
+def test_the_cosine_aperture_passes_half_of_the_light() -> None:
+    psi = build_imaging_matrix(SHIPPED["coded-aperture-cosines"], (4, 4))
+    assert psi.light_efficiency() == pytest.approx(0.5, rel=1e-6)
+
+
+def test_the_programmable_aperture_takes_one_view_a_shot() -> None:
+    passed = transmittance(SHIPPED["programmable-aperture"], (2, 2))
+    by_shot = passed[:, :, :, 0, 0, 0].reshape(25, 25)
+    np.testing.assert_allclose(by_shot, np.eye(25), atol=1e-6)
+
+
+@every_scenario
+@pytest.mark.parametrize("size", [(20, 24), (21, 25), (4, 331)])
+def test_every_sample_of_a_scenario_sees_exactly_one_mask_cell(
+    name: str, size: tuple[int, int]
+) -> None:
+    camera = SHIPPED[name]
+    passed = transmittance(camera.with_shots(2 * len(camera.shots)), size)
+    assert np.abs(passed - np.rint(passed)).max() < 1e-6
+    if passed.shape[4] == 3:
+        open_colours = np.rint(passed).sum(axis=4)
+        assert np.isin(open_colours, (1, 3)).all()  # a red, green, blue or clear cell
+
+
+@every_scenario
+def test_a_scenarios_mask_moves_by_one_sample_from_view_to_view(name: str) -> None:
+    bare = SHIPPED["scenario-iii-mono"]
+    camera = SHIPPED[name].model_copy(update={"sensor": bare.sensor, "shots": bare.shots})
+    passed = transmittance(camera, (20, 24))
+    np.testing.assert_allclose(passed[:, :, :-1, :, :, 1:], passed[:, :, 1:, :, :, :-1], atol=1e-6)
+    np.testing.assert_allclose(passed[:, :-1, :, 1:], passed[:, 1:, :, :-1], atol=1e-6)
+
+
+def test_the_scenarios_share_one_mask() -> None:
+    plates = [draw_plates(SHIPPED[name], (20, 24))["mask"].cells for name in SCENARIOS]
+    np.testing.assert_array_equal(plates[0], plates[1])
+    np.testing.assert_array_equal(plates[0], plates[2])
+
+
+def test_colour_by_colour_moves_its_mask_only_between_rounds_of_three() -> None:
+    camera = SHIPPED["scenario-i-rgb"].with_shots(6)
+    assert [shot.filter for shot in camera.shots] == 2 * ["red", "green", "blue"]
+    offsets = [shot.offset_um.get("mask", (0.0, 0.0)) for shot in camera.shots]
+    assert offsets[:3] == [(0.0, 0.0)] * 3
+    assert len(set(offsets[3:])) == 1
+    cell_um = camera.masks["mask"].cell_um
+    assert np.array(offsets[3]) / cell_um == pytest.approx([11, 7], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if SHIPPED[name].more_shots_step_um])
+def test_further_rounds_of_shots_see_the_mask_elsewhere(name: str) -> None:
+    camera = SHIPPED[name]
+    longer = camera.with_shots(3 * len(camera.shots))
+    states = [(shot.filter, tuple(shot.offset_um.items())) for shot in longer.shots]
+    assert len(set(states)) == len(states)
+    psi = build_imaging_matrix(longer, (8, 8))
+    blocks = np.moveaxis(psi.gram, (0, 1), (2, 3))
+    full_rank = np.linalg.matrix_rank(blocks, tol=1e-6) == psi.shots
+    assert full_rank.mean() > 0.5
+
+
+def test_a_redrawn_aperture_shows_new_patterns_in_further_shots() -> None:
+    camera = SHIPPED["coded-aperture-sequential-random"].with_shots(9)
+    passed = transmittance(camera, (2, 2))[:, :, :, 0, 0, 0].reshape(9, 25)
+    assert np.linalg.matrix_rank(passed) == 9
+
+
+@pytest.mark.parametrize("shots", [1, 2, 3])
+def test_the_bench_camera_takes_the_shots_of_its_name_within_one_exposure(shots: int) -> None:
+    camera = SHIPPED[f"rgbw-bayer-{shots}shot{'s' if shots > 1 else ''}"]
+    assert len(camera.shots) == shots
+    assert camera.exposures_s().sum() == pytest.approx(0.05)
+    assert camera.masks == SHIPPED["rgbw-bayer-1shot"].masks
+
+
+@every_camera
+def test_shipped_masks_are_coarse_enough_for_ray_optics(name: str) -> None:
+    assert SHIPPED[name].warnings() == []
+
+
+def test_a_mask_too_fine_for_its_distance_warns_of_diffraction() -> None:
+    fine = SHIPPED["rgbw-mono"].masks["mask"].model_copy(update={"cell_um": 12.0})
+    camera = SHIPPED["rgbw-mono"].model_copy(update={"masks": {"mask": fine}})
+    (warning,) = camera.warnings()
+    assert "mask 'mask': Fresnel number 0.55 < 1" in warning  # 6^2 / (0.55 x 120)
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong"),
+    [
+        ("rgbw-mono", "sensor:", "sensr:"),
+        ("rgbw-mono", "distance_mm: 0.12", "distanse_mm: 0.12"),
+        ("rgbw-mono", "cfa: mono", "cfs: mono"),
+        ("rgbw-mono", "seed: 1", "sed: 1"),
+        ("rgbw-bayer-2shots", "offset_um: {mask: [0, 0]}", "ofset_um: {mask: [0, 0]}"),
+        ("scenario-i-rgb", "aperture_fill: 0\n", "apperture_fill: 0\n"),
+        ("scenario-i-rgb", "more_shots_step_um:", "more_shot_step_um:"),
+    ],
+)
+def test_a_misspelt_key_is_refused_and_the_nearest_named(
+    tmp_path: Path, name: str, right: str, wrong: str
+) -> None:
+    text = (resources.files("emmc_rig") / "cameras" / f"{name}.yaml").read_text(encoding="utf-8")
+    assert right in text
+    path = tmp_path / "misspelt.yaml"
+    path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+    wrong_key, right_key = wrong.split(":")[0], right.split(":")[0]
+    with pytest.raises(CameraError, match=f"{wrong_key}': did you mean '{right_key}'") as caught:
+        load_camera(path)
+    assert "\n" not in str(caught.value)
