@@ -92,7 +92,18 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
 
     def sweep() -> None:
         tv_kernels.sweep(
-            *operator, inverse, frames, psi.binning, planar, dual, one, one / 16, one, one, bands, moved
+            *operator,
+            inverse,
+            frames,
+            psi.binning,
+            planar,
+            dual,
+            one,
+            one / 16,
+            one,
+            one,
+            bands,
+            moved,
         )
 
     cases: list[tuple[str, Callable[[], object], int]] = [

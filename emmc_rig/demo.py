@@ -22,7 +22,6 @@ from calibration.whiteboard import (
 from emmc_rig.capture import capture_shots, capture_whiteboards, whiteboard_exposures
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import (
     focus_disparities,
     psnr_db,

@@ -49,8 +49,8 @@ class FineScene:
 def open_scene(
     spec: str,
     size: tuple[int, int] | None = None,
-    seed: int = 0,
     views: tuple[int, int] | None = None,
+    seed: int = 0,
 ) -> Scene:
     """Open a scene.
 
@@ -58,8 +58,8 @@ def open_scene(
         spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, or a built-in name.
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 unless
             told), the middle that is cut from a measured one (all of it unless told).
-        seed: of a built-in scene; measured ones have none.
         views: rows and columns of views, likewise (5x5 unless told).
+        seed: of a built-in scene; measured ones have none.
 
     Raises:
         SceneError: nothing by that name (the message lists the built-in ones), unreadable,
@@ -81,8 +81,8 @@ def fine_scene(
     aperture_factor: int,
     pixel_factor: int,
     size: tuple[int, int] | None = None,
-    seed: int = 0,
     views: tuple[int, int] | None = None,
+    seed: int = 0,
 ) -> FineScene:
     """Open a scene for simulating a capture.
 
@@ -96,8 +96,8 @@ def fine_scene(
         aperture_factor: fine views per view, along each axis.
         pixel_factor: fine pixels per pixel, along each axis.
         size: as for `open_scene`, on the coarse grid.
-        seed: as for `open_scene`.
         views: as for `open_scene`, on the coarse grid.
+        seed: as for `open_scene`.
 
     Raises:
         SceneError: as for `open_scene`, or a factor below 1.

@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from emmc_rig.model.kernels import correct_row, gather_row, spread_row
+
 
 @njit(cache=True, inline="always", fastmath=True)
 def _descend(light_field, dual, step, v, u, y, out):
@@ -46,41 +48,26 @@ def _primal_rows(
 ):
     """Do the primal step of one row of pixels; ahead (v, u, part, colour, x) = 2 new - old."""
     shots, views_v, views_u, _, _, width = weights.shape
-    single = np.float32(1)
-    residual = np.zeros((shots, width // binning), frames.dtype)
-    total = np.empty((shots, width), frames.dtype)
-    spread = np.empty((shots, width), frames.dtype)
-    total[:] = 0
     base = row * binning
     for v in range(views_v):
         for u in range(views_u):
             for part in range(binning):
                 _descend(light_field, dual, step, v, u, base + part, ahead[v, u, part])
-    window = ahead.transpose(2, 0, 1, 3, 4)
+    seen = np.zeros((shots, width), frames.dtype)
     for shot in range(shots):
         for part in range(binning):
-            _gather(weights, colour, window[part], shot, base + part, total[shot])
-        for x in range(width):
-            residual[shot, x // binning] += total[shot, x]
-        for x in range(width // binning):
-            residual[shot, x] -= frames[shot, row, x]
-    for shot in range(shots):
-        line = total[shot]
-        line[:] = 0
-        for other in range(shots):
-            for x in range(width // binning):
-                line[x] -= inverse[shot, other, row, x] * residual[other, x]
-        for x in range(width):
-            spread[shot, x] = line[x // binning]
+            gather_row(weights, colour, ahead, part, shot, base + part, seen[shot])
+    correct_row(inverse, frames, binning, row, seen)
     change = 0.0
     power = 0.0
     for v in range(views_v):
         for u in range(views_u):
             for part in range(binning):
+                y = base + part
                 for shot in range(shots):
-                    _spread(weights, colour, spread[shot], shot, base + part, v, u, window[part])
+                    spread_row(weights, colour, seen[shot], shot, y, v, u, ahead[v, u, part])
                 for c in range(3):
-                    old = light_field[v, u, base + part, c]
+                    old = light_field[v, u, y, c]
                     line = ahead[v, u, part, c]
                     row_change = np.float32(0)
                     row_power = np.float32(0)
@@ -90,46 +77,10 @@ def _primal_rows(
                         old[x] += relax * delta
                         row_change += delta * delta
                         row_power += old[x] * old[x]
-                    change += row_change * single
-                    power += row_power * single
+                    change += row_change
+                    power += row_power
     moved[row, 0] = change
     moved[row, 1] = power
-
-
-@njit(cache=True, inline="always", fastmath=True)
-def _gather(weights, colour, window, shot, y, total):
-    """`gather_row` of one row (v, u, colour, x)."""
-    _, views_v, views_u, _, stored, width = weights.shape
-    for v in range(views_v):
-        for u in range(views_u):
-            if stored == 1:
-                weight = weights[shot, v, u, y, 0]
-                which = colour[shot, y]
-                for x in range(width):
-                    total[x] += weight[x] * window[v, u, which[x], x]
-            else:
-                for c in range(3):
-                    weight = weights[shot, v, u, y, c]
-                    line = window[v, u, c]
-                    for x in range(width):
-                        total[x] += weight[x] * line[x]
-
-
-@njit(cache=True, inline="always", fastmath=True)
-def _spread(weights, colour, frame_row, shot, y, v, u, window):
-    """`spread_row` of one row (v, u, colour, x)."""
-    stored, width = weights.shape[4], weights.shape[5]
-    if stored == 1:
-        weight = weights[shot, v, u, y, 0]
-        which = colour[shot, y]
-        for x in range(width):
-            window[v, u, which[x], x] += weight[x] * frame_row[x]
-    else:
-        for c in range(3):
-            weight = weights[shot, v, u, y, c]
-            line = window[v, u, c]
-            for x in range(width):
-                line[x] += weight[x] * frame_row[x]
 
 
 @njit(cache=True, fastmath=True)
@@ -242,9 +193,7 @@ def sweep(
                 first[band] = ahead
             else:
                 before = ring[(row - 1) % 2]
-                _dual_rows(
-                    before, ahead, True, dual, (row - 1) * binning, dual_step, bound, relax
-                )
+                _dual_rows(before, ahead, True, dual, (row - 1) * binning, dual_step, bound, relax)
         last[band] = ring[(end - 1) % 2]
     for band in prange(count):
         base = (bands[band, 1] - 1) * binning

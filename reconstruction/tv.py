@@ -90,7 +90,7 @@ def _check(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_] | None) 
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
     judged = frames if usable is None else frames[usable]
     if not np.isfinite(judged).all():
-        raise ReconstructionError("the frames hold values that are not finite: exclude those pixels")
+        raise ReconstructionError("the frames hold values that are not finite: exclude them")
 
 
 def reconstruct_tv(

@@ -76,7 +76,8 @@ def trace(
     points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
     open width of a cell. openings_um: (opening, 3), x, y and half side of the squares at the lens
     that the aperture plate leaves open. cells: (all cells, colour); starts, shapes: where each
-    mask lies in it, (rows, columns). plates: per mask distance_um, cell_um, x_um, y_um, cosine, sine of its turn.
+    mask lies in it, (rows, columns). plates: per mask distance_um, cell_um, x_um, y_um, and the
+    cosine and sine of its turn.
     """
     rows, columns = readings.shape
     views_v, views_u, count = points.shape[0], points.shape[1], points.shape[2]

@@ -75,9 +75,6 @@ def message_of(error: pytest.ExceptionInfo[SceneError]) -> str:
     return str(error.value)
 
 
-# Comparing
-
-
 def test_an_error_of_a_tenth_everywhere_is_20_db():
     truth = random_light_field(2, 3, 12, 14) * 0.5
     assert psnr_db(truth + np.float32(0.1), truth) == pytest.approx(20, abs=1e-4)
@@ -147,9 +144,6 @@ def test_ssim_refuses_views_smaller_than_its_window():
     small = random_light_field(2, 2, 10, 40)
     with pytest.raises(SceneError, match="11x11 pixels or more, these have 10x40"):
         ssim(small, small)
-
-
-# Views, EPIs, shearing, refocusing
 
 
 @pytest.mark.parametrize("views", [(3, 3), (4, 5), (2, 2)])
@@ -246,9 +240,6 @@ def test_the_focus_of_two_planes_is_found_at_both():
     assert low <= middle <= high
 
 
-# Checking
-
-
 @pytest.mark.parametrize(
     ("shape", "complaint"),
     [
@@ -284,9 +275,6 @@ def test_a_checked_light_field_is_contiguous_float32():
     checked = check_light_field(random_light_field(2, 2, 8, 9).astype(np.float64)[..., ::-1], "a")
     assert checked.dtype == np.float32
     assert checked.flags.c_contiguous
-
-
-# Folders of views
 
 
 def test_views_come_back_from_a_folder_within_half_a_code(tmp_path):
@@ -416,9 +404,6 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):
     assert "cannot be made a folder" in message_of(error)
 
 
-# HDF5
-
-
 def test_a_light_field_comes_back_from_hdf5_exactly_with_its_attributes(tmp_path):
     lf = random_light_field(2, 3, 8, 9)
     path = tmp_path / "new" / "lf.h5"
@@ -492,9 +477,6 @@ def test_an_hdf5_dataset_of_text_is_no_light_field(tmp_path):
         file["light_field"] = "hello"
     with pytest.raises(SceneError, match="shape"):
         load_hdf5(tmp_path / "lf.h5")
-
-
-# Pictures for people
 
 
 def test_the_parallax_animation_circles_once_over_the_outer_views(tmp_path):

@@ -81,9 +81,6 @@ def pixel_mean(samples: np.ndarray) -> np.ndarray:
     return samples.reshape(height // 2, 2, width // 2, 2, colours).mean(axis=(1, 3))
 
 
-# Geometry
-
-
 def test_a_plane_of_whole_disparity_moves_by_exactly_that_many_pixels_per_view(build):
     name = build(Card(SMOOTH, quoted(2), PICTURE_PLANE, tiled=True))
     scene = render(name, (5, 5), SIZE_PX)
@@ -219,9 +216,6 @@ def test_twice_the_views_at_twice_the_size_have_the_same_disparity_per_step():
         )
 
 
-# Built-in scenes
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_a_built_in_scene_is_a_light_field_within_its_quoted_disparities(name):
     scene = render(name, (3, 3), (96, 128))
@@ -295,9 +289,6 @@ def test_a_scene_that_cannot_be_rendered_says_why(settings, complaint):
         render("dark", **settings)
 
 
-# Opening a scene
-
-
 @pytest.fixture
 def measured() -> np.ndarray:
     """Edges from black to white and noise: what a cubic overshoots at."""
@@ -363,9 +354,6 @@ def test_a_file_of_another_kind_says_what_a_scene_is(tmp_path):
     (tmp_path / "lf.mat").write_text("")
     with pytest.raises(SceneError, match=r"ends in \.h5 or \.hdf5"):
         open_scene(str(tmp_path / "lf.mat"))
-
-
-# The fine grid
 
 
 def test_the_truth_of_a_fine_built_in_scene_is_its_box_average():

@@ -47,7 +47,7 @@ class Sensor(Settings):
 
     cfa: str | tuple[str, ...] = "mono"
     sample_pitch_um: float = Field(24.0, gt=0)
-    pixel_fill: float = Field(1.0, ge=0, le=1, description="sensitive width of a sample; 0: a point")
+    pixel_fill: float = Field(1.0, ge=0, le=1, description="open width of a sample; 0: a point")
     binning: int = Field(1, ge=1, le=16, description="k: a pixel sums k x k samples, r = 1/k^2")
     noise: SensorNoise = SensorNoise()
 
@@ -73,7 +73,7 @@ class Shot(Settings):
     """One exposure: which masks, moved by how much (x, y), behind which colour filter."""
 
     masks: tuple[str, ...] | None = None
-    offset_um: dict[str, tuple[float, float]] = {}
+    offset_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
     exposure_s: float | None = Field(None, gt=0)
     filter: Literal["none", "red", "green", "blue"] = "none"
 
@@ -86,7 +86,7 @@ class Camera(Settings):
     views: tuple[int, int] = (5, 5)
     lens: Lens = Lens()
     sensor: Sensor = Sensor()
-    masks: dict[str, Mask] = {}
+    masks: dict[str, Mask] = Field(default_factory=dict)
     shots: tuple[Shot, ...] = Field((Shot(),), min_length=1)
     more_shots_step_um: dict[str, tuple[float, float]] | None = None
     total_exposure_s: float = Field(0.05, gt=0)
@@ -186,7 +186,7 @@ def load_camera(path: Path) -> Camera:
 
 @dataclass(frozen=True)
 class Plate:
-    """A mask as manufactured: cells (frame, row, column, colour) of side `cell_um` at `distance_mm`."""
+    """A mask as manufactured: cells (frame, row, column, colour), their side and distance."""
 
     cells: NDArray[np.float32]
     cell_um: float
@@ -308,7 +308,7 @@ def sensor_response(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32
 
 
 def pixel_light(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return how much light each pixel collects (see emmc_rig.model.noise), (shot, pixel_y, pixel_x)."""
+    """Return how much light each pixel collects, (shot, pixel_y, pixel_x); see model.noise."""
     k = camera.sensor.binning
     colours = sensor_response(camera, size).sum(axis=-1)[:, ::k, ::k]
     return colours * k**2

@@ -50,7 +50,7 @@ def fresnel_number(cell_um: float, distance_mm: float) -> float:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Two boxes whose convolution weighs the mask: widths in um of the pixel's and the lens' share."""
+    """Two boxes whose convolution weighs the mask: the pixel's and the aperture cell's, in um."""
 
     pixel_um: float
     aperture_um: float

@@ -13,40 +13,61 @@ from numba import njit, prange
 
 
 @njit(cache=True, inline="always", fastmath=True)
-def gather_row(weights, colour, light_field, shot, y, total):
-    """Add to total (x,) what one shot sees of row y of the light field."""
-    views_v, views_u, stored, width = (
-        weights.shape[1],
-        weights.shape[2],
-        weights.shape[4],
-        weights.shape[5],
-    )
+def gather_row(weights, colour, block, part, shot, y, total):
+    """Add to total (x,) what one shot sees of row y; block[:, :, part] is that row."""
+    views_v, views_u, stored, width = weights.shape[1], weights.shape[2], *weights.shape[4:]
     for v in range(views_v):
         for u in range(views_u):
             if stored == 1:
+                weight = weights[shot, v, u, y, 0]
+                which = colour[shot, y]
+                lines = block[v, u, part]
                 for x in range(width):
-                    total[x] += (
-                        weights[shot, v, u, y, 0, x] * light_field[v, u, y, colour[shot, y, x], x]
-                    )
+                    total[x] += weight[x] * lines[which[x], x]
             else:
                 for c in range(3):
+                    weight = weights[shot, v, u, y, c]
+                    line = block[v, u, part, c]
                     for x in range(width):
-                        total[x] += weights[shot, v, u, y, c, x] * light_field[v, u, y, c, x]
+                        total[x] += weight[x] * line[x]
 
 
 @njit(cache=True, inline="always", fastmath=True)
-def spread_row(weights, colour, frame_row, shot, y, v, u, light_field):
-    """Add to row y of view (v, u) the transpose of one shot applied to frame_row (x,)."""
-    stored, width = weights.shape[4], weights.shape[5]
+def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
+    """Add to lines (colour, x), row y of view (v, u), the transpose of a shot on frame_row (x,)."""
+    stored, width = weights.shape[4:]
     if stored == 1:
+        weight = weights[shot, v, u, y, 0]
+        which = colour[shot, y]
         for x in range(width):
-            light_field[v, u, y, colour[shot, y, x], x] += (
-                weights[shot, v, u, y, 0, x] * frame_row[x]
-            )
+            lines[which[x], x] += weight[x] * frame_row[x]
     else:
         for c in range(3):
+            weight = weights[shot, v, u, y, c]
+            line = lines[c]
             for x in range(width):
-                light_field[v, u, y, c, x] += weights[shot, v, u, y, c, x] * frame_row[x]
+                line[x] += weight[x] * frame_row[x]
+
+
+@njit(cache=True, inline="always", fastmath=True)
+def correct_row(inverse, frames, binning, row, seen):
+    """Turn seen (shot, x), sums over views per sample, into -(Psi Psi^T + Lambda)^-1 residual."""
+    shots, width = seen.shape
+    pixels = width // binning
+    residual = np.zeros((shots, pixels), frames.dtype)
+    corrected = np.empty(pixels, frames.dtype)
+    for shot in range(shots):
+        for x in range(width):
+            residual[shot, x // binning] += seen[shot, x]
+        for x in range(pixels):
+            residual[shot, x] -= frames[shot, row, x]
+    for shot in range(shots):
+        corrected[:] = 0
+        for other in range(shots):
+            for x in range(pixels):
+                corrected[x] -= inverse[shot, other, row, x] * residual[other, x]
+        for x in range(width):
+            seen[shot, x] = corrected[x // binning]
 
 
 @njit(cache=True, parallel=True)
@@ -58,7 +79,8 @@ def project(weights, colour, light_field, binning, frames):
         for shot in range(frames.shape[0]):
             total[:] = 0
             for part in range(binning):
-                gather_row(weights, colour, light_field, shot, row * binning + part, total)
+                y = row * binning + part
+                gather_row(weights, colour, light_field, y, shot, y, total)
             frames[shot, row, :] = 0
             for x in range(width):
                 frames[shot, row, x // binning] += total[x]
@@ -99,37 +121,19 @@ def data_step(weights, colour, inverse, frames, binning, light_field):
     """
     shots, views_v, views_u, _, _, width = weights.shape
     for row in prange(frames.shape[1]):
-        apply_data_step(weights, colour, inverse, frames, binning, light_field, row)
-
-
-@njit(cache=True, inline="always")
-def apply_data_step(weights, colour, inverse, frames, binning, light_field, row):
-    """Do `data_step` for one row of pixels."""
-    shots, views_v, views_u, _, _, width = weights.shape
-    residual = np.zeros((shots, width // binning), frames.dtype)
-    spread = np.empty((shots, width), frames.dtype)
-    total = np.empty(width, frames.dtype)
-    for shot in range(shots):
-        total[:] = 0
+        seen = np.zeros((shots, width), frames.dtype)
+        for shot in range(shots):
+            for part in range(binning):
+                y = row * binning + part
+                gather_row(weights, colour, light_field, y, shot, y, seen[shot])
+        correct_row(inverse, frames, binning, row, seen)
         for part in range(binning):
-            gather_row(weights, colour, light_field, shot, row * binning + part, total)
-        for x in range(width):
-            residual[shot, x // binning] += total[x]
-        for x in range(width // binning):
-            residual[shot, x] -= frames[shot, row, x]
-    for shot in range(shots):
-        total[:] = 0
-        for other in range(shots):
-            for x in range(width // binning):
-                total[x] -= inverse[shot, other, row, x] * residual[other, x]
-        for x in range(width):
-            spread[shot, x] = total[x // binning]
-    for part in range(binning):
-        y = row * binning + part
-        for v in range(views_v):
-            for u in range(views_u):
-                for shot in range(shots):
-                    spread_row(weights, colour, spread[shot], shot, y, v, u, light_field)
+            y = row * binning + part
+            for v in range(views_v):
+                for u in range(views_u):
+                    for shot in range(shots):
+                        lines = light_field[v, u, y]
+                        spread_row(weights, colour, seen[shot], shot, y, v, u, lines)
 
 
 @njit(cache=True, parallel=True)

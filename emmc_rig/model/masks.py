@@ -96,19 +96,30 @@ class _Random(Pattern):
     redraw: bool = Field(False, description="draw a new pattern for every shot")
 
     def frame_count(self, shots: int) -> int:
+        """Return one frame, or one a shot."""
         return shots if self.redraw else 1
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
-        """Return `frames` patterns, frame s from the stream (seed, s)."""
-        return np.stack(
-            [
-                self.sample(np.random.default_rng([self.seed, frame]), rows, columns)
-                for frame in range(frames)
-            ]
-        )
+        """Return `frames` patterns, drawn outward from the middle.
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
+        Row r of frame s has the random stream (seed, s, r) of its own, counted from the middle
+        as its cells are: a larger plate is the same plate with more cells around it.
+        """
+        cells = np.empty((frames, rows, columns, 3), dtype=np.float32)
+        for frame in range(frames):
+            for index, row in enumerate(_outward(rows)):
+                rng = np.random.default_rng([self.seed, frame, index])
+                cells[frame, row, _outward(columns)] = self.sample(rng, columns)
+        return cells
+
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return `count` cells, (count, colour); the first of more are the same."""
         raise NotImplementedError
+
+
+def _outward(count: int) -> NDArray[np.intp]:
+    """Return the indices 0 to count - 1 from the middle outward, to both sides in turn."""
+    return np.argsort(np.abs(np.arange(count) - count // 2 + 0.25), kind="stable")
 
 
 class RandomRGBW(_Random):
@@ -116,9 +127,9 @@ class RandomRGBW(_Random):
 
     kind: Literal["random_rgbw"]
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
-        """Return one pattern."""
-        return np.array(list(FILTERS.values()), np.float32)[rng.integers(4, size=(rows, columns))]
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return a row of cells."""
+        return np.array(list(FILTERS.values()), np.float32)[rng.integers(4, size=count)]
 
 
 class RandomBinary(_Random):
@@ -127,9 +138,9 @@ class RandomBinary(_Random):
     kind: Literal["random_binary"]
     open_probability: float = Field(0.5, gt=0, le=1)
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
-        """Return one pattern."""
-        return _grey(rng.random((rows, columns)) < self.open_probability)
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return a row of cells."""
+        return _grey(rng.random(count) < self.open_probability)
 
 
 class UniformColour(_Random):
@@ -137,9 +148,9 @@ class UniformColour(_Random):
 
     kind: Literal["uniform_colour"]
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
-        """Return one pattern."""
-        return rng.random((rows, columns, 3), dtype=np.float32)
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return a row of cells."""
+        return rng.random((count, 3), dtype=np.float32)
 
 
 class GaussianColour(_Random):
@@ -149,9 +160,9 @@ class GaussianColour(_Random):
     mean: float = Field(0.5, ge=0, le=1)
     deviation: float = Field(0.2, ge=0)
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
-        """Return one pattern."""
-        cells = rng.normal(self.mean, self.deviation, (rows, columns, 3))
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return a row of cells."""
+        cells = rng.normal(self.mean, self.deviation, (count, 3))
         return np.clip(cells, 0, 1).astype(np.float32)
 
 
@@ -162,9 +173,9 @@ class GaussianMonochrome(_Random):
     mean: float = Field(0.5, ge=0, le=1)
     deviation: float = Field(0.2, ge=0)
 
-    def sample(self, rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
-        """Return one pattern."""
-        return _grey(np.clip(rng.normal(self.mean, self.deviation, (rows, columns)), 0, 1))
+    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return a row of cells."""
+        return _grey(np.clip(rng.normal(self.mean, self.deviation, count), 0, 1))
 
 
 class Sinusoids(Pattern):

@@ -61,18 +61,29 @@ class SensorNoise(Settings):
     def normalise(
         self, dn: NDArray[np.uint16], exposure_s: Array | float, light: Array | float
     ) -> NDArray[np.float32]:
-        """Return readings from DN: the inverse of the noise-free `expose_dn`, float32."""
-        scale = self.gain_dn_per_electron * self.electrons_per_s * exposure_s * light
-        return ((dn.astype(np.float64) - self.black_level_dn) / scale).astype(np.float32)
+        """Return readings from DN: the inverse of the noise-free `expose_dn`, float32.
+
+        A pixel that no light reaches reads 0.
+        """
+        scale = np.asarray(self.gain_dn_per_electron * self.electrons_per_s * exposure_s * light)
+        above = (dn.astype(np.float64) - self.black_level_dn) * (scale > 0)
+        return (above / np.where(scale > 0, scale, 1)).astype(np.float32)
 
     def variance(
         self, reading: Array, exposure_s: Array | float, light: Array | float
     ) -> NDArray[np.float64]:
-        """Return the variance of a normalised reading: shot, read and quantisation noise."""
-        per_reading = self.electrons_per_s * exposure_s * light
+        """Return the variance of a normalised reading: shot, read and quantisation noise.
+
+        Infinite where no light reaches the pixel.
+        """
+        per_reading = np.asarray(self.electrons_per_s * exposure_s * light)
         electrons = np.maximum(np.asarray(reading, dtype=np.float64), 0) * per_reading
         quantisation = 1 / 12 / self.gain_dn_per_electron**2
-        return (electrons + self.read_noise_electrons**2 + quantisation) / per_reading**2
+        counted = electrons + self.read_noise_electrons**2 + quantisation
+        return (
+            np.where(per_reading > 0, counted, np.inf)
+            / np.where(per_reading > 0, per_reading, 1) ** 2
+        )
 
     def saturated(self, dn: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """Return which pixels reached the white level."""

@@ -178,7 +178,7 @@ class ImagingMatrix:
 
     def to_scipy(self) -> sparse.csr_array:
         """Return Psi as an explicit sparse matrix without its zeros."""
-        shots, views_v, views_u, rows, stored, columns = self.weights.shape
+        _, _, views_u, rows, _, columns = self.weights.shape
         s, v, u, y, k, x = np.indices(self.weights.shape, sparse=True)
         colour = k if self.colour is None else self.colour[s, y, x]
         column = (((v * views_u + u) * rows + y) * columns + x) * 3 + colour

@@ -70,7 +70,9 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
         near = difflib.get_close_matches(key, valid, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
         return f"unknown key '{where}': {hint}"
-    message = first["msg"].removeprefix("Value error, ").replace("\n", " ")
+    message = first["msg"].replace("\n", " ")
+    if first["type"] == "value_error":
+        return f"{where}: {message.removeprefix('Value error, ')}"
     return f"{where}: {message[:1].lower()}{message[1:]}"
 
 
@@ -97,3 +99,5 @@ def read_yaml(path: Path, error: type[ModelError]) -> object:
         where = f" at line {mark.line + 1}" if mark else ""
         problem = getattr(fault, "problem", None) or "malformed"
         raise error(f"{path}: not valid YAML{where}: {problem}") from fault
+    except ValueError as fault:
+        raise error(f"{path}: not valid YAML: {fault}") from fault
