@@ -26,11 +26,13 @@ Array = NDArray[np.floating]
 class SensorNoise(Settings):
     """Gain, noise and range of the sensor."""
 
-    electrons_per_s: float = Field(310_000.0, gt=0, description="at reading 1, one colour, k = 1")
-    gain_dn_per_electron: float = Field(0.8, gt=0)
-    read_noise_electrons: float = Field(2.5, ge=0)
-    black_level_dn: int = Field(256, ge=0)
-    white_level_dn: int = Field(65_535, gt=0, le=65_535)
+    electrons_per_s: float = Field(
+        default=310_000.0, gt=0, description="at reading 1, one colour, k = 1"
+    )
+    gain_dn_per_electron: float = Field(default=0.8, gt=0)
+    read_noise_electrons: float = Field(default=2.5, ge=0)
+    black_level_dn: int = Field(default=256, ge=0)
+    white_level_dn: int = Field(default=65_535, gt=0, le=65_535)
 
     @model_validator(mode="after")
     def _range(self) -> SensorNoise:
@@ -66,8 +68,8 @@ class SensorNoise(Settings):
         A pixel that no light reaches reads 0.
         """
         scale = np.asarray(self.gain_dn_per_electron * self.electrons_per_s * exposure_s * light)
-        above = (dn.astype(np.float64) - self.black_level_dn) * (scale > 0)
-        return (above / np.where(scale > 0, scale, 1)).astype(np.float32)
+        above = dn.astype(np.float64) - self.black_level_dn
+        return np.where(scale > 0, above / np.where(scale > 0, scale, 1), 0).astype(np.float32)
 
     def variance(
         self, reading: Array, exposure_s: Array | float, light: Array | float
@@ -79,11 +81,8 @@ class SensorNoise(Settings):
         per_reading = np.asarray(self.electrons_per_s * exposure_s * light)
         electrons = np.maximum(np.asarray(reading, dtype=np.float64), 0) * per_reading
         quantisation = 1 / 12 / self.gain_dn_per_electron**2
-        counted = electrons + self.read_noise_electrons**2 + quantisation
-        return (
-            np.where(per_reading > 0, counted, np.inf)
-            / np.where(per_reading > 0, per_reading, 1) ** 2
-        )
+        with np.errstate(divide="ignore"):
+            return (electrons + self.read_noise_electrons**2 + quantisation) / per_reading**2
 
     def saturated(self, dn: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """Return which pixels reached the white level."""

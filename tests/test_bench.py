@@ -1,0 +1,155 @@
+"""The simulated bench follows its own rays, and agrees with the camera model in the limit."""
+
+import numpy as np
+import pytest
+
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.masks import CFA
+from simulators.bench import NO_ERRORS, Bench, MountingErrors, ray_points
+
+SIZE = (12, 18)
+CENTRED = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 0.0, "aperture_y": 0.0}
+WINDOW_UM = 50_000.0
+OPEN = {**CENTRED, "aperture_x": WINDOW_UM}
+WARM_MASK = {
+    "code": {"distance_mm": 0.2, "cell_um": 40, "pattern": {"kind": "uniform_colour", "seed": 4}}
+}
+
+
+def coded(cfa="rggb", binning=1, masks=None, shots=({},)):
+    return Camera.model_validate(
+        {
+            "title": "test",
+            "sensor": {"cfa": cfa, "binning": binning},
+            "masks": WARM_MASK if masks is None else masks,
+            "shots": list(shots),
+        }
+    )
+
+
+def light_field(seed=0, size=SIZE, views=(5, 5)):
+    return np.random.default_rng(seed).random((*views, *size, 3)).astype(np.float32)
+
+
+def bench_for(camera, scene, at_um, errors=NO_ERRORS, rays=1024, size=SIZE):
+    rng = np.random.default_rng(0)
+    bench = Bench(camera, scene, size, lambda: at_um, WINDOW_UM, rng, errors, rays)
+    bench.lamp = "white"
+    return bench
+
+
+def relative_error(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_an_open_camera_reads_one_from_a_whiteboard(cfa):
+    bench = bench_for(coded(cfa, masks={}), light_field(), OPEN, rays=16)
+    bench.target = "whiteboard"
+    np.testing.assert_allclose(bench.readings(), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cfa", "binning"), [("rggb", 1), ("mono", 1), ("mono", 2), ("x-trans", 1)]
+)
+def test_rays_through_one_mask_sum_to_the_imaging_matrix(cfa, binning):
+    camera, scene = coded(cfa, binning), light_field()
+    expected = build_imaging_matrix(camera, SIZE).forward(scene)[0]
+    assert relative_error(bench_for(camera, scene, OPEN).readings(), expected) < 3e-3
+
+
+def test_rays_through_two_masks_sum_to_the_imaging_matrix():
+    masks = {
+        **WARM_MASK,
+        "far": {
+            "distance_mm": 25,
+            "cell_um": 3000,
+            "pattern": {"kind": "uniform_colour", "seed": 9},
+        },
+    }
+    camera, scene = coded(masks=masks), light_field()
+    expected = build_imaging_matrix(camera, SIZE).forward(scene)[0]
+    assert relative_error(bench_for(camera, scene, OPEN).readings(), expected) < 5e-3
+
+
+def test_more_rays_come_closer_to_the_imaging_matrix():
+    camera, scene = coded(), light_field()
+    expected = build_imaging_matrix(camera, SIZE).forward(scene)[0]
+    errors = [
+        relative_error(bench_for(camera, scene, OPEN, rays=rays).readings(), expected)
+        for rays in (16, 128, 1024)
+    ]
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+
+
+def test_the_pinhole_shows_one_view_only():
+    camera = coded()
+    psi = build_imaging_matrix(camera, SIZE)
+    at_um = {**CENTRED, "aperture_x": -10_000.0, "aperture_y": 5_000.0}
+    bench = bench_for(camera, light_field(), at_um)
+    bench.target = "whiteboard"
+    assert relative_error(bench.readings(), psi.weights[0, 3, 0, :, 0, :]) < 1e-2
+
+
+def test_a_plate_between_pinhole_and_window_blocks_the_light():
+    at_um = {**CENTRED, "aperture_x": 0.4 * WINDOW_UM}
+    bench = bench_for(coded(), light_field(), at_um, rays=16)
+    assert not bench.readings().any()
+
+
+def test_the_lamp_colour_lights_its_own_pixels_only():
+    bench = bench_for(coded("rggb", masks={}), light_field(), OPEN, rays=16)
+    bench.target, bench.lamp = "whiteboard", "blue"
+    readings = bench.readings()
+    np.testing.assert_allclose(readings[1::2, 1::2], 1, rtol=1e-6)
+    assert not readings[::2].any()
+    assert not readings[1::2, ::2].any()
+
+
+def test_a_misplaced_mask_reads_as_the_imaging_matrix_of_a_moved_one():
+    camera = coded(shots=[{"offset_um": {"code": [30.0, -17.0]}}])
+    expected = build_imaging_matrix(camera, SIZE).forward(light_field())[0]
+    misplaced = MountingErrors((30.0, -17.0), 0.0, 1.0)
+    found = bench_for(camera, light_field(), OPEN, misplaced).readings()
+    assert relative_error(found, expected) < 3e-3
+
+
+def test_the_stage_moves_the_mask_as_an_offset_does():
+    camera = coded(shots=[{"offset_um": {"code": [60.0, 20.0]}}])
+    expected = build_imaging_matrix(camera, SIZE).forward(light_field())[0]
+    at_um = {**OPEN, "mask_x": 60.0, "mask_y": 20.0}
+    assert relative_error(bench_for(camera, light_field(), at_um).readings(), expected) < 3e-3
+
+
+def test_a_finer_scene_whose_blocks_average_to_the_light_field_reads_nearly_the_same():
+    scene = light_field()
+    fine = scene.repeat(2, axis=2).repeat(2, axis=3).repeat(2, axis=0).repeat(2, axis=1)
+    coarse = bench_for(coded(), scene, OPEN).readings()
+    np.testing.assert_allclose(bench_for(coded(), fine, OPEN).readings(), coarse, rtol=1e-9)
+
+
+def test_a_scene_that_is_no_finer_grid_is_refused():
+    with pytest.raises(ValueError, match="no finer grid"):
+        bench_for(coded(), light_field(size=(13, 18)), OPEN)
+
+
+def test_a_frame_has_the_noise_of_its_exposure():
+    camera = coded(masks={})
+    bench = bench_for(camera, light_field(), OPEN, rays=16)
+    bench.target = "whiteboard"
+    noise = camera.sensor.noise
+    frames = np.array([bench.expose(0.01) for _ in range(200)], dtype=float)
+    electrons = noise.electrons_per_s * 0.01
+    expected = noise.gain_dn_per_electron**2 * (electrons + noise.read_noise_electrons**2) + 1 / 12
+    assert frames.var(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.03)
+    assert frames.mean() == pytest.approx(
+        noise.black_level_dn + noise.gain_dn_per_electron * electrons, rel=1e-3
+    )
+
+
+def test_ray_points_fill_every_projection_evenly():
+    points = ray_points((2, 3), 256)
+    assert points.shape == (2, 3, 256, 4)
+    counts = np.histogram(points[0, 0, :, 0], bins=16, range=(0, 1))[0]
+    np.testing.assert_array_equal(counts, 16)
+    assert not np.array_equal(points[0, 0], points[0, 1])

@@ -1,0 +1,176 @@
+"""Psi from whiteboards: ratios of signals, their uncertainty, and refusals."""
+
+import numpy as np
+import pytest
+
+from calibration.errors import CalibrationError
+from calibration.frames import MeanFrame, SensorGain, average, photon_transfer
+from calibration.whiteboard import Whiteboards, ideal_boards, lamps_needed, measure_psi
+from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
+
+SIZE = (12, 16)
+WHITE_DN = 65_535
+
+
+def design_of(cfa="rggb", binning=1, shots=({},)):
+    camera = Camera.model_validate(
+        {
+            "title": "test",
+            "views": [2, 3],
+            "sensor": {"cfa": cfa, "binning": binning},
+            "masks": {
+                "code": {
+                    "distance_mm": 0.2,
+                    "cell_um": 40,
+                    "pattern": {"kind": "uniform_colour", "seed": 4},
+                }
+            },
+            "shots": list(shots),
+        }
+    )
+    return camera, build_imaging_matrix(camera, SIZE)
+
+
+def pinhole_readings(design):
+    """What a noise-free sensor reads through the pinhole, from Psi's own coefficients."""
+    k = design.binning
+    rows, columns = design.frames_shape[1:]
+    readings = {}
+    for shot, v, u in np.ndindex(design.weights.shape[:3]):
+        for stored, lamp in enumerate(lamps_needed(design)):
+            weights = design.weights[shot, v, u, :, stored]
+            pixels = weights.reshape(rows, k, columns, k).sum(axis=(1, 3))
+            readings[shot, v, u, lamp] = pixels.astype(np.float64)
+    return readings
+
+
+def noisy_boards(camera, design, seed, repeats, exposure_s=0.2):
+    rng, noise = np.random.default_rng(seed), camera.sensor.noise
+    light = pixel_light(camera, SIZE)[0]
+    lamps = lamps_needed(design)
+    count = design.weights.shape[1] * design.weights.shape[2]
+
+    def mean(reading, time_s, frames):
+        taken = [noise.expose_dn(reading, time_s, light, rng) for _ in range(frames)]
+        return average(taken, time_s, WHITE_DN, "test")
+
+    white = np.full(design.frames_shape[1:], 1 / len(lamps))
+    return Whiteboards(
+        mean(0 * white, exposure_s, 8),
+        {(s, lamp): mean(white, exposure_s, 8) for s in range(design.shots) for lamp in lamps},
+        {
+            key: mean(reading, exposure_s * count, repeats)
+            for key, reading in pinhole_readings(design).items()
+        },
+    )
+
+
+@pytest.mark.parametrize(("cfa", "binning"), [("rggb", 1), ("mono", 1), ("rggb", 2), ("mono", 2)])
+def test_noise_free_whiteboards_give_psi_back(cfa, binning):
+    _, design = design_of(cfa, binning, [{}, {"offset_um": {"code": [50, 20]}}])
+    boards = ideal_boards(pinhole_readings(design), lamps_needed(design), design)
+    assert measure_psi(boards, design).psi.relative_difference(design) < 1e-5
+
+
+def test_the_stated_deviation_is_that_of_the_coefficients():
+    camera, design = design_of()
+    found = [measure_psi(noisy_boards(camera, design, seed, 2), design) for seed in range(40)]
+    spread = np.std([one.psi.weights for one in found], axis=0, ddof=1)
+    stated = np.mean([one.deviation for one in found], axis=0)
+    assert np.sqrt(np.mean(spread**2) / np.mean(stated**2)) == pytest.approx(1, abs=0.05)
+
+
+def test_more_repeats_make_psi_surer_by_their_root():
+    camera, design = design_of()
+    few, many = (measure_psi(noisy_boards(camera, design, 1, n), design) for n in (1, 9))
+    gain = few.psi.relative_difference(design) / many.psi.relative_difference(design)
+    assert 2 < gain < 3.5
+
+
+def test_the_lamp_level_and_the_pixel_sensitivity_cancel():
+    _, design = design_of()
+    readings = pinhole_readings(design)
+    boards = ideal_boards(readings, ("white",), design)
+    falloff = np.linspace(0.5, 1.5, SIZE[1])[None, :]
+
+    def dimmed(frame):
+        return MeanFrame((frame.mean_dn * falloff).astype(np.float32), 0.0, frame.count, 1.0)
+
+    seen = Whiteboards(
+        boards.dark,
+        {key: dimmed(frame) for key, frame in boards.references.items()},
+        {key: dimmed(frame) for key, frame in boards.pinholes.items()},
+    )
+    assert measure_psi(seen, design).psi.relative_difference(design) < 1e-5
+
+
+def test_readings_are_what_the_design_predicts():
+    camera, design = design_of()
+    calibration = measure_psi(noisy_boards(camera, design, 0, 4), design)
+    truth = np.full((1, *SIZE), 0.4)
+    light = pixel_light(camera, SIZE)
+    rng = np.random.default_rng(3)
+    frames = np.array(
+        [camera.sensor.noise.expose_dn(truth, 0.05, light, rng) for _ in range(50)], dtype=float
+    )
+    readings = np.array([calibration.readings(frame, np.array([0.05])) for frame in frames])
+    assert readings.mean() == pytest.approx(0.4, rel=2e-3)
+    stated = calibration.reading_variance(frames[0], np.array([0.05])).mean()
+    assert readings.var(axis=0, ddof=1).mean() == pytest.approx(stated, rel=0.1)
+
+
+def test_the_gain_comes_out_of_repeated_frames():
+    camera, design = design_of()
+    boards = noisy_boards(camera, design, 5, 2)
+    gain = photon_transfer(boards.dark, boards.references[0, "white"])
+    noise = camera.sensor.noise
+    assert gain.gain_dn_per_electron == pytest.approx(noise.gain_dn_per_electron, rel=0.1)
+    read_dn2 = (noise.gain_dn_per_electron * noise.read_noise_electrons) ** 2 + 1 / 12
+    assert gain.dark_variance_dn2 == pytest.approx(read_dn2, rel=0.1)
+    assert gain.variance_dn2(np.array([-5.0]))[0] == gain.dark_variance_dn2
+
+
+def test_a_saturated_whiteboard_is_refused():
+    frame = np.full((4, 4), WHITE_DN, np.uint16)
+    with pytest.raises(CalibrationError, match=r"100.0% of the pixels are saturated; shorten"):
+        average([frame], 0.1, WHITE_DN, "reference")
+
+
+def test_a_missing_whiteboard_is_named():
+    _, design = design_of()
+    boards = ideal_boards(pinhole_readings(design), ("white",), design)
+    del boards.pinholes[0, 1, 2, "white"]
+    with pytest.raises(CalibrationError, match=r"missing: shot 0, view \(1, 2\), white lamp"):
+        measure_psi(boards, design)
+
+
+def test_no_reference_is_refused():
+    _, design = design_of()
+    boards = ideal_boards(pinhole_readings(design), ("white",), design)
+    with pytest.raises(CalibrationError, match="no reference whiteboard"):
+        measure_psi(Whiteboards(boards.dark, {}, boards.pinholes), design)
+
+
+def test_a_dark_reference_is_refused():
+    _, design = design_of()
+    boards = ideal_boards(pinhole_readings(design), ("white",), design)
+    dim = MeanFrame(np.full(SIZE, 20.0, np.float32), 0.0, 2, 1.0)
+    with pytest.raises(CalibrationError, match="raise the lamp or the exposure"):
+        measure_psi(Whiteboards(boards.dark, {(0, "white"): dim}, boards.pinholes), design)
+
+
+def test_frames_of_two_sizes_and_no_frames_are_refused():
+    with pytest.raises(CalibrationError, match="differ"):
+        average([np.zeros((4, 4), np.uint16), np.zeros((4, 5), np.uint16)], 1.0, WHITE_DN, "x")
+    with pytest.raises(CalibrationError, match="no frame was taken"):
+        average([], 1.0, WHITE_DN, "x")
+
+
+def test_a_gain_without_repeats_or_light_is_refused():
+    one = MeanFrame(np.zeros((4, 4), np.float32), np.nan, 1, 1.0)
+    two = MeanFrame(np.zeros((4, 4), np.float32), 1.0, 2, 1.0)
+    with pytest.raises(CalibrationError, match="at least two"):
+        photon_transfer(one, two)
+    with pytest.raises(CalibrationError, match="is the lamp on"):
+        photon_transfer(two, two)
+    assert SensorGain(0.5, 2.0).variance_dn2(np.array([10.0]))[0] == 7.0
