@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
 from emmc_rig.scene import open_scene
 from reconstruction import kernels as tv_kernels
-from reconstruction.tv import reconstruct_tv, row_bands
+from reconstruction.tv import colour_metric, reconstruct_tv, row_bands
 
 TRIAD_VALUES = 40_000_000
 
@@ -80,14 +81,15 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
     yield Timing("triad", triad_bytes / 1e9, triad_bytes / rate, triad_bytes / rate)
     psi = build_imaging_matrix(camera, size)
     light_field = np.random.default_rng(0).random(psi.light_field_shape, dtype=np.float32)
-    natural = rows_of_colours(light_field)
     frames = psi.forward(light_field)
     inverse = psi.solver(0.01).inverse
-    planar = np.ascontiguousarray(natural)
+    planar = np.ascontiguousarray(rows_of_colours(light_field))
     dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
     moved = np.zeros((psi.frames_shape[1], 2))
     bands = row_bands(psi.frames_shape[1], get_num_threads())
+    pool = ThreadPoolExecutor(len(bands))
     one = np.float32(1)
+    metric = colour_metric(2.0).astype(np.float32)
     operator = (psi.weights, psi.colour_map)
 
     def sweep() -> None:
@@ -98,23 +100,25 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
             psi.binning,
             planar,
             dual,
+            metric,
             one,
             one / 16,
             one,
             one,
             bands,
             moved,
+            pool.map,
         )
 
     cases: list[tuple[str, Callable[[], object], int]] = [
         (
             "forward",
-            lambda: kernels.project(*operator, natural, psi.binning, frames.copy()),
+            lambda: kernels.project(*operator, light_field, psi.binning, frames.copy()),
             psi.weights.nbytes + light_field.nbytes,
         ),
         (
             "adjoint",
-            lambda: kernels.back_project(*operator, frames, psi.binning, natural),
+            lambda: kernels.back_project(*operator, frames, psi.binning, light_field),
             psi.weights.nbytes + light_field.nbytes,
         ),
         (
@@ -124,9 +128,10 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
         ),
         ("TV step", sweep, psi.weights.nbytes + 2 * light_field.nbytes + 2 * dual.nbytes),
     ]
-    for name, call, counted in cases:
-        rate = bandwidth()
-        yield Timing(name, counted / 1e9, _median_s(call, repeats), counted / rate)
+    with pool:
+        for name, call, counted in cases:
+            rate = bandwidth()
+            yield Timing(name, counted / 1e9, _median_s(call, repeats), counted / rate)
 
 
 def reconstruction_memory(camera_name: str, size: tuple[int, int]) -> tuple[float, float]:
@@ -147,7 +152,7 @@ def _reconstruct_once(camera_name: str, size: tuple[int, int]) -> None:
     """Print the seconds of a converged reconstruction and this process's peak memory in GiB."""
     camera = find_camera(camera_name)
     psi = build_imaging_matrix(camera, size)
-    light_field = open_scene("deep-occlusions", size, camera.views).light_field
+    light_field = open_scene("deep-occlusions", size=size, views=camera.views).light_field
     frames = psi.forward(light_field)
     del light_field
     started = time.perf_counter()

@@ -27,6 +27,7 @@ from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
+INTERRUPTED = 130
 DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 
@@ -276,9 +277,12 @@ def chart(
 def main() -> None:
     """Run the program; never shows a traceback for a fault that the user can mend."""
     try:
-        sys.exit(app(standalone_mode=False) or 0)
+        code = app(standalone_mode=False) or 0
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+        sys.exit(code)
     except KeyboardInterrupt:
-        _fail("stopped by Ctrl-C; nothing was written", 130)
+        _fail("stopped by Ctrl-C; nothing was written", INTERRUPTED)
     except ERRORS as fault:
         _fail(str(fault), 1)
     except MemoryError:
@@ -286,7 +290,7 @@ def main() -> None:
     except Exception as fault:
         show, code = getattr(fault, "show", None), getattr(fault, "exit_code", None)
         if type(fault).__name__ == "Abort":
-            _fail("stopped by Ctrl-C; nothing was written", 130)
+            _fail("stopped by Ctrl-C; nothing was written", INTERRUPTED)
         if show is None or code is None:
             raise
         show()

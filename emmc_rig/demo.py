@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,7 @@ from emmc_rig.capture import capture_shots, capture_whiteboards, whiteboard_expo
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import (
+    export_pictures,
     focus_disparities,
     psnr_db,
     replicate_centre,
@@ -31,7 +32,7 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.output import command_line, save_frames, versions, write_metrics
 from emmc_rig.report import ReportContent, write_report
 from emmc_rig.scene import fine_scene
 from reconstruction.result import Progress, Reconstruction
@@ -95,8 +96,8 @@ class _Stages:
 def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = None) -> dict:
     """Run the demo into an existing folder and return its metrics.
 
-    Writes light_field.h5, psi.h5, frames.h5, metrics.json and report.html. Raises the errors of
-    the layers below, each one line.
+    Writes light_field.h5, psi.h5, frames.h5, metrics.json, report.html and pictures/. Raises the
+    errors of the layers below, each one line.
     """
     watcher = watcher or Silent()
     stages = _Stages(watcher)
@@ -179,11 +180,16 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         }
     with stages("write"):
         save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": metrics["psnr_db"]})
+        focus = focus_disparities(truth)
+        export_pictures(folder / "pictures", estimate, focus)
+        save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s())
         calibration.psi.save(folder / "psi.h5")
         metrics["seconds"] = dict(stages.seconds)
         write_report(
             folder / "report.html",
-            _report(settings, metrics, truth, result, readings, calibration, boards.pinholes),
+            _report(
+                settings, metrics, truth, result, readings, calibration, boards.pinholes, focus
+            ),
         )
     metrics["seconds"] = dict(stages.seconds)
     write_metrics(folder, metrics)
@@ -213,7 +219,8 @@ def _report(
     result: Reconstruction,
     readings: Array,
     calibration: Calibration,
-    pinholes: dict[tuple[int, int, int, str], MeanFrame],
+    pinholes: Mapping[tuple[int, int, int, str], MeanFrame],
+    focus: tuple[float, float, float],
 ) -> ReportContent:
     camera = settings.camera
     weights, deviation = (
@@ -229,7 +236,6 @@ def _report(
         for shot, v, u, lamp in chosen
     ]
     peak = max(float(np.percentile(board, 99.9)) for _, board in boards)
-    front, _, back = focus_disparities(truth)
     return ReportContent(
         title=f"{settings.scene} through {settings.camera_name}",
         scene=settings.scene,
@@ -247,7 +253,7 @@ def _report(
         metrics=metrics,
         stage_s=metrics["seconds"],
         objective=[value for _, value in result.objective],
-        disparity_range_px=(min(front, back), max(front, back)),
+        disparity_range_px=(focus[0], focus[2]),
         warnings=metrics["warnings"],
         command=metrics["command"],
     )

@@ -13,6 +13,10 @@ from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
 from emmc_rig import __version__
 from emmc_rig.errors import AppError
 
@@ -77,6 +81,20 @@ def _finite(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return value
+
+
+def save_frames(
+    path: Path,
+    frames_dn: NDArray[np.uint16],
+    readings: NDArray[np.floating],
+    exposures_s: NDArray[np.floating],
+    **more: NDArray[np.floating],
+) -> None:
+    """Write frames (shot, y, x) as HDF5: frames_dn, readings, exposures_s (shot,), and more."""
+    arrays = {"frames_dn": frames_dn, "readings": readings, "exposures_s": exposures_s, **more}
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
 
 
 def versions() -> dict[str, str]:

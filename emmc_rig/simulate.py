@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.output import command_line, save_frames, versions, write_metrics
 from emmc_rig.scene import open_scene
 
 
@@ -30,7 +28,7 @@ def simulate(
     frames.h5 holds `frames_dn` (shot, y, x) uint16, `readings` and `noise_free`, float32.
     sensor_psnr_db compares readings with noise to those without, peak 1, as the paper's Figure 5.
     """
-    scene = open_scene(scene_spec, size, camera.views, seed)
+    scene = open_scene(scene_spec, size=size, views=camera.views, seed=seed)
     psi = build_imaging_matrix(camera, (scene.light_field.shape[2], scene.light_field.shape[3]))
     noise = camera.sensor.noise
     light = pixel_light(camera, psi.size)
@@ -38,7 +36,7 @@ def simulate(
     clean = psi.forward(scene.light_field)
     frames_dn = noise.expose_dn(clean, exposures_s, light, np.random.default_rng(seed))
     readings = noise.normalise(frames_dn, exposures_s, light)
-    _write_frames(folder / "frames.h5", frames_dn, readings, clean, exposures_s.ravel())
+    save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s(), noise_free=clean)
     psi.save(folder / "psi.h5")
     metrics = {
         "scene": scene_spec,
@@ -57,17 +55,3 @@ def simulate(
     }
     write_metrics(folder, metrics)
     return metrics
-
-
-def _write_frames(
-    path: Path,
-    frames_dn: NDArray[np.uint16],
-    readings: NDArray[np.float32],
-    clean: NDArray[np.floating],
-    exposures_s: NDArray[np.float64],
-) -> None:
-    with h5py.File(path, "w") as file:
-        file["frames_dn"] = frames_dn
-        file["readings"] = readings
-        file["noise_free"] = clean
-        file["exposures_s"] = exposures_s

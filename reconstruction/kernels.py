@@ -1,10 +1,12 @@
 """Fused loops of primal-dual total variation on the kernels' axes (v, u, y, colour, x).
 
 The dual variable has axes (v, u, y, direction, colour, x), directions x, y, u, v: forward
-differences, 0 across the far border. One sweep reads and writes the light field and the dual
-variable once: rows of pixels are taken in order, the primal step of a row is followed by the dual
-step of the row before it while both are in cache. Bands of rows run in parallel; the dual step of
-a band's last row needs the next band's first and is done after all bands.
+differences, 0 across the far border, of the colours after multiplication by a 3 x 3 metric.
+
+One sweep reads and writes the light field and the dual variable once: rows of pixels are taken in
+order, the primal step of a row is followed by the dual step of the row before it while both are
+in cache. Bands of rows run in parallel; the dual step of a band's last row needs the next band's
+first and is done after all bands.
 """
 
 from __future__ import annotations
@@ -15,44 +17,75 @@ from numba import njit, prange
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
 
-@njit(cache=True, inline="always", fastmath=True)
-def _descend(light_field, dual, step, v, u, y, out):
-    """Set out (colour, x) to the light field less step times the adjoint gradient of the dual."""
+@njit(cache=True, fastmath=True)
+def _mix(metric, lines):
+    """Replace lines (colour, x) by metric @ lines."""
+    red, green, blue = lines[0], lines[1], lines[2]
+    for x in range(red.size):
+        r, g, b = red[x], green[x], blue[x]
+        red[x] = metric[0, 0] * r + metric[0, 1] * g + metric[0, 2] * b
+        green[x] = metric[1, 0] * r + metric[1, 1] * g + metric[1, 2] * b
+        blue[x] = metric[2, 0] * r + metric[2, 1] * g + metric[2, 2] * b
+
+
+@njit(cache=True, fastmath=True)
+def _descend(light_field, dual, step, back, v, u, y, out):
+    """Set out (colour, x) to the light field less step times the adjoint of `_dual_rows`' gradient.
+
+    back: the transposed metric.
+    """
     width = light_field.shape[4]
     here = dual[v, u, y]
     for c in range(3):
         gx, gy, gu, gv = here[0, c], here[1, c], here[2, c], here[3, c]
-        row = light_field[v, u, y, c]
         line = out[c]
         for x in range(width):
-            line[x] = row[x] + step * (gx[x] + gy[x] + gu[x] + gv[x])
+            line[x] = gx[x] + gy[x] + gu[x] + gv[x]
         for x in range(1, width):
-            line[x] -= step * gx[x - 1]
+            line[x] -= gx[x - 1]
         if y > 0:
             gy = dual[v, u, y - 1, 1, c]
             for x in range(width):
-                line[x] -= step * gy[x]
+                line[x] -= gy[x]
         if u > 0:
             gu = dual[v, u - 1, y, 2, c]
             for x in range(width):
-                line[x] -= step * gu[x]
+                line[x] -= gu[x]
         if v > 0:
             gv = dual[v - 1, u, y, 3, c]
             for x in range(width):
-                line[x] -= step * gv[x]
+                line[x] -= gv[x]
+    _mix(back, out)
+    for c in range(3):
+        row, line = light_field[v, u, y, c], out[c]
+        for x in range(width):
+            line[x] = row[x] + step * line[x]
 
 
 @njit(cache=True, fastmath=True)
 def _primal_rows(
-    weights, colour, inverse, frames, binning, light_field, dual, step, relax, row, ahead, moved
+    weights,
+    colour,
+    inverse,
+    frames,
+    binning,
+    light_field,
+    dual,
+    metric,
+    step,
+    relax,
+    row,
+    ahead,
+    moved,
 ):
-    """Do the primal step of one row of pixels; ahead (v, u, part, colour, x) = 2 new - old."""
+    """Do the primal step of a row of pixels; set ahead, for _dual_rows, to metric (2 new - old)."""
     shots, views_v, views_u, _, _, width = weights.shape
     base = row * binning
+    back = metric.T.copy()
     for v in range(views_v):
         for u in range(views_u):
             for part in range(binning):
-                _descend(light_field, dual, step, v, u, base + part, ahead[v, u, part])
+                _descend(light_field, dual, step, back, v, u, base + part, ahead[v, u, part])
     seen = np.zeros((shots, width), frames.dtype)
     for shot in range(shots):
         for part in range(binning):
@@ -79,11 +112,12 @@ def _primal_rows(
                         row_power += old[x] * old[x]
                     change += row_change
                     power += row_power
+                _mix(metric, ahead[v, u, part])
     moved[row, 0] = change
     moved[row, 1] = power
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _dual_rows(ahead, below, has_below, dual, base, step, bound, relax):
     """Do the dual step of the rows of `ahead` (v, u, part, colour, x); `below`: the next block."""
     views_v, views_u, parts, _, width = ahead.shape
@@ -145,7 +179,56 @@ def _dual_rows(ahead, below, has_below, dual, base, step, bound, relax):
                             old[x] = (one - relax) * old[x] + size[x] * new[x]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, fastmath=True)
+def _sweep_band(
+    weights,
+    colour,
+    inverse,
+    frames,
+    binning,
+    light_field,
+    dual,
+    metric,
+    primal_step,
+    dual_step,
+    bound,
+    relax,
+    begin,
+    end,
+    moved,
+    first,
+    last,
+):
+    """Do the rows of pixels from begin to end, but for the dual step of the last one.
+
+    first, last: set to the `ahead` of those rows, for the dual steps at the bands' edges.
+    """
+    ring = np.empty((2, *first.shape), light_field.dtype)
+    for row in range(begin, end):
+        ahead = ring[row % 2]
+        _primal_rows(
+            weights,
+            colour,
+            inverse,
+            frames,
+            binning,
+            light_field,
+            dual,
+            metric,
+            primal_step,
+            relax,
+            row,
+            ahead,
+            moved,
+        )
+        if row == begin:
+            first[:] = ahead
+        else:
+            base = (row - 1) * binning
+            _dual_rows(ring[(row - 1) % 2], ahead, True, dual, base, dual_step, bound, relax)
+    last[:] = ring[(end - 1) % 2]
+
+
 def sweep(
     weights,
     colour,
@@ -154,79 +237,84 @@ def sweep(
     binning,
     light_field,
     dual,
+    metric,
     primal_step,
     dual_step,
     bound,
     relax,
     bands,
     moved,
+    run=map,
 ):
     """Do one over-relaxed primal-dual iteration in place (Condat 2013, algorithm 3.1).
 
+    metric: (3, 3), turns colours into the coordinates in which differences are measured.
     bands: (band, 2) first and last + 1 row of pixels. moved: (pixel_y, 2) squared change and
-    squared size of the light field per row of pixels.
+    squared size of the light field per row of pixels. run: `map`, or that of a thread pool: the
+    bands are independent (numba's own parallel loop takes 15 s more to compile).
     """
     views_v, views_u, _, _, width = light_field.shape
-    count = bands.shape[0]
-    first = np.empty((count, views_v, views_u, binning, 3, width), light_field.dtype)
-    last = np.empty((count, views_v, views_u, binning, 3, width), light_field.dtype)
-    for band in prange(count):
-        begin, end = bands[band, 0], bands[band, 1]
-        ring = np.empty((2, views_v, views_u, binning, 3, width), light_field.dtype)
-        for row in range(begin, end):
-            ahead = ring[row % 2]
-            _primal_rows(
-                weights,
-                colour,
-                inverse,
-                frames,
-                binning,
-                light_field,
-                dual,
-                primal_step,
-                relax,
-                row,
-                ahead,
-                moved,
-            )
-            if row == begin:
-                first[band] = ahead
-            else:
-                before = ring[(row - 1) % 2]
-                _dual_rows(before, ahead, True, dual, (row - 1) * binning, dual_step, bound, relax)
-        last[band] = ring[(end - 1) % 2]
-    for band in prange(count):
+    edges = np.empty((2, len(bands), views_v, views_u, binning, 3, width), light_field.dtype)
+    first, last = edges
+
+    def rows(band):
+        _sweep_band(
+            weights,
+            colour,
+            inverse,
+            frames,
+            binning,
+            light_field,
+            dual,
+            metric,
+            primal_step,
+            dual_step,
+            bound,
+            relax,
+            *bands[band],
+            moved,
+            first[band],
+            last[band],
+        )
+
+    def last_row(band):
         base = (bands[band, 1] - 1) * binning
-        below = first[min(band + 1, count - 1)]
-        _dual_rows(last[band], below, band + 1 < count, dual, base, dual_step, bound, relax)
+        inner = band + 1 < len(bands)
+        below = first[band + 1 if inner else band]
+        _dual_rows(last[band], below, inner, dual, base, dual_step, bound, relax)
+
+    for step in (rows, last_row):
+        for _ in run(step, range(len(bands))):
+            pass
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def total_variation_rows(light_field, totals):
-    """Set totals (y,) to DV_1 of every row of the light field (v, u, y, colour, x)."""
+def total_variation_rows(light_field, metric, totals):
+    """Set totals (y,) to the total variation of every row of the light field."""
     views_v, views_u, rows, _, width = light_field.shape
     for y in prange(rows):
         square = np.empty(width, light_field.dtype)
+        step = np.empty((3, width), light_field.dtype)
         total = 0.0
         for v in range(views_v):
             for u in range(views_u):
                 square[:] = 0
-                for c in range(3):
-                    here = light_field[v, u, y, c]
-                    for x in range(width - 1):
-                        square[x] += (here[x + 1] - here[x]) ** 2
-                    if y + 1 < rows:
-                        beyond = light_field[v, u, y + 1, c]
+                for direction in range(4):
+                    y_to = y + (direction == 1)
+                    u_to = u + (direction == 2)
+                    v_to = v + (direction == 3)
+                    if y_to == rows or u_to == views_u or v_to == views_v:
+                        continue
+                    along = 1 if direction == 0 else 0
+                    for c in range(3):
+                        here, there = light_field[v, u, y, c], light_field[v_to, u_to, y_to, c]
+                        step[c, width - 1] = 0
+                        for x in range(width - along):
+                            step[c, x] = there[x + along] - here[x]
+                    _mix(metric, step)
+                    for c in range(3):
                         for x in range(width):
-                            square[x] += (beyond[x] - here[x]) ** 2
-                    if u + 1 < views_u:
-                        beyond = light_field[v, u + 1, y, c]
-                        for x in range(width):
-                            square[x] += (beyond[x] - here[x]) ** 2
-                    if v + 1 < views_v:
-                        beyond = light_field[v + 1, u, y, c]
-                        for x in range(width):
-                            square[x] += (beyond[x] - here[x]) ** 2
+                            square[x] += step[c, x] ** 2
                 for x in range(width):
                     total += np.sqrt(square[x])
         totals[y] = total

@@ -1,9 +1,10 @@
 """Fused loops of the imaging matrix, over rows of pixels in parallel.
 
-Axes: weights (shot, v, u, y, stored colour, x); light field (v, u, y, colour, x), any strides;
-frames (shot, pixel_y, pixel_x). With one stored colour, `colour` (shot, y, x) says which it is.
-A pixel sums binning x binning samples; samples belong to one pixel only, so Psi Psi^T is one
-small block (shot x shot) per pixel.
+Axes: weights (shot, v, u, y, stored colour, x); frames (shot, pixel_y, pixel_x); light fields as
+said at each. With one stored colour, `colour` (shot, y, x) says which it is. A pixel sums
+binning x binning samples; samples belong to one pixel only, so Psi Psi^T is one small block
+(shot x shot) per pixel. Solvers keep the colours of a row apart, (v, u, y, colour, x): their
+loops then run along x.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 
-@njit(cache=True, inline="always", fastmath=True)
+@njit(cache=True, fastmath=True)
 def gather_row(weights, colour, block, part, shot, y, total):
     """Add to total (x,) what one shot sees of row y; block[:, :, part] is that row."""
     views_v, views_u, stored, width = weights.shape[1], weights.shape[2], *weights.shape[4:]
@@ -32,7 +33,7 @@ def gather_row(weights, colour, block, part, shot, y, total):
                         total[x] += weight[x] * line[x]
 
 
-@njit(cache=True, inline="always", fastmath=True)
+@njit(cache=True, fastmath=True)
 def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
     """Add to lines (colour, x), row y of view (v, u), the transpose of a shot on frame_row (x,)."""
     stored, width = weights.shape[4:]
@@ -49,7 +50,7 @@ def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
                 line[x] += weight[x] * frame_row[x]
 
 
-@njit(cache=True, inline="always", fastmath=True)
+@njit(cache=True, fastmath=True)
 def correct_row(inverse, frames, binning, row, seen):
     """Turn seen (shot, x), sums over views per sample, into -(Psi Psi^T + Lambda)^-1 residual."""
     shots, width = seen.shape
@@ -70,47 +71,77 @@ def correct_row(inverse, frames, binning, row, seen):
             seen[shot, x] = corrected[x // binning]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, fastmath=True)
+def pass_colours(colour, shot, y, passes):
+    """Set passes (colour, x) to 1 where a pixel of row y sees that colour, else 0."""
+    for c in range(3):
+        for x in range(passes.shape[1]):
+            passes[c, x] = 1 if colour[shot, y, x] == c else 0
+
+
+@njit(cache=True, parallel=True, fastmath=True)
 def project(weights, colour, light_field, binning, frames):
-    """Set frames = Psi light_field."""
-    width = weights.shape[5]
+    """Set frames = Psi light_field, a light field in its natural order (v, u, y, x, colour)."""
+    shots, views_v, views_u, _, stored, width = weights.shape
     for row in prange(frames.shape[1]):
         total = np.empty(width, frames.dtype)
-        for shot in range(frames.shape[0]):
+        for shot in range(shots):
             total[:] = 0
             for part in range(binning):
                 y = row * binning + part
-                gather_row(weights, colour, light_field, y, shot, y, total)
+                for v in range(views_v):
+                    for u in range(views_u):
+                        samples = light_field[v, u, y]
+                        if stored == 1:
+                            weight = weights[shot, v, u, y, 0]
+                            which = colour[shot, y]
+                            for x in range(width):
+                                total[x] += weight[x] * samples[x, which[x]]
+                        else:
+                            red, green, blue = weights[shot, v, u, y]
+                            for x in range(width):
+                                total[x] += (
+                                    red[x] * samples[x, 0]
+                                    + green[x] * samples[x, 1]
+                                    + blue[x] * samples[x, 2]
+                                )
             frames[shot, row, :] = 0
             for x in range(width):
                 frames[shot, row, x // binning] += total[x]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, fastmath=True)
 def back_project(weights, colour, frames, binning, light_field):
-    """Set light_field = Psi^T frames; every row is gathered in cache and written once."""
+    """Set light_field = Psi^T frames, a light field in its natural order (v, u, y, x, colour)."""
     shots, views_v, views_u, _, stored, width = weights.shape
     for row in prange(frames.shape[1]):
-        spread = np.empty((shots, width), frames.dtype)
-        line = np.empty((width, 3), frames.dtype)
-        for shot in range(shots):
-            for x in range(width):
-                spread[shot, x] = frames[shot, row, x // binning]
+        spread = np.empty((shots, 3, width), frames.dtype)
         for part in range(binning):
             y = row * binning + part
+            for shot in range(shots):
+                spread[shot] = 1
+                if stored == 1:
+                    pass_colours(colour, shot, y, spread[shot])
+                for c in range(3):
+                    for x in range(width):
+                        spread[shot, c, x] *= frames[shot, row, x // binning]
             for v in range(views_v):
                 for u in range(views_u):
-                    line[:] = 0
+                    samples = light_field[v, u, y]
                     for shot in range(shots):
-                        for c in range(stored):
-                            weight = weights[shot, v, u, y, c]
+                        red = weights[shot, v, u, y, 0]
+                        green = weights[shot, v, u, y, 1 % stored]
+                        blue = weights[shot, v, u, y, 2 % stored]
+                        if shot == 0:
                             for x in range(width):
-                                where = c if stored == 3 else colour[shot, y, x]
-                                line[x, where] += weight[x] * spread[shot, x]
-                    out = light_field[v, u, y]
-                    for x in range(width):
-                        for c in range(3):
-                            out[c, x] = line[x, c]
+                                samples[x, 0] = red[x] * spread[shot, 0, x]
+                                samples[x, 1] = green[x] * spread[shot, 1, x]
+                                samples[x, 2] = blue[x] * spread[shot, 2, x]
+                        else:
+                            for x in range(width):
+                                samples[x, 0] += red[x] * spread[shot, 0, x]
+                                samples[x, 1] += green[x] * spread[shot, 1, x]
+                                samples[x, 2] += blue[x] * spread[shot, 2, x]
 
 
 @njit(cache=True, parallel=True)

@@ -29,7 +29,7 @@ FORMAT = "emmc-rig imaging matrix 1"
 
 
 def rows_of_colours(light_field: Array) -> Array:
-    """Return a view of a light field (v, u, y, x, c) as the kernels' (v, u, y, c, x)."""
+    """Return a view of a light field (v, u, y, x, c) as the solvers' (v, u, y, c, x)."""
     return np.moveaxis(light_field, -1, -2)
 
 
@@ -111,18 +111,14 @@ class ImagingMatrix:
         """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c)."""
         light_field = self._checked(light_field, self.light_field_shape, "a light field")
         frames = np.empty(self.frames_shape, dtype=self.weights.dtype)
-        kernels.project(
-            self.weights, self.colour_map, rows_of_colours(light_field), self.binning, frames
-        )
+        kernels.project(self.weights, self.colour_map, light_field, self.binning, frames)
         return frames
 
     def adjoint(self, frames: Array) -> Array:
         """Return Psi^T frames, a light field (v, u, y, x, c)."""
         frames = np.ascontiguousarray(self._checked(frames, self.frames_shape, "frames"))
         light_field = np.empty(self.light_field_shape, dtype=self.weights.dtype)
-        kernels.back_project(
-            self.weights, self.colour_map, frames, self.binning, rows_of_colours(light_field)
-        )
+        kernels.back_project(self.weights, self.colour_map, frames, self.binning, light_field)
         return light_field
 
     @cached_property
