@@ -24,6 +24,7 @@ from calibration.frames import MeanFrame, SensorGain, photon_transfer
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
+Frames = NDArray[np.floating] | NDArray[np.integer]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 IDEAL_DN = 1e6
@@ -61,12 +62,12 @@ class Calibration:
     white_dn_per_s: NDArray[np.float32]
     gain: SensorGain
 
-    def readings(self, frames_dn: Array, exposures_s: Array) -> NDArray[np.float32]:
+    def readings(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float32]:
         """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""
         scale = self.white_dn_per_s * np.asarray(exposures_s)[:, None, None]
         return ((frames_dn - self.dark_dn) / scale).astype(np.float32)
 
-    def reading_variance(self, frames_dn: Array, exposures_s: Array) -> NDArray[np.float64]:
+    def reading_variance(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float64]:
         """Return the variance of the readings of frames in DN, (shot, y, x)."""
         scale = self.white_dn_per_s * np.asarray(exposures_s, dtype=np.float64)[:, None, None]
         return self.gain.variance_dn2(frames_dn - self.dark_dn) / scale**2

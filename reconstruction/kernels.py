@@ -11,6 +11,8 @@ first and is done after all bands.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 from numba import njit, prange
 
@@ -244,7 +246,7 @@ def sweep(
     relax,
     bands,
     moved,
-    run=map,
+    run: Callable[..., Iterable[object]] = map,
 ):
     """Do one over-relaxed primal-dual iteration in place (Condat 2013, algorithm 3.1).
 
@@ -271,7 +273,8 @@ def sweep(
             dual_step,
             bound,
             relax,
-            *bands[band],
+            bands[band, 0],
+            bands[band, 1],
             moved,
             first[band],
             last[band],

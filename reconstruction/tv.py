@@ -66,7 +66,8 @@ def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float) -> float:
     factor were fitted to the best mu of 191 runs on the built-in scenes (2x2 to 7x7 views, Bayer
     and monochrome, one to three shots, k = 1 and 2, noise of 1-9 % of the mean brightness): the
     loss against the best was 0.05 dB on average and 0.4 dB at most, and the same in 94 runs with
-    a chrominance weight of 2. Without noise the minimiser tends to the least DV_1 that explains the frames, reached at a small mu.
+    a chrominance weight of 2. Without noise the minimiser tends to the least variation that
+    explains the frames, reached at a small mu.
     """
     brightness = max(float(np.mean(frames)) / max(psi.light_efficiency(), 1e-12), 1e-12)
     views_v, views_u = psi.light_field_shape[:2]
@@ -145,8 +146,8 @@ def reconstruct_tv(
     data = np.where(usable, frames, 0).astype(dtype)
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma)
     guess = smooth_guess(psi, data, usable)
-    contrast = max(float(guess.std()), 1e-3 * float(np.abs(guess).max()), 1e-12)
-    gamma = settings.primal_step or 0.15 * contrast / mu
+    contrast = max(float(guess.std()), 0.05 * float(np.abs(guess).max()), 1e-12)
+    gamma = settings.primal_step or 0.18 * contrast / mu / max(1.0, settings.chroma_weight)
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     norm_squared = DIFFERENCE_NORM_SQUARED * max(1.0, settings.chroma_weight) ** 2
     dual_step = 1 / (norm_squared * gamma)

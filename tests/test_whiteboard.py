@@ -139,7 +139,8 @@ def test_a_saturated_whiteboard_is_refused():
 def test_a_missing_whiteboard_is_named():
     _, design = design_of()
     boards = ideal_boards(pinhole_readings(design), ("white",), design)
-    del boards.pinholes[0, 1, 2, "white"]
+    pinholes = {key: frame for key, frame in boards.pinholes.items() if key[1:3] != (1, 2)}
+    boards = Whiteboards(boards.dark, boards.references, pinholes)
     with pytest.raises(CalibrationError, match=r"missing: shot 0, view \(1, 2\), white lamp"):
         measure_psi(boards, design)
 

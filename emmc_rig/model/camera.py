@@ -31,24 +31,31 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings, read_yaml, validated
 
 FILTER_COLOURS = {"none": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
-PARTLY_SEEN_SPLITS = 3
 
 
 class Lens(Settings):
     """The lens: D, and the aperture cells that the views stand for."""
 
-    distance_mm: float = Field(50.0, gt=0, description="D, from the sensor to the lens")
-    aperture_cell_mm: float = Field(5.0, gt=0, description="between the centres of two views")
-    aperture_fill: float = Field(1.0, ge=0, le=1, description="open width of a cell; 0: a point")
+    distance_mm: float = Field(default=50.0, gt=0, description="D, from the sensor to the lens")
+    aperture_cell_mm: float = Field(
+        default=5.0, gt=0, description="between the centres of two views"
+    )
+    aperture_fill: float = Field(
+        default=1.0, ge=0, le=1, description="open width of a cell; 0: a point"
+    )
 
 
 class Sensor(Settings):
     """The sensor: its colour filters, sampling step and pixel size."""
 
     cfa: str | tuple[str, ...] = "mono"
-    sample_pitch_um: float = Field(24.0, gt=0)
-    pixel_fill: float = Field(1.0, ge=0, le=1, description="open width of a sample; 0: a point")
-    binning: int = Field(1, ge=1, le=16, description="k: a pixel sums k x k samples, r = 1/k^2")
+    sample_pitch_um: float = Field(default=24.0, gt=0)
+    pixel_fill: float = Field(
+        default=1.0, ge=0, le=1, description="open width of a sample; 0: a point"
+    )
+    binning: int = Field(
+        default=1, ge=1, le=16, description="k: a pixel sums k x k samples, r = 1/k^2"
+    )
     noise: SensorNoise = SensorNoise()
 
     @model_validator(mode="after")
@@ -66,7 +73,7 @@ class Mask(Settings):
     distance_mm: float = Field(ge=0, description="d, from the sensor")
     cell_um: float = Field(gt=0)
     pattern: AnyPattern
-    spare_cells: int = Field(8, ge=0, description="beyond the beam, for a misplaced mask")
+    spare_cells: int = Field(default=8, ge=0, description="beyond the beam, for a misplaced mask")
 
 
 class Shot(Settings):
@@ -74,12 +81,16 @@ class Shot(Settings):
 
     masks: tuple[str, ...] | None = None
     offset_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    exposure_s: float | None = Field(None, gt=0)
+    exposure_s: float | None = Field(default=None, gt=0)
     filter: Literal["none", "red", "green", "blue"] = "none"
 
 
 class Camera(Settings):
-    """A camera; `total_exposure_s` is shared by the shots that do not name their own."""
+    """A camera.
+
+    total_exposure_s: divided evenly by the number of shots; a shot may name its own instead.
+    footprint_splits: see `_transmittances`; more for two masks of cells as fine as their shadow.
+    """
 
     title: str
     reference: str = ""
@@ -89,7 +100,8 @@ class Camera(Settings):
     masks: dict[str, Mask] = Field(default_factory=dict)
     shots: tuple[Shot, ...] = Field((Shot(),), min_length=1)
     more_shots_step_um: dict[str, tuple[float, float]] | None = None
-    total_exposure_s: float = Field(0.05, gt=0)
+    total_exposure_s: float = Field(default=0.05, gt=0)
+    footprint_splits: int = Field(default=3, ge=1, le=9)
 
     @model_validator(mode="after")
     def _consistent(self) -> Camera:
@@ -180,8 +192,16 @@ def shipped_cameras() -> dict[str, Camera]:
 
 
 def load_camera(path: Path) -> Camera:
-    """Return the camera described by a YAML file; raises CameraError with one line."""
-    return validated(Camera, read_yaml(path, CameraError), str(path), CameraError)
+    """Return the camera described by a YAML file; raises CameraError with one line.
+
+    The paths of mask pictures are relative to the folder of the file.
+    """
+    camera = validated(Camera, read_yaml(path, CameraError), str(path), CameraError)
+    masks = {
+        name: mask.model_copy(update={"pattern": mask.pattern.beside(path.parent)})
+        for name, mask in camera.masks.items()
+    }
+    return camera.model_copy(update={"masks": masks})
 
 
 @dataclass(frozen=True)
@@ -321,7 +341,7 @@ def _transmittances(
 
     One mask whose footprint covers several cells is averaged exactly. The average of the product
     of two such masks is not the product of their averages: pixels and aperture cells are then
-    split in PARTLY_SEEN_SPLITS along each axis, and the products of the parts averaged.
+    split in `footprint_splits` along each axis, and the products of the parts averaged.
     """
     axes = _axes(camera, size)
     names = camera.shot_masks(shot)
@@ -348,7 +368,7 @@ def _transmittances(
         for (name, _), matrix in weights.items()
         if (np.diff(matrix.indptr) > 1).any()
     }
-    splits = PARTLY_SEEN_SPLITS if len(partly) > 1 else 1
+    splits = camera.footprint_splits if len(partly) > 1 else 1
     parts = [(i, j) for i in range(splits) for j in range(splits)]
     by_part = [
         {part: whole[axis] if splits == 1 else factors(axis, splits, *part) for part in parts}
@@ -373,7 +393,8 @@ def _transmittances(
                         for colour in range(3):
                             product[:, :, colour] *= (right @ upper[name, part_y, colour].T).T
                     total += product
-            yield v, u, total / len(parts) ** 2
+            total /= len(parts) ** 2
+            yield v, u, total
 
 
 def build_imaging_matrix(camera: Camera, size: tuple[int, int]) -> ImagingMatrix:

@@ -20,11 +20,12 @@ from scipy import sparse
 from emmc_rig.model.errors import CameraError
 
 WAVELENGTH_UM = 0.55
+SMALLEST_SHARE = 1e-9
 
 
 def centred_grid(count: int, pitch: float) -> NDArray[np.float64]:
     """Return `count` equally spaced positions around 0, in the unit of `pitch`."""
-    return (np.arange(count) - (count - 1) / 2) * pitch
+    return np.asarray((np.arange(count) - (count - 1) / 2) * pitch, dtype=np.float64)
 
 
 def mask_position(
@@ -105,6 +106,7 @@ def cell_weights(
     below = _covered(edges_um, footprint)
     below[:, 0] = 0.0
     values = np.diff(below, axis=1)
+    values[values < SMALLEST_SHARE] = 0
     rows = np.repeat(np.arange(len(positions_um)), band)
     columns = np.minimum(index[:, :-1].ravel(), cell_count - 1)
     matrix = sparse.csr_array(

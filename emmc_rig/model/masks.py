@@ -8,7 +8,7 @@ shows frame s in shot s. Reference numbers are those of the paper.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -48,8 +48,6 @@ def cfa_tile(cfa: str | tuple[str, ...]) -> NDArray[np.float32]:
 class Pattern(Settings):
     """A mask pattern; `draw` makes its cells."""
 
-    extends: ClassVar[bool] = True
-
     def frame_count(self, shots: int) -> int:
         """Return how many different frames the pattern shows over `shots` shots."""
         return 1
@@ -58,8 +56,12 @@ class Pattern(Settings):
         """Return the cells (frame, row, column, colour) in [0, 1]."""
         raise NotImplementedError
 
+    def beside(self, folder: Path) -> Pattern:
+        """Return the pattern with its files looked up from a folder."""
+        return self
 
-def _grey(cells: NDArray[np.float64]) -> NDArray[np.float32]:
+
+def _grey(cells: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.repeat(np.asarray(cells, dtype=np.float32)[..., None], 3, axis=-1)
 
 
@@ -78,22 +80,23 @@ class Pinhole(Pattern):
 
     kind: Literal["pinhole"]
     at_cells: tuple[float, float] = (0, 0)
-    side_cells: float = Field(1, gt=0)
+    side_cells: float = Field(default=1, gt=0)
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the plate; cells cut by the edge of the hole pass their open share."""
 
         def share(count: int, centre: float) -> NDArray[np.float64]:
             edges = np.arange(count + 1) - count / 2 - centre
-            return np.diff(np.clip(edges, -self.side_cells / 2, self.side_cells / 2))
+            inside = np.clip(edges, -self.side_cells / 2, self.side_cells / 2)
+            return np.asarray(np.diff(inside), dtype=np.float64)
 
         hole = np.outer(share(rows, self.at_cells[1]), share(columns, self.at_cells[0]))
         return np.repeat(_grey(hole)[None], frames, axis=0)
 
 
 class _Random(Pattern):
-    seed: int = Field(0, ge=0)
-    redraw: bool = Field(False, description="draw a new pattern for every shot")
+    seed: int = Field(default=0, ge=0)
+    redraw: bool = Field(default=False, description="draw a new pattern for every shot")
 
     def frame_count(self, shots: int) -> int:
         """Return one frame, or one a shot."""
@@ -136,7 +139,7 @@ class RandomBinary(_Random):
     """Each cell is open with the given probability [31]."""
 
     kind: Literal["random_binary"]
-    open_probability: float = Field(0.5, gt=0, le=1)
+    open_probability: float = Field(default=0.5, gt=0, le=1)
 
     def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         """Return a row of cells."""
@@ -157,8 +160,8 @@ class GaussianColour(_Random):
     """Each colour of each cell normal, clipped to [0, 1] (paper, Figure 8d)."""
 
     kind: Literal["gaussian_colour"]
-    mean: float = Field(0.5, ge=0, le=1)
-    deviation: float = Field(0.2, ge=0)
+    mean: float = Field(default=0.5, ge=0, le=1)
+    deviation: float = Field(default=0.2, ge=0)
 
     def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         """Return a row of cells."""
@@ -170,8 +173,8 @@ class GaussianMonochrome(_Random):
     """Each cell a grey, normal, clipped to [0, 1] [17]."""
 
     kind: Literal["gaussian_monochrome"]
-    mean: float = Field(0.5, ge=0, le=1)
-    deviation: float = Field(0.2, ge=0)
+    mean: float = Field(default=0.5, ge=0, le=1)
+    deviation: float = Field(default=0.2, ge=0)
 
     def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         """Return a row of cells."""
@@ -209,7 +212,7 @@ class Mura(Pattern):
     """A broadband mask: the modified uniformly redundant array of a prime side, repeated."""
 
     kind: Literal["mura"]
-    prime: int = Field(5, ge=3, le=997)
+    prime: int = Field(default=5, ge=3, le=997)
 
     @model_validator(mode="after")
     def _is_prime(self) -> Mura:
@@ -265,7 +268,6 @@ class Sequence(Pattern):
     kind: Literal["sequence"]
     regions: list | None = None
     scan: tuple[int, int] | None = None
-    extends: ClassVar[bool] = False
 
     @model_validator(mode="after")
     def _has_one(self) -> Sequence:
@@ -297,7 +299,6 @@ class Parameters(Pattern):
 
     kind: Literal["parameters"]
     cells: list
-    extends: ClassVar[bool] = False
 
     @model_validator(mode="after")
     def _is_array(self) -> Parameters:
@@ -315,7 +316,10 @@ class Picture(Pattern):
     kind: Literal["picture"]
     path: Path
     repeat: bool = False
-    extends: ClassVar[bool] = False
+
+    def beside(self, folder: Path) -> Picture:
+        """Return the pattern with its picture looked up from a folder."""
+        return self.model_copy(update={"path": folder / self.path})
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the picture scaled to [0, 1]; raises CameraError when it cannot be read."""
@@ -324,11 +328,12 @@ class Picture(Pattern):
             raise CameraError(f"mask picture {self.path}: no such file, or not a picture")
         if picture.dtype not in (np.uint8, np.uint16):
             raise CameraError(f"mask picture {self.path}: use 8 or 16 bits a channel")
-        cells = picture.astype(np.float32) / np.iinfo(picture.dtype).max
-        cells = _grey(cells) if cells.ndim == 2 else cells[:, :, 2::-1]
+        grey = picture.ndim == 2
+        levels = picture.astype(np.float64) / np.iinfo(picture.dtype).max
+        cells = _grey(levels) if grey else levels[:, :, 2::-1].astype(np.float32)
         if self.repeat:
             cells = _repeat(cells, rows, columns)
-        return np.repeat(np.ascontiguousarray(cells, dtype=np.float32)[None], frames, axis=0)
+        return np.repeat(cells[None], frames, axis=0)
 
 
 AnyPattern = Annotated[

@@ -175,7 +175,7 @@ class ImagingMatrix:
     def to_scipy(self) -> sparse.csr_array:
         """Return Psi as an explicit sparse matrix without its zeros."""
         _, _, views_u, rows, _, columns = self.weights.shape
-        s, v, u, y, k, x = np.indices(self.weights.shape, sparse=True)
+        s, v, u, y, k, x = np.ogrid[tuple(slice(n) for n in self.weights.shape)]
         colour = k if self.colour is None else self.colour[s, y, x]
         column = (((v * views_u + u) * rows + y) * columns + x) * 3 + colour
         pixel_y, pixel_x = y // self.binning, x // self.binning
@@ -190,12 +190,7 @@ class ImagingMatrix:
 
     def linear_operator(self) -> LinearOperator:
         """Return Psi for SciPy's iterative solvers, on flattened light fields and frames."""
-        return LinearOperator(
-            self.shape,
-            matvec=lambda x: self.forward(x.reshape(self.light_field_shape)).ravel(),
-            rmatvec=lambda y: self.adjoint(y.reshape(self.frames_shape)).ravel(),
-            dtype=self.weights.dtype,
-        )
+        return _FlatPsi(self)
 
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
@@ -207,8 +202,8 @@ class ImagingMatrix:
     def checksum(self) -> str:
         """Return the SHA-256 of weights, colours, binning and camera."""
         digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{self.camera_json}".encode())
-        digest.update(np.ascontiguousarray(self.weights))
-        digest.update(np.ascontiguousarray(self.colour_map))
+        for array in (self.weights, self.colour_map):
+            digest.update(np.ascontiguousarray(array).view(np.uint8).data)
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
@@ -243,7 +238,7 @@ class ImagingMatrix:
                 matrix = cls(
                     np.asarray(file["weights"]),
                     colour,
-                    int(file.attrs["binning"]),
+                    int(np.asarray(file.attrs["binning"])),
                     str(file.attrs["camera"]),
                 )
                 expected = file.attrs["sha256"]
@@ -253,3 +248,17 @@ class ImagingMatrix:
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix
+
+
+class _FlatPsi(LinearOperator):
+    """Psi on flattened arrays."""
+
+    def __init__(self, psi: ImagingMatrix) -> None:
+        super().__init__(psi.weights.dtype, psi.shape)
+        self._psi = psi
+
+    def _matvec(self, x: Array) -> Array:
+        return self._psi.forward(x.reshape(self._psi.light_field_shape)).ravel()
+
+    def _rmatvec(self, x: Array) -> Array:
+        return self._psi.adjoint(x.reshape(self._psi.frames_shape)).ravel()

@@ -1,0 +1,271 @@
+"""The command line: exit codes, one clear line for every fault, nothing half-written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from emmc_rig import cli
+
+SMALL = ["--size", "24x32"]
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run the program in-process: returns exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        shown = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else code), shown.out, shown.err
+
+    return call
+
+
+def views_in(folder, rows=2, columns=2, size=(24, 32)):
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for row, column in np.ndindex(rows, columns):
+        picture = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"view_{row}_{column}.png"), picture)
+    return folder
+
+
+def camera_file(path, **changes):
+    base = {
+        "title": "a camera",
+        "views": [2, 2],
+        "sensor": {"cfa": "rggb"},
+        "masks": {"code": {"distance_mm": 0.12, "cell_um": 48, "pattern": {"kind": "random_rgbw"}}},
+    }
+    path.write_text(yaml.safe_dump({**base, **changes}))
+    return path
+
+
+def one_line(text):
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
+def leftovers(folder):
+    return [path.name for path in folder.iterdir() if ".part" in path.name or ".old" in path.name]
+
+
+def test_the_demo_writes_a_whole_result(run, tmp_path):
+    code, out, _ = run("demo", *SMALL, "--shots", 1, "--out", "result")
+    assert code == 0
+    assert "dB" in out
+    made = {path.name for path in (tmp_path / "result").iterdir()}
+    assert {"metrics.json", "report.html", "light_field.h5", "psi.h5", "frames.h5"} <= made
+    assert json.loads((tmp_path / "result/metrics.json").read_text())["shots"] == 1
+    assert not leftovers(tmp_path)
+
+
+def test_a_second_run_replaces_the_first(run, tmp_path):
+    for seed in (1, 2):
+        assert run("simulate", *SMALL, "--seed", seed, "--out", "result")[0] == 0
+    assert json.loads((tmp_path / "result/metrics.json").read_text())["seed"] == 2
+    assert not leftovers(tmp_path)
+
+
+def test_a_folder_that_holds_something_else_is_not_touched(run, tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/cat.jpg").write_text("meow")
+    code, _, err = run("simulate", *SMALL, "--out", "photos")
+    assert code == 1
+    assert "choose another folder" in one_line(err)
+    assert (tmp_path / "photos/cat.jpg").read_text() == "meow"
+
+
+def test_an_output_that_cannot_be_written_is_one_line(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in ("file", "file/inside", "/proc/emmc"):
+        code, _, err = run("simulate", *SMALL, "--out", out)
+        assert code == 1
+        assert "--out" in one_line(err)
+
+
+def test_cameras_are_listed_and_drawn(run, tmp_path):
+    code, out, _ = run("cameras")
+    assert code == 0
+    assert "rgbw-bayer" in out
+    code, out, _ = run("cameras", "rgbw-mono", "--out", "sheet")
+    assert code == 0
+    assert (tmp_path / "sheet/camera.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "sheet/metrics.json").read_text())["light_efficiency"] > 0.3
+
+
+def test_kernels_are_charted_against_the_triad(run, tmp_path):
+    code, out, _ = run("chart", "--kernels", "--size", "48x64", "--repeats", 1, "--out", "k")
+    assert code == 0
+    metrics = json.loads((tmp_path / "k/metrics.json").read_text())
+    names = [row["name"] for row in metrics["kernels"]]
+    assert names == ["triad", "forward", "adjoint", "data step", "TV step"]
+    assert metrics["reconstruction_peak_gib"] > 0
+    assert "TV step" in out
+
+
+def test_a_folder_of_views_is_imaged(run, tmp_path):
+    views_in(tmp_path / "views")
+    camera_file(tmp_path / "c.yaml")
+    code, out, _ = run("simulate", "--scene", "views", "--camera", "c.yaml", "--out", "r")
+    assert code == 0
+    assert "1 frame(s)" in out
+
+
+def test_faults_of_scenes_are_one_line(run, tmp_path):
+    views_in(tmp_path / "gap")
+    (tmp_path / "gap/view_0_1.png").unlink()
+    views_in(tmp_path / "mixed")
+    cv2.imwrite(str(tmp_path / "mixed/view_1_1.png"), np.zeros((9, 9, 3), np.uint8))
+    views_in(tmp_path / "broken")
+    (tmp_path / "broken/view_1_0.png").write_text("no picture")
+    views_in(tmp_path / "single", 1, 2)
+    (tmp_path / "empty").mkdir()
+    for scene, told in {
+        "gap": "view_0_1",
+        "mixed": "view_1_1",
+        "broken": "view_1_0",
+        "single": "2x2",
+        "empty": "view_",
+        "nowhere": "deep-occlusions",
+    }.items():
+        code, _, err = run("demo", "--scene", scene, "--out", "r")
+        assert code == 1
+        assert told in one_line(err)
+    assert not (tmp_path / "r").exists()
+    assert not leftovers(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"viewss": [2, 2]}, "did you mean 'views'"),
+        ({"sensor": {"cfa": "rggg"}}, "unknown CFA 'rggg'"),
+        (
+            {"masks": {"m": {"distance_mm": 60, "cell_um": 9, "pattern": {"kind": "open"}}}},
+            "further away than the lens",
+        ),
+        (
+            {
+                "masks": {
+                    "m": {
+                        "distance_mm": 1,
+                        "cell_um": 9,
+                        "pattern": {"kind": "parameters", "cells": [[1, 0], [0, 1]]},
+                    }
+                }
+            },
+            "smaller than the beam",
+        ),
+        (
+            {
+                "masks": {
+                    "m": {
+                        "distance_mm": 50,
+                        "cell_um": 5000,
+                        "pattern": {"kind": "parameters", "cells": [[0, 0], [0, 0]]},
+                    }
+                }
+            },
+            "no light reaches the sensor in shot 0",
+        ),
+    ],
+)
+def test_faults_of_cameras_are_one_line(run, tmp_path, changes, told):
+    camera_file(tmp_path / "c.yaml", **changes)
+    for command in ("demo", "simulate"):
+        code, _, err = run(command, *SMALL, "--camera", "c.yaml", "--out", "r")
+        assert code == 1
+        assert told in one_line(err)
+    assert not (tmp_path / "r").exists()
+
+
+def test_unknown_names_and_sizes_are_one_line(run):
+    code, _, err = run("demo", "--camera", "rgbw-bayer-3shot", "--out", "r")
+    assert (code, "rgbw-bayer-3shots" in one_line(err)) == (1, True)
+    code, _, err = run("demo", "--size", "tiny", "--out", "r")
+    assert (code, "192x256" in one_line(err)) == (1, True)
+    code, _, err = run("demo", "--camera", "learned-aperture", "--shots", 9, "--out", "r")
+    assert (code, "more_shots_step_um" in one_line(err)) == (1, True)
+
+
+def test_wrong_usage_is_exit_code_2(run):
+    for arguments in (
+        ["demo", "--sceen", "x"],
+        ["no-such-command"],
+        ["chart"],
+        ["demo", "--shots", 0],
+    ):
+        code, _, err = run(*arguments)
+        assert code == 2
+        assert "Traceback" not in err
+
+
+def test_the_version_and_help_are_told(run):
+    assert run("--version")[:2] == (0, "emmc-rig 0.1.0\n")
+    code, out, _ = run("--help")
+    assert code == 0
+    assert "demo" in out
+
+
+def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
+    command = [sys.executable, "-c", "from emmc_rig.cli import main; main()"]
+    process = subprocess.Popen(
+        [*command, "demo", "--size", "96x128", "--out", "r"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    deadline = time.monotonic() + 60
+    while not leftovers(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Ctrl-C" in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
+    from emmc_rig import demo
+
+    for stage in ("fine_scene", "capture_whiteboards", "capture_shots", "reconstruct_tv", "ssim"):
+
+        def interrupted(*arguments, **settings):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(demo, stage, interrupted)
+            code, _, err = run("demo", *SMALL, "--out", "r")
+        assert code == 130
+        assert "Ctrl-C" in err
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
+    from emmc_rig import demo
+
+    def full(*arguments, **settings):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(demo, "write_report", full)
+    code, _, err = run("demo", *SMALL, "--shots", 1, "--out", "r")
+    assert code == 1
+    assert "No space left" in one_line(err)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,374 @@
+"""Mask patterns and colour filter tiles: statistics, defining properties, bad input."""
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+from scipy.signal import correlate
+
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.masks import CFA, AnyPattern, cfa_tile, mura_tile
+
+CELL_UM = 24.0
+PATTERN = TypeAdapter(AnyPattern)
+RANDOM = [
+    "random_rgbw",
+    "random_binary",
+    "uniform_colour",
+    "gaussian_colour",
+    "gaussian_monochrome",
+]
+SPECIFICATIONS = {
+    "open": {},
+    "pinhole": {"side_cells": 3},
+    **{kind: {} for kind in RANDOM},
+    "sinusoids": {"cycles_per_mm": [[2.0, 1.0], [0.0, 5.0]]},
+    "mura": {"prime": 7},
+    "tile": {"cells": [[0, 0.25], [0.5, 1]]},
+}
+
+
+def pattern(kind, **settings):
+    return PATTERN.validate_python({"kind": kind, **settings})
+
+
+def drawn(kind, frames=1, rows=200, columns=300, **settings):
+    return pattern(kind, **settings).draw(frames, rows, columns, CELL_UM)
+
+
+@pytest.mark.parametrize("kind", SPECIFICATIONS)
+@pytest.mark.parametrize("frames", [1, 3])
+def test_a_mask_is_drawn_as_large_as_asked_with_transmittance_between_0_and_1(kind, frames):
+    cells = drawn(kind, frames, 13, 17, **SPECIFICATIONS[kind])
+    assert cells.shape == (frames, 13, 17, 3)
+    assert cells.dtype == np.float32
+    assert cells.min() >= 0
+    assert cells.max() <= 1
+
+
+@pytest.mark.parametrize("kind", SPECIFICATIONS)
+def test_the_same_settings_draw_the_same_mask(kind):
+    first, second = (drawn(kind, 2, 20, 30, **SPECIFICATIONS[kind]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("kind", RANDOM)
+def test_another_seed_draws_another_mask(kind):
+    assert (drawn(kind, seed=1) != drawn(kind, seed=2)).mean() > 0.4
+
+
+@pytest.mark.parametrize("kind", RANDOM)
+def test_a_redrawn_mask_differs_in_every_shot_and_a_fixed_one_is_drawn_once(kind):
+    assert pattern(kind).frame_count(3) == 1
+    redrawn = pattern(kind, redraw=True)
+    assert redrawn.frame_count(3) == 3
+    cells = redrawn.draw(3, 50, 60, CELL_UM)
+    for one, other in [(0, 1), (0, 2), (1, 2)]:
+        assert (cells[one] != cells[other]).mean() > 0.4
+    np.testing.assert_array_equal(cells[:2], redrawn.draw(2, 50, 60, CELL_UM))
+
+
+@pytest.mark.parametrize("kind", RANDOM)
+def test_a_larger_random_plate_is_the_same_plate_with_more_cells_around_it(kind):
+    for rows, columns in [(12, 17), (13, 18)]:
+        small = drawn(kind, 2, rows, columns, redraw=True)
+        large = drawn(kind, 3, rows + 8, columns + 14, redraw=True)
+        np.testing.assert_array_equal(large[:2, 4:-4, 7:-7], small)
+
+
+def assert_mean(values, mean, deviation, sigmas=4.5):
+    """Check a sample mean against theory, in standard errors."""
+    assert abs(values.mean() - mean) < sigmas * deviation / np.sqrt(values.size)
+
+
+def test_an_open_mask_passes_everything():
+    assert (drawn("open") == 1).all()
+
+
+def test_rgbw_filters_are_equally_likely_and_pass_half_of_the_light():
+    cells = drawn("random_rgbw")[0]
+    for letter in [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]:
+        assert_mean((cells == letter).all(axis=-1), 0.25, np.sqrt(0.25 * 0.75))
+    for colour in range(3):
+        assert_mean(cells[..., colour], 0.5, 0.5)
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.5, 0.8, 1.0])
+def test_a_binary_mask_is_open_with_its_probability_in_all_colours_alike(probability):
+    cells = drawn("random_binary", open_probability=probability)[0]
+    assert set(np.unique(cells)) <= {0.0, 1.0}
+    assert (cells == cells[..., :1]).all()
+    deviation = np.sqrt(probability * (1 - probability)) + 1e-9
+    assert_mean(cells[..., 0], probability, deviation)
+
+
+def test_neighbouring_random_cells_are_uncorrelated():
+    cells = drawn("random_binary")[0, :, :, 0] - 0.5
+    for neighbours in (cells[1:] * cells[:-1], cells[:, 1:] * cells[:, :-1]):
+        assert_mean(neighbours, 0, 0.25)
+
+
+def test_uniform_colours_have_mean_a_half_variance_a_twelfth_and_are_independent():
+    cells = drawn("uniform_colour")[0].astype(np.float64)
+    assert_mean(cells, 0.5, np.sqrt(1 / 12))
+    assert cells.var() == pytest.approx(1 / 12, rel=0.02)
+    correlation = np.corrcoef(cells.reshape(-1, 3).T)
+    assert np.abs(correlation - np.eye(3)).max() < 4.5 / np.sqrt(60_000)
+
+
+@pytest.mark.parametrize("kind", ["gaussian_colour", "gaussian_monochrome"])
+def test_gaussian_masks_have_their_mean_and_deviation(kind):
+    cells = drawn(kind, mean=0.5, deviation=0.1)[0, ..., 0].astype(np.float64)
+    assert_mean(cells, 0.5, 0.1)
+    assert cells.std() == pytest.approx(0.1, rel=4.5 / np.sqrt(2 * cells.size))
+
+
+@pytest.mark.parametrize("kind", ["gaussian_colour", "gaussian_monochrome"])
+def test_gaussian_masks_are_clipped_at_opaque_and_at_clear(kind):
+    cells = drawn(kind, mean=0.5, deviation=0.2)[0, ..., 0]
+    tail = 0.0062097
+    for end in (0.0, 1.0):
+        assert_mean(cells == end, tail, np.sqrt(tail * (1 - tail)))
+
+
+def test_gaussian_colours_are_independent_and_gaussian_greys_equal():
+    colour = drawn("gaussian_colour", deviation=0.1)[0].reshape(-1, 3)
+    assert np.abs(np.corrcoef(colour.T) - np.eye(3)).max() < 4.5 / np.sqrt(60_000)
+    grey = drawn("gaussian_monochrome")[0]
+    assert (grey == grey[..., :1]).all()
+
+
+def test_a_pinhole_is_one_open_cell_in_the_middle():
+    cells = drawn("pinhole", 1, 5, 7)[0, ..., 0]
+    expected = np.zeros((5, 7))
+    expected[2, 3] = 1
+    np.testing.assert_array_equal(cells, expected)
+
+
+def test_a_pinhole_moves_right_and_down_and_keeps_its_area_when_it_cuts_cells():
+    cells = drawn("pinhole", 1, 9, 9, at_cells=(2, -1))[0, ..., 0]
+    assert np.argwhere(cells).tolist() == [[3, 6]]
+    cut = drawn("pinhole", 1, 9, 9, at_cells=(0.25, 0), side_cells=2)[0, ..., 0]
+    assert cut.sum() == pytest.approx(4)
+    np.testing.assert_allclose(cut[4], [0, 0, 0, 0.25, 1, 0.75, 0, 0, 0])
+    np.testing.assert_allclose(cut[:, 4], [0, 0, 0, 0.5, 1, 0.5, 0, 0, 0])
+
+
+def test_a_sum_of_sinusoids_holds_its_frequencies_and_no_others():
+    rows, columns = 48, 60
+    width_mm, height_mm = columns * CELL_UM * 1e-3, rows * CELL_UM * 1e-3
+    waves = [(3, 0), (0, 5), (7, -4)]
+    cells = drawn(
+        "sinusoids",
+        1,
+        rows,
+        columns,
+        cycles_per_mm=[(m / width_mm, n / height_mm) for m, n in waves],
+    )
+    spectrum = np.abs(np.fft.fft2(cells[0, ..., 0].astype(np.float64))) / (rows * columns)
+    expected = np.zeros((rows, columns))
+    expected[0, 0] = 0.5
+    for m, n in waves:
+        expected[n % rows, m % columns] = expected[-n % rows, -m % columns] = 0.25 / len(waves)
+    np.testing.assert_allclose(spectrum, expected, atol=1e-6)
+
+
+def test_sinusoids_have_phase_0_at_the_middle_of_the_mask():
+    cells = drawn("sinusoids", 1, 5, 7, cycles_per_mm=[(2.0, 3.0), (4.0, 0.0)])[0, ..., 0]
+    assert cells[2, 3] == 1
+    np.testing.assert_allclose(cells, cells[::-1, ::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("prime", [3, 5, 7, 11, 13, 31])
+def test_the_periodic_correlation_of_a_mura_with_its_decoding_array_is_a_delta(prime):
+    """Gottesman & Fenimore 1989: G is 1 where A is open, -1 elsewhere, but G(0, 0) = 1."""
+    cells = drawn("mura", 1, 2 * prime, 2 * prime, prime=prime)[0, ..., 0].astype(np.float64)
+    tile = cells[:prime, :prime]
+    np.testing.assert_array_equal(tile, mura_tile(prime))
+    decoding = 2 * tile - 1
+    decoding[0, 0] = 1
+    correlation = correlate(cells, decoding, mode="valid", method="direct")
+    expected = np.zeros((prime + 1, prime + 1))
+    expected[::prime, ::prime] = (prime**2 - 1) / 2
+    np.testing.assert_allclose(correlation, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("prime", [4, 9, 15, 25, 2, 1, 998])
+def test_a_mura_needs_a_prime_side(prime):
+    with pytest.raises(ValidationError):
+        pattern("mura", prime=prime)
+
+
+def test_a_tile_repeats_from_the_corner():
+    grey = [[0, 0.25, 1], [0.5, 0.75, 0]]
+    cells = drawn("tile", 1, 5, 7, cells=grey)[0]
+    expected = np.tile(np.array(grey), (3, 3))[:5, :7]
+    np.testing.assert_array_equal(cells, np.repeat(expected[..., None], 3, axis=-1))
+
+
+def test_a_tile_of_colours_keeps_them():
+    colours = [[[1, 0, 0], [0, 0.5, 0.25]]]
+    cells = drawn("tile", 1, 2, 4, cells=colours)[0]
+    np.testing.assert_array_equal(cells, np.tile(np.array(colours), (2, 2, 1)))
+
+
+@pytest.mark.parametrize(
+    ("cells", "complaint"),
+    [
+        ([[0, 1], [1]], "different lengths"),
+        ([[0, 1.5]], r"\[0, 1\]"),
+        ([[-0.1, 1]], r"\[0, 1\]"),
+        ([[float("nan"), 1]], r"\[0, 1\]"),
+        ([], "array of greys"),
+        ([0, 1], "array of greys"),
+        ([[[0, 1]]], "array of greys"),
+        ([["clear", "dark"]], "numbers"),
+        ([[{"grey": 1}]], "numbers"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["tile", "parameters"])
+def test_cells_that_are_no_transmittance_are_refused(kind, cells, complaint):
+    with pytest.raises(ValidationError, match=complaint):
+        pattern(kind, cells=cells)
+
+
+def test_parameters_are_drawn_as_given_whatever_is_asked():
+    cells = np.random.default_rng(0).random((3, 4, 3))
+    mask = drawn("parameters", 2, 50, 60, cells=cells.tolist())
+    assert mask.shape == (2, 3, 4, 3)
+    np.testing.assert_allclose(mask, np.stack([cells, cells]), rtol=1e-7)
+
+
+def test_a_scan_opens_every_cell_once_row_by_row():
+    scan = pattern("sequence", scan=(3, 2))
+    assert scan.frame_count(1) == 6
+    cells = scan.draw(6, 50, 60, CELL_UM)
+    assert cells.shape == (6, 2, 3, 3)
+    for frame in range(6):
+        assert np.argwhere(cells[frame, ..., 1]).tolist() == [[frame // 3, frame % 3]]
+
+
+def test_the_regions_of_a_sequence_are_its_frames():
+    regions = [[[1, 0], [0, 0]], [[0, 1], [0.5, 0]], [[0, 0], [0, 1]]]
+    sequence = pattern("sequence", regions=regions)
+    assert sequence.frame_count(7) == 3
+    np.testing.assert_array_equal(sequence.draw(7, 9, 9, CELL_UM)[..., 2], np.array(regions))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"scan": (2, 2), "regions": [[[1]]]},
+        {"scan": (0, 2)},
+        {"regions": [[0, 1]]},
+        {"regions": [[[0, 2]]]},
+    ],
+)
+def test_a_sequence_needs_either_a_scan_or_regions(settings):
+    with pytest.raises(ValidationError):
+        pattern("sequence", **settings)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_picture_comes_back_in_red_green_blue(tmp_path, dtype, channels):
+    top = np.iinfo(dtype).max
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, top, (6, 9, channels), dtype=dtype, endpoint=True)
+    path = tmp_path / "mask.png"
+    red_first = codes[..., 0] if channels == 1 else codes[..., [2, 1, 0, 3][:channels]]
+    assert cv2.imwrite(str(path), red_first)
+    cells = drawn("picture", 2, 6, 9, path=str(path))
+    assert cells.shape == (2, 6, 9, 3)
+    expected = np.broadcast_to(codes[..., :3] / top, (2, 6, 9, 3))
+    np.testing.assert_allclose(cells, expected, atol=1e-7)
+
+
+def test_a_picture_is_repeated_only_when_asked(tmp_path):
+    codes = np.arange(6, dtype=np.uint8).reshape(2, 3) * 50
+    path = tmp_path / "mask.png"
+    assert cv2.imwrite(str(path), codes)
+    assert drawn("picture", 1, 5, 7, path=str(path)).shape == (1, 2, 3, 3)
+    repeated = drawn("picture", 1, 5, 7, path=str(path), repeat=True)[0, ..., 0]
+    np.testing.assert_allclose(repeated, np.tile(codes / 255, (3, 3))[:5, :7], atol=1e-7)
+
+
+def test_a_file_that_is_no_picture_is_refused_in_one_line(tmp_path):
+    text, empty = tmp_path / "mask.png", tmp_path / "empty.png"
+    text.write_text("not a picture")
+    empty.write_bytes(b"")
+    for path in (text, empty, tmp_path / "missing.png", tmp_path):
+        with pytest.raises(CameraError, match="no such file, or not a picture") as fault:
+            drawn("picture", path=str(path))
+        assert "\n" not in str(fault.value)
+
+
+def test_a_picture_of_floats_is_refused(tmp_path):
+    path = tmp_path / "mask.tiff"
+    assert cv2.imwrite(str(path), np.ones((4, 4), np.float32))
+    with pytest.raises(CameraError, match="8 or 16 bits"):
+        drawn("picture", path=str(path))
+
+
+FILTER_COUNTS = {
+    "mono": {"W": 1},
+    "rggb": {"R": 1, "G": 2, "B": 1},
+    "grbg": {"R": 1, "G": 2, "B": 1},
+    "gbrg": {"R": 1, "G": 2, "B": 1},
+    "bggr": {"R": 1, "G": 2, "B": 1},
+    "quad-bayer": {"R": 4, "G": 8, "B": 4},
+    "rgbw": {"R": 1, "G": 1, "B": 1, "W": 1},
+    "x-trans": {"R": 8, "G": 20, "B": 8},
+}
+PASSED = {"R": [1, 0, 0], "G": [0, 1, 0], "B": [0, 0, 1], "W": [1, 1, 1]}
+
+
+def test_every_tile_has_the_filters_its_name_promises():
+    assert set(FILTER_COUNTS) == set(CFA)
+    for name, counts in FILTER_COUNTS.items():
+        tile = cfa_tile(name)
+        found = {
+            letter: int((tile == passed).all(axis=-1).sum()) for letter, passed in PASSED.items()
+        }
+        assert {letter: count for letter, count in found.items() if count} == counts, name
+
+
+def test_the_bayer_phases_read_as_their_names():
+    for name in ("rggb", "grbg", "gbrg", "bggr"):
+        expected = np.array([PASSED[letter.upper()] for letter in name]).reshape(2, 2, 3)
+        np.testing.assert_array_equal(cfa_tile(name), expected)
+        np.testing.assert_array_equal(cfa_tile(name.upper()), expected)
+
+
+def test_a_quad_bayer_tile_is_a_bayer_tile_of_doubled_pixels():
+    doubled = np.repeat(np.repeat(cfa_tile("rggb"), 2, axis=0), 2, axis=1)
+    np.testing.assert_array_equal(cfa_tile("quad-bayer"), doubled)
+
+
+def test_every_row_and_column_of_x_trans_holds_all_colours():
+    tile = cfa_tile("x-trans")
+    assert (tile.sum(axis=0) > 0).all()
+    assert (tile.sum(axis=1) > 0).all()
+    assert (tile.sum(axis=-1) == 1).all()
+
+
+def test_a_user_tile_is_read_row_by_row():
+    expected = np.array([[PASSED[letter] for letter in row] for row in ("RWG", "BGW")])
+    np.testing.assert_array_equal(cfa_tile(("RWG", "BGW")), expected)
+
+
+@pytest.mark.parametrize(
+    ("tile", "complaint"),
+    [
+        ("rgbb", "unknown CFA 'rgbb'.*rggb"),
+        (("RG", "G"), "same number of filters"),
+        ((), "same number of filters"),
+        (("",), "same number of filters"),
+        (("RX",), "'X' is not one of R G B W"),
+        (("rg",), "is not one of R G B W"),
+    ],
+)
+def test_a_bad_tile_is_refused(tile, complaint):
+    with pytest.raises(CameraError, match=complaint):
+        cfa_tile(tile)
