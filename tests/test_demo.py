@@ -16,7 +16,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.scene import open_scene
 from reconstruction.tv import TVSettings
 
-SIZE = (64, 80)
+SIZE = (96, 128)
 
 
 class Recorder:

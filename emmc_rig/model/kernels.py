@@ -71,14 +71,6 @@ def correct_row(inverse, frames, binning, row, seen):
             seen[shot, x] = corrected[x // binning]
 
 
-@njit(cache=True, fastmath=True)
-def pass_colours(colour, shot, y, passes):
-    """Set passes (colour, x) to 1 where a pixel of row y sees that colour, else 0."""
-    for c in range(3):
-        for x in range(passes.shape[1]):
-            passes[c, x] = 1 if colour[shot, y, x] == c else 0
-
-
 @njit(cache=True, parallel=True, fastmath=True)
 def project(weights, colour, light_field, binning, frames):
     """Set frames = Psi light_field, a light field in its natural order (v, u, y, x, colour)."""
@@ -112,36 +104,44 @@ def project(weights, colour, light_field, binning, frames):
 
 @njit(cache=True, parallel=True, fastmath=True)
 def back_project(weights, colour, frames, binning, light_field):
-    """Set light_field = Psi^T frames, a light field in its natural order (v, u, y, x, colour)."""
+    """Set light_field = Psi^T frames, a contiguous one in natural order (v, u, y, x, colour).
+
+    The first shot sets the samples and the others add to them: every row is written once.
+    """
     shots, views_v, views_u, _, stored, width = weights.shape
     for row in prange(frames.shape[1]):
         spread = np.empty((shots, 3, width), frames.dtype)
         for part in range(binning):
             y = row * binning + part
             for shot in range(shots):
-                spread[shot] = 1
-                if stored == 1:
-                    pass_colours(colour, shot, y, spread[shot])
                 for c in range(3):
                     for x in range(width):
-                        spread[shot, c, x] *= frames[shot, row, x // binning]
+                        seen = stored == 3 or colour[shot, y, x] == c
+                        spread[shot, c, x] = frames[shot, row, x // binning] if seen else 0
             for v in range(views_v):
                 for u in range(views_u):
-                    samples = light_field[v, u, y]
+                    samples = light_field[v, u, y].reshape(-1)
                     for shot in range(shots):
-                        red = weights[shot, v, u, y, 0]
-                        green = weights[shot, v, u, y, 1 % stored]
-                        blue = weights[shot, v, u, y, 2 % stored]
-                        if shot == 0:
+                        red, green, blue = spread[shot]
+                        for_red = weights[shot, v, u, y, 0]
+                        for_green = weights[shot, v, u, y, 1 % stored]
+                        for_blue = weights[shot, v, u, y, 2 % stored]
+                        if shot > 0:
                             for x in range(width):
-                                samples[x, 0] = red[x] * spread[shot, 0, x]
-                                samples[x, 1] = green[x] * spread[shot, 1, x]
-                                samples[x, 2] = blue[x] * spread[shot, 2, x]
+                                samples[3 * x] += for_red[x] * red[x]
+                                samples[3 * x + 1] += for_green[x] * green[x]
+                                samples[3 * x + 2] += for_blue[x] * blue[x]
+                        elif stored == 1:
+                            for x in range(width):
+                                weight = for_red[x]
+                                samples[3 * x] = weight * red[x]
+                                samples[3 * x + 1] = weight * green[x]
+                                samples[3 * x + 2] = weight * blue[x]
                         else:
                             for x in range(width):
-                                samples[x, 0] += red[x] * spread[shot, 0, x]
-                                samples[x, 1] += green[x] * spread[shot, 1, x]
-                                samples[x, 2] += blue[x] * spread[shot, 2, x]
+                                samples[3 * x] = for_red[x] * red[x]
+                                samples[3 * x + 1] = for_green[x] * green[x]
+                                samples[3 * x + 2] = for_blue[x] * blue[x]
 
 
 @njit(cache=True, parallel=True)
