@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -172,11 +173,10 @@ def cameras(
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
     if name is None:
-        table = Table("name", "title", "sensor", "shots", "masks", "sampling", "light")
+        table = Table("camera", "sensor", "shots", "masks", "sampling", "light", box=SIMPLE)
         for row in camera_rows():
             table.add_row(
-                row.name,
-                row.title,
+                f"[bold]{row.name}[/]\n{row.title}",
                 row.sensor,
                 str(row.shots),
                 str(row.masks),

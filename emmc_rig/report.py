@@ -343,7 +343,10 @@ FIGURES = {
         "PSNR with the exact Psi", ".2f", "dB", "same frames, reconstructed without calibration"
     ),
     "calibration_cost_db": Figure(
-        "What calibration costs", ".2f", "dB", "PSNR with the exact Psi less PSNR with the measured"
+        "What calibration costs",
+        "z.2f",
+        "dB",
+        "PSNR with the exact Psi less PSNR with the measured",
     ),
     "design_relative_error": Figure(
         "Relative error of the design",
@@ -439,7 +442,7 @@ def _cards(content: ReportContent) -> str:
             _card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
             _card(
                 "Calibration costs",
-                _written(cost, ".2f", "dB"),
+                _written(cost, "z.2f", "dB"),
                 f"with the exact Psi: {_written(exact, '.2f', 'dB')}"
                 if _number(exact) is not None
                 else "needs a run with the exact Psi",
