@@ -92,23 +92,8 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
     metric = colour_metric(2.0).astype(np.float32)
     operator = (psi.weights, psi.colour_map)
 
-    def sweep() -> None:
-        tv_kernels.sweep(
-            *operator,
-            inverse,
-            frames,
-            psi.binning,
-            planar,
-            dual,
-            metric,
-            one,
-            one / 16,
-            one,
-            one,
-            bands,
-            moved,
-            pool.map,
-        )
+    data = tv_kernels.Data(*operator, inverse, frames, psi.binning)
+    steps = tv_kernels.Steps(one, one / 64, one, one, metric)
 
     cases: list[tuple[str, Callable[[], object], int]] = [
         (
@@ -126,7 +111,11 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
             lambda: kernels.data_step(*operator, inverse, frames, psi.binning, planar),
             psi.weights.nbytes + 2 * light_field.nbytes,
         ),
-        ("TV step", sweep, psi.weights.nbytes + 2 * light_field.nbytes + 2 * dual.nbytes),
+        (
+            "TV step",
+            lambda: tv_kernels.sweep(data, steps, planar, dual, bands, moved, pool.map),
+            psi.weights.nbytes + 2 * light_field.nbytes + 2 * dual.nbytes,
+        ),
     ]
     with pool:
         for name, call, counted in cases:

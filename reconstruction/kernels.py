@@ -12,11 +12,36 @@ first and is done after all bands.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
+
+
+class Data(NamedTuple):
+    """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k."""
+
+    weights: Any
+    colour: Any
+    inverse: Any
+    frames: Any
+    binning: int
+
+
+class Steps(NamedTuple):
+    """The steps, of the arrays' type: gamma, tau, mu, the relaxation, and the colours' metric.
+
+    metric: (3, 3), turns colours into the coordinates in which differences are measured.
+    """
+
+    primal: Any
+    dual: Any
+    bound: Any
+    relax: Any
+    metric: Any
 
 
 @njit(cache=True, fastmath=True)
@@ -65,29 +90,18 @@ def _descend(light_field, dual, step, back, v, u, y, out):
 
 
 @njit(cache=True, fastmath=True)
-def _primal_rows(
-    weights,
-    colour,
-    inverse,
-    frames,
-    binning,
-    light_field,
-    dual,
-    metric,
-    step,
-    relax,
-    row,
-    ahead,
-    moved,
-):
+def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
     """Do the primal step of a row of pixels; set ahead, for _dual_rows, to metric (2 new - old)."""
+    weights, colour, inverse, frames, binning = data
     shots, views_v, views_u, _, _, width = weights.shape
     base = row * binning
-    back = metric.T.copy()
+    back = steps.metric.T.copy()
     for v in range(views_v):
         for u in range(views_u):
             for part in range(binning):
-                _descend(light_field, dual, step, back, v, u, base + part, ahead[v, u, part])
+                _descend(
+                    light_field, dual, steps.primal, back, v, u, base + part, ahead[v, u, part]
+                )
     seen = np.zeros((shots, width), frames.dtype)
     for shot in range(shots):
         for part in range(binning):
@@ -109,19 +123,20 @@ def _primal_rows(
                     for x in range(width):
                         delta = line[x] - old[x]
                         line[x] += delta
-                        old[x] += relax * delta
+                        old[x] += steps.relax * delta
                         row_change += delta * delta
                         row_power += old[x] * old[x]
                     change += row_change
                     power += row_power
-                _mix(metric, ahead[v, u, part])
+                _mix(steps.metric, ahead[v, u, part])
     moved[row, 0] = change
     moved[row, 1] = power
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _dual_rows(ahead, below, has_below, dual, base, step, bound, relax):
+def _dual_rows(steps, ahead, below, has_below, dual, base):
     """Do the dual step of the rows of `ahead` (v, u, part, colour, x); `below`: the next block."""
+    _, step, bound, relax, _ = steps
     views_v, views_u, parts, _, width = ahead.shape
     raised = np.empty((4, 3, width), dual.dtype)
     size = np.empty(width, dual.dtype)
@@ -182,25 +197,7 @@ def _dual_rows(ahead, below, has_below, dual, base, step, bound, relax):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _sweep_band(
-    weights,
-    colour,
-    inverse,
-    frames,
-    binning,
-    light_field,
-    dual,
-    metric,
-    primal_step,
-    dual_step,
-    bound,
-    relax,
-    begin,
-    end,
-    moved,
-    first,
-    last,
-):
+def _sweep_band(data, steps, light_field, dual, begin, end, moved, first, last):
     """Do the rows of pixels from begin to end, but for the dual step of the last one.
 
     first, last: set to the `ahead` of those rows, for the dual steps at the bands' edges.
@@ -208,86 +205,45 @@ def _sweep_band(
     ring = np.empty((2, *first.shape), light_field.dtype)
     for row in range(begin, end):
         ahead = ring[row % 2]
-        _primal_rows(
-            weights,
-            colour,
-            inverse,
-            frames,
-            binning,
-            light_field,
-            dual,
-            metric,
-            primal_step,
-            relax,
-            row,
-            ahead,
-            moved,
-        )
+        _primal_rows(data, steps, light_field, dual, row, ahead, moved)
         if row == begin:
             first[:] = ahead
         else:
-            base = (row - 1) * binning
-            _dual_rows(ring[(row - 1) % 2], ahead, True, dual, base, dual_step, bound, relax)
+            _dual_rows(steps, ring[(row - 1) % 2], ahead, True, dual, (row - 1) * data.binning)
     last[:] = ring[(end - 1) % 2]
 
 
 def sweep(
-    weights,
-    colour,
-    inverse,
-    frames,
-    binning,
-    light_field,
-    dual,
-    metric,
-    primal_step,
-    dual_step,
-    bound,
-    relax,
-    bands,
-    moved,
+    data: Data,
+    steps: Steps,
+    light_field: NDArray[np.floating],
+    dual: NDArray[np.floating],
+    bands: NDArray[np.int64],
+    moved: NDArray[np.float64],
     run: Callable[..., Iterable[object]] = map,
-):
+) -> None:
     """Do one over-relaxed primal-dual iteration in place (Condat 2013, algorithm 3.1).
 
-    metric: (3, 3), turns colours into the coordinates in which differences are measured.
-    bands: (band, 2) first and last + 1 row of pixels. moved: (pixel_y, 2) squared change and
-    squared size of the light field per row of pixels. run: `map`, or that of a thread pool: the
-    bands are independent (numba's own parallel loop takes 15 s more to compile).
+    bands: (band, 2) first and last + 1 row of pixels. moved: (pixel_y, 2), set to the squared
+    change and the squared size of the light field per row of pixels. run: `map`, or that of a
+    thread pool: the bands are independent (numba's own parallel loop takes 15 s more to compile).
     """
     views_v, views_u, _, _, width = light_field.shape
-    edges = np.empty((2, len(bands), views_v, views_u, binning, 3, width), light_field.dtype)
-    first, last = edges
+    block = (views_v, views_u, data.binning, 3, width)
+    first, last = np.empty((2, len(bands), *block), light_field.dtype)
 
-    def rows(band):
-        _sweep_band(
-            weights,
-            colour,
-            inverse,
-            frames,
-            binning,
-            light_field,
-            dual,
-            metric,
-            primal_step,
-            dual_step,
-            bound,
-            relax,
-            bands[band, 0],
-            bands[band, 1],
-            moved,
-            first[band],
-            last[band],
-        )
+    def rows(band: int) -> None:
+        begin, end = bands[band]
+        _sweep_band(data, steps, light_field, dual, begin, end, moved, first[band], last[band])
 
-    def last_row(band):
-        base = (bands[band, 1] - 1) * binning
+    def last_row(band: int) -> None:
         inner = band + 1 < len(bands)
         below = first[band + 1 if inner else band]
-        _dual_rows(last[band], below, inner, dual, base, dual_step, bound, relax)
+        base = (bands[band, 1] - 1) * data.binning
+        _dual_rows(steps, last[band], below, inner, dual, base)
 
-    for step in (rows, last_row):
-        for _ in run(step, range(len(bands))):
+    for stage in (rows, last_row):
+        for _ in run(stage, range(len(bands))):
             pass
 
 

@@ -156,6 +156,10 @@ def reconstruct_tv(
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
     light_field[:] = rows_of_colours(guess)[:, :, :]
     dual = np.zeros((*light_field.shape[:3], 4, *light_field.shape[3:]), dtype=dtype)
+    fit = kernels.Data(psi.weights, psi.colour_map, inverse, data, psi.binning)
+    steps = kernels.Steps(
+        dtype(gamma), dtype(dual_step), dtype(mu), dtype(settings.relaxation), metric
+    )
     moved = np.zeros((psi.frames_shape[1], 2))
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     history: list[tuple[int, float]] = []
@@ -170,23 +174,7 @@ def reconstruct_tv(
 
     with ThreadPoolExecutor(len(bands)) as pool:
         while step < settings.max_steps and change > settings.rtol:
-            kernels.sweep(
-                psi.weights,
-                psi.colour_map,
-                inverse,
-                data,
-                psi.binning,
-                light_field,
-                dual,
-                metric,
-                dtype(gamma),
-                dtype(dual_step),
-                dtype(mu),
-                dtype(settings.relaxation),
-                bands,
-                moved,
-                pool.map,
-            )
+            kernels.sweep(fit, steps, light_field, dual, bands, moved, pool.map)
             step += 1
             change = float(np.sqrt(moved[:, 0].sum() / max(moved[:, 1].sum(), 1e-300)))
             value = objective() if step % settings.objective_every == 0 else None

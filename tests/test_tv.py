@@ -110,23 +110,11 @@ def swept(psi, frames, light_field, dual, count, bands, ridge=None):
     inverse = psi.solver(1 / gamma if ridge is None else ridge).inverse
     state, dual_state = rows_of_colours(light_field), kernel_dual(dual)
     moved = np.zeros((psi.frames_shape[1], 2))
+    data = kernels.Data(psi.weights, psi.colour_map, inverse, frames, psi.binning)
+    numbers = [np.float32(number) for number in (gamma, sigma, mu, relax)]
+    steps = kernels.Steps(*numbers, metric.astype(np.float32))
     for _ in range(count):
-        kernels.sweep(
-            psi.weights,
-            psi.colour_map,
-            inverse,
-            frames,
-            psi.binning,
-            state,
-            dual_state,
-            metric.astype(np.float32),
-            np.float32(gamma),
-            np.float32(sigma),
-            np.float32(mu),
-            np.float32(relax),
-            row_bands(psi.frames_shape[1], bands),
-            moved,
-        )
+        kernels.sweep(data, steps, state, dual_state, row_bands(psi.frames_shape[1], bands), moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved
 
 
