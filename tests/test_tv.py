@@ -111,8 +111,8 @@ def swept(psi, frames, light_field, dual, count, bands, ridge=None):
     state, dual_state = rows_of_colours(light_field), kernel_dual(dual)
     moved = np.zeros((psi.frames_shape[1], 2))
     data = kernels.Data(psi.weights, psi.colour_map, inverse, frames, psi.binning)
-    numbers = [np.float32(number) for number in (gamma, sigma, mu, relax)]
-    steps = kernels.Steps(*numbers, metric.astype(np.float32))
+    kind = np.float32
+    steps = kernels.Steps(kind(gamma), kind(sigma), kind(mu), kind(relax), metric.astype(kind))
     for _ in range(count):
         kernels.sweep(data, steps, state, dual_state, row_bands(psi.frames_shape[1], bands), moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved
