@@ -127,17 +127,27 @@ def demo(
     shots: ShotsOption = None,
     seed: SeedOption = 0,
     size: SizeOption = None,
+    mu: Annotated[
+        float | None, typer.Option("--mu", help="weight of the regulariser (default: from noise)")
+    ] = None,
+    chroma_weight: Annotated[
+        float, typer.Option("--chroma-weight", help="of chrominance differences; 1: DV_1")
+    ] = 2.0,
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.demo import DemoSettings, run_demo
+    from emmc_rig.model.settings import validated
     from emmc_rig.output import result_folder
+    from reconstruction.tv import TVSettings
 
     described = find_camera(camera)
     if shots is not None:
         described = described.with_shots(shots)
-    settings = DemoSettings(scene, camera, described, _size(size), seed)
+    chosen = {"mu": mu, "chroma_weight": chroma_weight}
+    solver = validated(TVSettings, chosen, "solver settings", AppError)
+    settings = DemoSettings(scene, camera, described, _size(size), seed, solver=solver)
     for warning in described.warnings():
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
     with result_folder(out) as folder, _progress() as progress:

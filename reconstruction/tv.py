@@ -192,5 +192,10 @@ def reconstruct_tv(
         steps=step,
         objective=tuple(history),
         seconds=clock() - started,
-        parameters={"mu": float(mu), "primal_step": float(gamma), "noise_sigma": noise_sigma},
+        parameters={
+            "mu": float(mu),
+            "chroma_weight": settings.chroma_weight,
+            "primal_step": float(gamma),
+            "noise_sigma": noise_sigma,
+        },
     )

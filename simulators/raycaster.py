@@ -14,8 +14,8 @@ at twice the size are the same world sampled finer.
 Rays are traced one per view through 2x2 points of every pixel (a pinhole in the middle of each
 aperture cell), meet textured cards and balls, and may be reflected or refracted once per ball.
 Ball normals are those of a sphere in a space in which D is stretched until the ball is round.
-Left out: shadows of cards, objects mirrored in others (mirrors show only the surroundings), light
-that bounces between surfaces.
+Left out: shadows cast by cards, objects mirrored in others (mirrors show only the surroundings),
+light that bounces between surfaces.
 
 Textures are (side, side, 4) RGBA in [0, 1], side a power of two.
 """

@@ -203,6 +203,13 @@ def test_unknown_names_and_sizes_are_one_line(run):
     assert (code, "more_shots_step_um" in one_line(err)) == (1, True)
 
 
+def test_solver_settings_that_make_no_sense_are_one_line(run):
+    for option, value in (("--mu", -1), ("--mu", "nan"), ("--chroma-weight", 0)):
+        code, _, err = run("demo", *SMALL, option, value, "--out", "r")
+        assert code == 1
+        assert option.strip("-").replace("-", "_") in one_line(err)
+
+
 def test_wrong_usage_is_exit_code_2(run):
     for arguments in (
         ["demo", "--sceen", "x"],

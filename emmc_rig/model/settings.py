@@ -76,7 +76,7 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
     return f"{where}: {message[:1].lower()}{message[1:]}"
 
 
-def validated(cls: type[S], data: object, source: str, error: type[ModelError]) -> S:
+def validated(cls: type[S], data: object, source: str, error: type[Exception]) -> S:
     """Return `cls` built from plain data; raise `error` with one line naming `source`."""
     if not isinstance(data, dict):
         raise error(f"{source}: expected a mapping of settings, found {type(data).__name__}")
