@@ -103,8 +103,9 @@ def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
                     light_field, dual, steps.primal, back, v, u, base + part, ahead[v, u, part]
                 )
     seen = np.zeros((shots, width), frames.dtype)
-    for part in range(binning):
-        gather_row(weights, colour, ahead, part, base + part, seen)
+    for shot in range(shots):
+        for part in range(binning):
+            gather_row(weights, colour, ahead, part, shot, base + part, seen[shot])
     correct_row(inverse, frames, binning, row, seen)
     change = 0.0
     power = 0.0

@@ -14,28 +14,23 @@ from numba import njit, prange
 
 
 @njit(cache=True, fastmath=True)
-def gather_row(weights, colour, block, part, y, seen):
-    """Add to seen (shot, x) what every shot sees of row y; block[:, :, part] is that row.
-
-    The shots are innermost: the row of one view stays in the nearest cache for all of them.
-    """
-    shots, views_v, views_u, _, stored, width = weights.shape
+def gather_row(weights, colour, block, part, shot, y, total):
+    """Add to total (x,) what one shot sees of row y; block[:, :, part] is that row."""
+    views_v, views_u, stored, width = weights.shape[1], weights.shape[2], *weights.shape[4:]
     for v in range(views_v):
         for u in range(views_u):
-            lines = block[v, u, part]
-            for shot in range(shots):
-                total = seen[shot]
-                if stored == 1:
-                    weight = weights[shot, v, u, y, 0]
-                    which = colour[shot, y]
+            if stored == 1:
+                weight = weights[shot, v, u, y, 0]
+                which = colour[shot, y]
+                lines = block[v, u, part]
+                for x in range(width):
+                    total[x] += weight[x] * lines[which[x], x]
+            else:
+                for c in range(3):
+                    weight = weights[shot, v, u, y, c]
+                    line = block[v, u, part, c]
                     for x in range(width):
-                        total[x] += weight[x] * lines[which[x], x]
-                else:
-                    for c in range(3):
-                        weight = weights[shot, v, u, y, c]
-                        line = lines[c]
-                        for x in range(width):
-                            total[x] += weight[x] * line[x]
+                        total[x] += weight[x] * line[x]
 
 
 @njit(cache=True, fastmath=True)
@@ -81,14 +76,14 @@ def project(weights, colour, light_field, binning, frames):
     """Set frames = Psi light_field, a light field in its natural order (v, u, y, x, colour)."""
     shots, views_v, views_u, _, stored, width = weights.shape
     for row in prange(frames.shape[1]):
-        seen = np.zeros((shots, width), frames.dtype)
-        for part in range(binning):
-            y = row * binning + part
-            for v in range(views_v):
-                for u in range(views_u):
-                    samples = light_field[v, u, y]
-                    for shot in range(shots):
-                        total = seen[shot]
+        total = np.empty(width, frames.dtype)
+        for shot in range(shots):
+            total[:] = 0
+            for part in range(binning):
+                y = row * binning + part
+                for v in range(views_v):
+                    for u in range(views_u):
+                        samples = light_field[v, u, y]
                         if stored == 1:
                             weight = weights[shot, v, u, y, 0]
                             which = colour[shot, y]
@@ -102,10 +97,9 @@ def project(weights, colour, light_field, binning, frames):
                                     + green[x] * samples[x, 1]
                                     + blue[x] * samples[x, 2]
                                 )
-        frames[:, row, :] = 0
-        for shot in range(shots):
+            frames[shot, row, :] = 0
             for x in range(width):
-                frames[shot, row, x // binning] += seen[shot, x]
+                frames[shot, row, x // binning] += total[x]
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -159,9 +153,10 @@ def data_step(weights, colour, inverse, frames, binning, light_field):
     shots, views_v, views_u, _, _, width = weights.shape
     for row in prange(frames.shape[1]):
         seen = np.zeros((shots, width), frames.dtype)
-        for part in range(binning):
-            y = row * binning + part
-            gather_row(weights, colour, light_field, y, y, seen)
+        for shot in range(shots):
+            for part in range(binning):
+                y = row * binning + part
+                gather_row(weights, colour, light_field, y, shot, y, seen[shot])
         correct_row(inverse, frames, binning, row, seen)
         for part in range(binning):
             y = row * binning + part
