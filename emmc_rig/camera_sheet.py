@@ -181,7 +181,7 @@ def _mask_figures(camera: Camera, mask: Mask) -> MaskFigures:
     ratio = mask.distance_mm / camera.lens.distance_mm
     at_lens = ratio >= 1 - 1e-9
     seen_um = (1 - ratio) * camera.sensor.sample_pitch_um
-    shift_um = ratio * camera.lens.aperture_cell_mm * 1e3
+    shift_um = ratio * camera.lens.aperture_cell_um
     return MaskFigures(
         view_shift_samples=None if at_lens else shift_um / seen_um,
         magnification=None if at_lens else 1 / (1 - ratio),
@@ -284,7 +284,7 @@ def _draw_zoom(axes: Axes, camera: Camera, plates: dict[str, Plate]) -> None:
     """Draw the masks near the sensor: which cells the rays of one pixel meet."""
     pitch_um, k = camera.sensor.sample_pitch_um, camera.sensor.binning
     lens_um = camera.lens.distance_mm * 1e3
-    views_um = centred_grid(camera.views[1], camera.lens.aperture_cell_mm * 1e3)
+    views_um = centred_grid(camera.views[1], camera.lens.aperture_cell_um)
     farthest_mm = max(plate.distance_mm for plate in plates.values())
     reach_um = (
         views_um[-1] * farthest_mm * 1e3 / lens_um
@@ -470,7 +470,7 @@ def _draw_plate(
     meets = [
         mask_position(
             start_um,
-            centred_grid(count, camera.lens.aperture_cell_mm * 1e3),
+            centred_grid(count, camera.lens.aperture_cell_um),
             plate.distance_mm * 1e3,
             lens_um,
         )

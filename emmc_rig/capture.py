@@ -51,7 +51,7 @@ def open_aperture(rig: Rig) -> None:
 
 def place_pinhole(rig: Rig, camera: Camera, v: int, u: int) -> None:
     """Bring the pinhole before one view."""
-    cell_um = camera.lens.aperture_cell_mm * 1e3
+    cell_um = camera.lens.aperture_cell_um
     y_um = float(centred_grid(camera.views[0], cell_um)[v])
     x_um = float(centred_grid(camera.views[1], cell_um)[u])
     _go(rig, {"aperture_x": x_um, "aperture_y": y_um})

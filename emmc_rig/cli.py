@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE
@@ -26,6 +26,9 @@ from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
+
+if TYPE_CHECKING:
+    from emmc_rig.model.camera import Camera
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
@@ -110,6 +113,14 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(rows), int(columns)
 
 
+def _camera(spec: str, shots: int | None) -> Camera:
+    """Return a camera by name or file, with as many shots as asked for."""
+    from emmc_rig.camera_sheet import find_camera
+
+    camera = find_camera(spec)
+    return camera if shots is None else camera.with_shots(shots)
+
+
 @app.callback(invoke_without_command=True)
 def root(
     version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
@@ -136,15 +147,12 @@ def demo(
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
-    from emmc_rig.camera_sheet import find_camera
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.model.settings import validated
     from emmc_rig.output import result_folder
     from reconstruction.tv import TVSettings
 
-    described = find_camera(camera)
-    if shots is not None:
-        described = described.with_shots(shots)
+    described = _camera(camera, shots)
     chosen = {"mu": mu, "chroma_weight": chroma_weight}
     solver = validated(TVSettings, chosen, "solver settings", AppError)
     settings = DemoSettings(scene, camera, described, _size(size), seed, solver=solver)
@@ -223,13 +231,10 @@ def simulate(
     out: OutOption = Path("emmc-frames"),
 ) -> None:
     """Make frames of a light field through any camera, without a rig."""
-    from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import result_folder
     from emmc_rig.simulate import simulate as run
 
-    described = find_camera(camera)
-    if shots is not None:
-        described = described.with_shots(shots)
+    described = _camera(camera, shots)
     with result_folder(out) as folder:
         metrics = run(scene, camera, described, _size(size), seed, folder)
     typer.echo(

@@ -118,7 +118,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
     lamps = lamps_needed(design)
     seen: dict[tuple[int, int, int, str], Array] = {}
-    with stages("whiteboards", whiteboard_exposures(camera, lamps, settings.whiteboard_repeats)):
+    exposures = whiteboard_exposures(camera, lamps, settings.whiteboard_repeats)
+    with stages("whiteboards", exposures):
         boards = capture_whiteboards(
             rig,
             camera,
@@ -129,7 +130,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         )
     with stages("psi"):
         calibration = measure_psi(boards, design)
-        exact = exact_psi(design, seen, lamps)
+        exact = measure_psi(ideal_boards(seen, lamps, design), design).psi
         psi_error = calibration.psi.relative_difference(exact)
         design_error = design.relative_difference(exact)
     with stages("capture", design.shots):
@@ -150,24 +151,24 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         compared = reconstruct(exact)
     with stages("evaluate"):
         estimate = result.light_field
-        exact_psnr = psnr_db(compared.light_field, truth)
+        psnr, exact_psnr = psnr_db(estimate, truth), psnr_db(compared.light_field, truth)
         metrics = {
             "scene": settings.scene,
             "scene_provenance": fine.scene.provenance,
             "camera": settings.camera_name,
             "shots": design.shots,
             "size": list(size),
-            "psnr_db": psnr_db(estimate, truth),
+            "psnr_db": psnr,
             "ssim": ssim(estimate, truth),
             "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
             "psi_relative_error": psi_error,
             "design_relative_error": design_error,
             "psi_mean_deviation": float(calibration.deviation.mean()),
             "exact_psi_psnr_db": exact_psnr,
-            "calibration_cost_db": exact_psnr - psnr_db(estimate, truth),
+            "calibration_cost_db": exact_psnr - psnr,
             "noise_sigma": sigma,
             "saturated_share": float(1 - usable.mean()),
-            "whiteboard_frames": whiteboard_exposures(camera, lamps, settings.whiteboard_repeats),
+            "whiteboard_frames": exposures,
             "method": result.method,
             "status": result.status,
             "advice": result.advice,
@@ -179,7 +180,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "versions": versions(),
         }
     with stages("write"):
-        save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": metrics["psnr_db"]})
+        save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": psnr})
         focus = focus_disparities(truth)
         export_pictures(folder / "pictures", estimate, focus)
         save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s())
@@ -194,18 +195,6 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     metrics["seconds"] = dict(stages.seconds)
     write_metrics(folder, metrics)
     return metrics
-
-
-def exact_psi(
-    design: ImagingMatrix,
-    readings: dict[tuple[int, int, int, str], Array],
-    lamps: tuple[str, ...],
-) -> ImagingMatrix:
-    """Return the Psi that noise-free whiteboards of the bench would give.
-
-    readings: (pixel_y, pixel_x) by (shot, v, u, lamp), as the bench computes them without noise.
-    """
-    return measure_psi(ideal_boards(readings, lamps, design), design).psi
 
 
 def _told(progress: Progress) -> str:
@@ -245,7 +234,7 @@ def _report(
         estimate=result.light_field,
         truth=truth,
         frames=readings,
-        cfa=camera.sensor.cfa if isinstance(camera.sensor.cfa, str) else "custom",
+        cfa=camera.sensor.cfa_name,
         cfa_tile=cfa_tile(camera.sensor.cfa),
         whiteboards=[(label, board / peak) for label, board in boards],
         psi=weights,

@@ -93,7 +93,7 @@ def simulated_rig(
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field.
     """
     clock = ManualClock()
-    aperture_um = max(camera.views) * camera.lens.aperture_cell_mm * 1e3
+    aperture_um = max(camera.views) * camera.lens.aperture_cell_um
     travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um}
     chain = ZaberChain(
         clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in STAGE_AXES.values()}
@@ -119,7 +119,7 @@ def simulated_rig(
         settings=StageSettings(tolerance_um=POSITION_TOLERANCE_UM),
     )
     noise = camera.sensor.noise
-    cfa = camera.sensor.cfa if isinstance(camera.sensor.cfa, str) else "custom"
+    cfa = camera.sensor.cfa_name
     device = SimulatedRawCamera(
         bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn
     )

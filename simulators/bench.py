@@ -203,7 +203,7 @@ class Bench:
     def _trace(self, at_um: Mapping[str, float]) -> Array:
         camera = self._camera
         lens, sensor = camera.lens, camera.sensor
-        cell_um = lens.aperture_cell_mm * 1e3
+        cell_um = lens.aperture_cell_um
         names = camera.shot_masks(self.shot) if self.masks_in else ()
         cells, starts, shapes, plates = [np.zeros((0, 3), np.float32)], [], [], []
         turn = np.deg2rad(self._errors.rotation_deg)
@@ -257,7 +257,7 @@ class Bench:
 
     def _openings(self, x_um: float, y_um: float) -> Array:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
-        cell_um = self._camera.lens.aperture_cell_mm * 1e3
+        cell_um = self._camera.lens.aperture_cell_um
         window_half_um = max(self._camera.views) * cell_um / 2
         return np.array(
             [

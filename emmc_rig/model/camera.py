@@ -44,6 +44,11 @@ class Lens(Settings):
         default=1.0, ge=0, le=1, description="open width of a cell; 0: a point"
     )
 
+    @property
+    def aperture_cell_um(self) -> float:
+        """Distance between the centres of two views, um."""
+        return self.aperture_cell_mm * 1e3
+
 
 class Sensor(Settings):
     """The sensor: its colour filters, sampling step and pixel size."""
@@ -65,6 +70,11 @@ class Sensor(Settings):
         except CameraError as fault:
             raise ValueError(str(fault)) from fault
         return self
+
+    @property
+    def cfa_name(self) -> str:
+        """Name of the colour filter tile; "custom" for the user's own."""
+        return self.cfa if isinstance(self.cfa, str) else "custom"
 
 
 class Mask(Settings):
@@ -261,7 +271,7 @@ class _Axis:
 def _axes(camera: Camera, size: tuple[int, int]) -> tuple[_Axis, _Axis]:
     """Return the y and the x axis of a camera for a light field of `size` samples."""
     lens, sensor = camera.lens, camera.sensor
-    cell_um = lens.aperture_cell_mm * 1e3
+    cell_um = lens.aperture_cell_um
 
     def axis(samples: int, views: int) -> _Axis:
         return _Axis(

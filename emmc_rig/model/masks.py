@@ -18,7 +18,6 @@ from pydantic import Field, model_validator
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import Settings
 
-COLOURS = "RGB"
 FILTERS = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": (1, 1, 1)}
 CFA = {
     "mono": ("W",),
@@ -244,16 +243,19 @@ def _as_frames(cells: object, ndim: int) -> NDArray[np.float32]:
     return array
 
 
-class Tile(Pattern):
-    """Any user tile, repeated over the mask: rows of greys or of RGB triples."""
-
-    kind: Literal["tile"]
+class _Cells(Pattern):
     cells: list
 
     @model_validator(mode="after")
-    def _is_array(self) -> Tile:
+    def _is_array(self) -> _Cells:
         _as_frames(self.cells, 2)
         return self
+
+
+class Tile(_Cells):
+    """Any user tile, repeated over the mask: rows of greys or of RGB triples."""
+
+    kind: Literal["tile"]
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the tile repeated, its first cell at the mask's corner."""
@@ -294,16 +296,10 @@ class Sequence(Pattern):
         return self._cells()
 
 
-class Parameters(Pattern):
+class Parameters(_Cells):
     """A mask given cell by cell, for instance learned [34]: rows of greys or of RGB triples."""
 
     kind: Literal["parameters"]
-    cells: list
-
-    @model_validator(mode="after")
-    def _is_array(self) -> Parameters:
-        _as_frames(self.cells, 2)
-        return self
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the cells as they are given."""
