@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Progress:
-    """One step of a solver, as given to `on_step`; the objective is None where not evaluated."""
+    """One step of a solver, as given to `on_step`; None where not evaluated or not known.
+
+    total: steps there will be.
+    """
 
     step: int
-    relative_change: float
+    relative_change: float | None
     objective: float | None
+    total: int | None = None
 
 
 @dataclass(frozen=True)
