@@ -666,7 +666,7 @@ def sl0(atoms, data, tolerance, shrink, inner_steps, narrowest, ridge, code):
     coefficient); after each the code is projected back onto the data, where it misses them by
     more than the tolerance. ridge: of A A^T, relative. Returns the passes and the residual.
     """
-    count, length = atoms.shape
+    length = data.size
     blocks = np.empty((length, length), np.float32)
     inverse = np.empty((length, length), np.float32)
     gram(atoms, blocks)
