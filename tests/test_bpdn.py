@@ -194,8 +194,9 @@ def test_what_cannot_be_coded_is_refused():
             solve_bpdn(bad_atoms, bad_data, sigma)
 
 
-def test_the_inverse_is_that_of_the_gram_matrix_with_its_ridge():
-    atoms = problem(50, 20)[0].astype(np.float32)
+@pytest.mark.parametrize("count", [50, 13])
+def test_the_inverse_is_that_of_the_gram_matrix_with_its_ridge(count):
+    atoms = problem(count, 20)[0].astype(np.float32)
     inverse = np.empty((20, 20), np.float32)
     assert kernels.factor(atoms, np.float32(0.7), inverse)
     expected = np.linalg.inv(atoms.T.astype(float) @ atoms + 0.7 * np.eye(20))

@@ -42,7 +42,7 @@ def scene():
 
 
 def settings(method="lars", **more):
-    solver = BPDNSettings(method=method, penalty=1e-4, atoms=8, rtol=1e-4, max_steps=20_000)
+    solver = BPDNSettings(method=method, smallest_penalty=1e-4, atoms=8)
     return SparseSettings(stride=6, solver=solver, **more)
 
 
