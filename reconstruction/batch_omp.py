@@ -14,6 +14,7 @@ N = 30,000, n = 6,075, K = 5,120, k = 10: 0.16, 1.9 and 0.02 TFLOP.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 from numba import get_num_threads, njit
@@ -100,7 +101,7 @@ def _pursue(gram, correlations, floors, smallest_pivot, indices, coefficients):
 def bands(count: int) -> list[tuple[int, int]]:
     """Return the first and last + 1 of as many even parts of `count` as there are threads."""
     edges = np.unique(np.linspace(0, count, get_num_threads() + 1).astype(int))
-    return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def batch_omp(

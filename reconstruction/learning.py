@@ -25,9 +25,9 @@ from pydantic import Field
 
 from emmc_rig.model.settings import Settings
 from reconstruction.batch_omp import NO_ATOM, Array, bands, batch_omp
+from reconstruction.dictionary import OPPONENT
 from reconstruction.errors import DictionaryError
 
-OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]])
 _ROWS_AT_ONCE = 2048
 
 
