@@ -1,5 +1,7 @@
 """Dictionary-based reconstruction: exact where patches are sparse, honest where frames are not."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -41,7 +43,7 @@ def scene():
     return dictionary, tiled_light_field(dictionary)
 
 
-def settings(method="lars", **more):
+def settings(method: Any = "lars", **more: Any):
     solver = BPDNSettings(method=method, smallest_penalty=1e-4, atoms=8)
     return SparseSettings(stride=6, solver=solver, **more)
 
