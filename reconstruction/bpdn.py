@@ -38,7 +38,7 @@ class BPDNSettings(Settings):
         default=0.5, gt=0, description="of sigma |a| sqrt(2 log atoms), which sets eta"
     )
     smallest_penalty: float = Field(
-        default=1e-3, gt=0, lt=1, description="eta against the penalty above which the code is 0"
+        default=2e-3, gt=0, lt=1, description="eta against the penalty above which the code is 0"
     )
     rtol: float = Field(
         default=1e-3, gt=0, description="relative duality gap; float32 certifies about 1e-5"
