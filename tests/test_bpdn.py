@@ -146,18 +146,20 @@ def test_matching_pursuit_rests_at_the_noise():
 
 def test_the_penalty_follows_the_noise_and_the_size_of_the_sensed_atoms():
     atoms, data, _ = problem(300, 45)
-    small, large = (solve_bpdn(atoms, data, sigma).penalty for sigma in (0.3, 0.6))
+    small, large = (solve_bpdn(atoms, data, sigma).penalty for sigma in (0.5, 1.0))
     assert large == pytest.approx(2 * small)
-    expected = 0.5 * 0.3 * np.sqrt((atoms**2).sum(axis=1).mean() * 2 * np.log(300))
+    size = np.median(np.linalg.norm(atoms, axis=1))
+    expected = 0.2 * 0.5 * size * np.sqrt(2 * np.log(300))
     assert small == pytest.approx(expected, rel=1e-5)
-    scaled = solve_bpdn(3 * atoms, 3 * data, 0.3).penalty
+    scaled = solve_bpdn(3 * atoms, 3 * data, 0.5).penalty
     assert scaled == pytest.approx(3 * small)
 
 
 def test_without_noise_the_penalty_is_a_small_share_of_the_largest_useful_one():
     atoms, data, _ = problem(300, 45)
     largest = np.abs(atoms @ data).max()
-    assert solve_bpdn(atoms, data).penalty == pytest.approx(2e-3 * largest, rel=1e-5)
+    bound = np.median(np.linalg.norm(atoms, axis=1)) * np.linalg.norm(data)
+    assert solve_bpdn(atoms, data).penalty == pytest.approx(5e-4 * bound, rel=1e-5)
     zero = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=1.01 * largest))
     assert not zero.weights.any()
 
