@@ -115,10 +115,10 @@ METHODS = {
         ),
         Method(
             "tv-dict",
-            "DV_K drawn towards the patches of dict-admm (the paper's TV-Dict)",
-            "both of `tv` and `dict-admm`",
-            "that of dict-admm, then that of tv with 4N bytes more a step",
-            "the better of the paper's two, from any number of shots",
+            "DV_K drawn towards sparse patches (the paper's TV-Dict)",
+            "what `tv` and `dict-admm` assume, each where it holds",
+            "that of dict-lars (the same minimiser), then that of tv with 4N bytes more a step",
+            "the best here, from any number of shots",
             True,
         ),
     )
