@@ -289,11 +289,14 @@ def reconstruct(
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
+    tile: Annotated[
+        int | None, typer.Option("--tile", min=1, help="in tiles of so many samples: less memory")
+    ] = None,
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.output import result_folder
-    from emmc_rig.reconstruct import load_settings, run_reconstruct
+    from emmc_rig.reconstruct import load_settings, run_in_tiles, run_reconstruct
     from reconstruction.methods import COSTS, METHODS
 
     if list_methods:
@@ -307,6 +310,20 @@ def reconstruct(
     if frames is None:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
     chosen = load_settings(settings)
+    if tile is not None:
+        if truth is not None:
+            raise typer.BadParameter(
+                "--truth needs the whole light field in memory, without --tile"
+            )
+        with result_folder(out) as folder, _progress() as progress:
+            bars = Bars(progress)
+            bars.begin(f"{method} in tiles", None)
+            metrics = run_in_tiles(
+                frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
+            )
+        typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
+        typer.echo(f"read {out / 'light_field.h5'}")
+        return
     with result_folder(out) as folder, _progress() as progress:
         bars = Bars(progress)
         bars.begin(method, None)

@@ -124,7 +124,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         design = build_imaging_matrix(camera, size)
         dictionary = None
         if find_method(settings.method).needs_dictionary:
-            dictionary = open_dictionary(settings.dictionary, design)
+            dictionary = open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
         rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
     lamps = lamps_needed(design)
     seen: dict[tuple[int, int, int, str], Array] = {}
