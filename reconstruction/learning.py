@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import get_num_threads, njit
@@ -50,11 +51,14 @@ class LearningSettings(Settings):
 
 @dataclass(frozen=True)
 class Iteration:
-    """One step: root mean square errors per sample after coding and after the atoms' update."""
+    """One step: root mean square errors per sample after coding and after the atoms' update.
+
+    updated_rmse is None where the method does not evaluate it; replaced: atoms put anew.
+    """
 
     step: int
     coded_rmse: float
-    updated_rmse: float
+    updated_rmse: float | None
     replaced: int
 
 
@@ -94,7 +98,7 @@ def first_state(
     patches: (patch, sample). Raises DictionaryError for patches too few, of another size, not
     finite, or with too few that differ from the fixed atoms.
     """
-    _check(patches, settings, patch_shape)
+    check_patches(patches, settings, patch_shape)
     fixed = fixed_atoms(settings, patch_shape)
     wanted = settings.atoms - len(fixed)
     order = np.random.default_rng(settings.seed).permutation(len(patches))
@@ -134,7 +138,7 @@ def ksvd_step(
     coded_rmse = float(np.sqrt(errors.sum() / patches.size))
     atoms = state.atoms.copy()
     _update_atoms(atoms, indices, coefficients, residuals, settings.power_iterations, fixed)
-    errors = _squares(residuals)
+    errors = squared_norms(residuals)
     updated_rmse = float(np.sqrt(errors.sum() / patches.size))
     replaced = _replace_atoms(atoms, indices, coefficients, residuals, errors, settings, fixed)
     done = Iteration(len(state.history) + 1, coded_rmse, updated_rmse, replaced)
@@ -161,7 +165,7 @@ def learn_ksvd(
     Raises:
         DictionaryError: as `first_state`; or a `start` of other patches or settings.
     """
-    _check(patches, settings, patch_shape)
+    check_patches(patches, settings, patch_shape)
     state = start or first_state(patches, settings, patch_shape)
     shapes = (settings.atoms, patches.shape[1]), (len(patches), settings.sparsity)
     if (state.atoms.shape, state.indices.shape) != shapes:
@@ -174,16 +178,8 @@ def learn_ksvd(
     return state
 
 
-def without_unused(state: LearningState, fixed: int) -> LearningState:
-    """Return the state with the atoms that no patch uses left out, the fixed ones apart."""
-    uses = np.bincount(state.indices[state.indices >= 0], minlength=len(state.atoms))
-    kept = (uses > 0) | (np.arange(len(uses)) < fixed)
-    place = np.where(kept, np.cumsum(kept) - 1, NO_ATOM).astype(np.int32)
-    indices = np.where(state.indices >= 0, place[state.indices], NO_ATOM).astype(np.int32)
-    return replace(state, atoms=state.atoms[kept], indices=indices)
-
-
-def _check(patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]) -> None:
+def check_patches(patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]) -> None:
+    """Raise DictionaryError for patches that cannot be learnt from with these settings."""
     if patches.ndim != 2 or patches.shape[1] != np.prod(patch_shape):
         raise DictionaryError(
             f"training patches of shape {patches.shape}: needs (patch, {np.prod(patch_shape)})"
@@ -198,7 +194,7 @@ def _check(patches: Array, settings: LearningSettings, patch_shape: tuple[int, .
         raise DictionaryError(f"a sparsity of {settings.sparsity}, but {settings.atoms} atoms")
     if settings.flat_atoms and settings.atoms <= patch_shape[-1]:
         raise DictionaryError(f"{settings.atoms} atoms: more than the {patch_shape[-1]} flat ones")
-    if not np.isfinite(_squares(patches)).all():
+    if not np.isfinite(squared_norms(patches)).all():
         raise DictionaryError("training patches hold values that are not finite: leave them out")
 
 
@@ -261,7 +257,7 @@ def _keep_better(
     return errors
 
 
-def _squares(rows: Array) -> NDArray[np.float64]:
+def squared_norms(rows: Array) -> NDArray[np.float64]:
     """Return the squared norm of every row, summed in float64 in small parts."""
     parts = [
         np.einsum("ij,ij->i", part, part, dtype=np.float64)
@@ -344,7 +340,7 @@ def _replace_atoms(
     """
     uses = np.bincount(indices[indices >= 0], minlength=len(atoms))
     poor = uses < settings.fewest_uses
-    poor |= _doubled(atoms, uses, settings.largest_coherence)
+    poor |= doubled_atoms(atoms, uses, settings.largest_coherence)
     poor[:fixed] = False
     places = np.flatnonzero(poor)
     if not places.size:
@@ -361,7 +357,7 @@ def _replace_atoms(
     return len(places)
 
 
-def _doubled(atoms: Array, uses: NDArray[np.int64], largest_coherence: float) -> NDArray[np.bool_]:
+def doubled_atoms(atoms: Array, uses: NDArray[Any], largest_coherence: float) -> NDArray[np.bool_]:
     """Say of every atom whether a more used one (of equals the earlier) is nearly the same."""
     rank = np.empty(len(atoms), np.int64)
     rank[np.argsort(-uses, kind="stable")] = np.arange(len(atoms))
