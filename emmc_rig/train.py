@@ -40,8 +40,9 @@ LEARNERS: dict[str, Learner] = {
     "online": (learn_online, OnlineState),
     "separable": (learn_separable, SeparableState),
 }
-BUILT_IN_SEEDS = 4
+BUILT_IN_SEEDS = 3
 _CHECKPOINT_EVERY_S = 60.0
+_KEPT_SCENE_BYTES = 32 << 20
 _SHOWN_ATOMS = 400
 _ZOOM = 3
 _GAP_PX = 2
@@ -159,6 +160,21 @@ def _sources(spec: str) -> list[Source]:
     return [Source(path.stem, str(path)) for path in inner]
 
 
+def _opened_once(source: Source) -> Callable[[], NDArray[np.float32]]:
+    """Return what opens a scene; a small one, slow to render, is kept for the second pass."""
+    kept: list[NDArray[np.float32]] = []
+
+    def scene() -> NDArray[np.float32]:
+        if kept:
+            return kept.pop()
+        light_field = source.open()
+        if light_field.nbytes <= _KEPT_SCENE_BYTES:
+            kept.append(light_field)
+        return light_field
+
+    return scene
+
+
 def checkpoint_path(out: Path) -> Path:
     """Return where the checkpoint of a training that writes `out` is."""
     return out.with_name(f"{out.stem}.checkpoint.h5")
@@ -191,7 +207,7 @@ def train(
     started = clock()
     watcher.begin("reading scenes", 2 * len(sources))
     patches = training_patches(
-        [source.open for source in sources],
+        [_opened_once(source) for source in sources],
         settings.patches,
         lambda number: watcher.step(sources[number].name),
     )

@@ -318,7 +318,7 @@ def _line(blur_px: float) -> Callable[[NDArray], NDArray]:
 
 def _offsets(reach_px: float, step_px: float) -> NDArray[np.float64]:
     last = int(reach_px / step_px)
-    return step_px * np.arange(-last, last + 1)
+    return np.arange(-last, last + 1, dtype=np.float64) * step_px
 
 
 def _ridges(

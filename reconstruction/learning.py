@@ -42,24 +42,26 @@ class LearningSettings(Settings):
     power_iterations: int = Field(
         default=2, ge=1, description="alternating projections of each atom's rank-1 update"
     )
-    fewest_uses: int = Field(default=1, ge=0, description="atoms used less are replaced")
+    least_use: float = Field(
+        default=0.1, ge=0, lt=1, description="atoms used less, of the mean use, are replaced"
+    )
     largest_coherence: float = Field(
-        default=0.99, gt=0, le=1, description="of two atoms nearer than this one is replaced"
+        default=0.98, gt=0, le=1, description="of two atoms nearer than this one is replaced"
     )
     seed: int = Field(default=0, ge=0)
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """One step: root mean square errors per sample after coding and after the atoms' update.
+    """One step: atoms put anew, then errors per sample after coding and the atoms' update.
 
-    updated_rmse is None where the method does not evaluate it; replaced: atoms put anew.
+    The errors are root mean squares; updated_rmse is None where the method does not evaluate it.
     """
 
     step: int
+    replaced: int
     coded_rmse: float
     updated_rmse: float | None
-    replaced: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +129,21 @@ def first_state(
 def ksvd_step(
     state: LearningState, patches: Array, settings: LearningSettings, fixed: int
 ) -> LearningState:
-    """Return the state after sparse coding, the update of every atom and replacements.
+    """Return the state after replacements, sparse coding, and the update of every atom.
 
     fixed: how many of the first atoms stay. A patch keeps its old code where the new one is no
-    better, so that the error never rises in the coding; it never rises in the update either.
+    better, so that the error never rises in the coding; it never rises in the update either. A
+    replaced atom leaves the codes that used it, so only a replacement may raise the error.
     """
+    state, replaced = _replace_atoms(state, patches, settings, fixed)
     indices, coefficients = batch_omp(state.atoms, patches, settings.sparsity)
     residuals = np.empty_like(patches)
     errors = _keep_better(state, patches, indices, coefficients, residuals)
     coded_rmse = float(np.sqrt(errors.sum() / patches.size))
     atoms = state.atoms.copy()
     _update_atoms(atoms, indices, coefficients, residuals, settings.power_iterations, fixed)
-    errors = squared_norms(residuals)
-    updated_rmse = float(np.sqrt(errors.sum() / patches.size))
-    replaced = _replace_atoms(atoms, indices, coefficients, residuals, errors, settings, fixed)
-    done = Iteration(len(state.history) + 1, coded_rmse, updated_rmse, replaced)
+    updated_rmse = float(np.sqrt(squared_norms(residuals).sum() / patches.size))
+    done = Iteration(len(state.history) + 1, replaced, coded_rmse, updated_rmse)
     return LearningState(atoms, indices, coefficients, (*state.history, done))
 
 
@@ -211,6 +213,13 @@ def _residual(atoms, patch, indices, coefficients, out):
     for i in range(out.size):
         total += np.float64(out[i]) * out[i]
     return total
+
+
+@njit(cache=True, nogil=True)
+def _errors_of_rows(atoms, patches, indices, coefficients, errors):
+    spare = np.empty(patches.shape[1], patches.dtype)
+    for row in range(len(patches)):
+        errors[row] = _residual(atoms, patches[row], indices[row], coefficients[row], spare)
 
 
 @njit(cache=True, nogil=True)
@@ -325,36 +334,49 @@ def _update_atoms(
 
 
 def _replace_atoms(
-    atoms: Array,
-    indices: NDArray[np.int32],
-    coefficients: Array,
-    residuals: Array,
-    errors: NDArray[np.float64],
-    settings: LearningSettings,
-    fixed: int,
-) -> int:
-    """Put residuals of the worst patches in place of atoms little used or doubled; return count.
+    state: LearningState, patches: Array, settings: LearningSettings, fixed: int
+) -> tuple[LearningState, int]:
+    """Put what is left of the worst patches in place of poor atoms; return how many."""
+    used = state.indices >= 0
+    if not used.any():
+        return state, 0
+    uses = np.bincount(state.indices[used], minlength=len(state.atoms))
+    poor = poor_atoms(state.atoms, uses, settings, fixed)
+    if not poor.size:
+        return state, 0
+    errors = np.empty(len(patches))
 
-    A replaced atom leaves the codes that used it, which are then a little worse until the next
-    coding.
-    """
-    uses = np.bincount(indices[indices >= 0], minlength=len(atoms))
-    poor = uses < settings.fewest_uses
+    def rows(band: tuple[int, int]) -> None:
+        part = slice(*band)
+        codes = state.indices[part], state.coefficients[part]
+        _errors_of_rows(state.atoms, patches[part], *codes, errors[part])
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        list(pool.map(rows, bands(len(patches))))
+    worst = np.argsort(-errors, kind="stable")[: len(poor)]
+    worst = worst[errors[worst] > 0]
+    poor = poor[: len(worst)]
+    atoms = state.atoms.copy()
+    for place, row in zip(poor, worst, strict=True):
+        taken = used[row]
+        left = (
+            patches[row] - state.coefficients[row, taken] @ state.atoms[state.indices[row, taken]]
+        )
+        atoms[place] = left / np.linalg.norm(left)
+    gone = np.isin(state.indices, poor)
+    indices = np.where(gone, np.int32(NO_ATOM), state.indices)
+    coefficients = np.where(gone, np.float32(0), state.coefficients)
+    return LearningState(atoms, indices, coefficients, state.history), len(poor)
+
+
+def poor_atoms(
+    atoms: Array, uses: NDArray[Any], settings: LearningSettings, fixed: int
+) -> NDArray[np.intp]:
+    """Return the places of atoms hardly used, and of those a more used one makes superfluous."""
+    poor = uses < settings.least_use * uses.mean()
     poor |= doubled_atoms(atoms, uses, settings.largest_coherence)
     poor[:fixed] = False
-    places = np.flatnonzero(poor)
-    if not places.size:
-        return 0
-    worst = np.argsort(errors, kind="stable")[::-1][: len(places)]
-    places = places[: len(worst)]
-    spoilt = np.isin(indices, places)
-    indices[spoilt] = NO_ATOM
-    coefficients[spoilt] = 0
-    norms = np.sqrt(errors[worst])
-    for place, row, norm in zip(places, worst, norms, strict=True):
-        if norm > 0:
-            atoms[place] = residuals[row] / norm
-    return len(places)
+    return np.flatnonzero(poor)
 
 
 def doubled_atoms(atoms: Array, uses: NDArray[Any], largest_coherence: float) -> NDArray[np.bool_]:

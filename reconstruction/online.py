@@ -23,26 +23,35 @@ from reconstruction.learning import (
     Iteration,
     LearningSettings,
     check_patches,
-    doubled_atoms,
     first_state,
     fixed_atoms,
+    poor_atoms,
     squared_norms,
 )
 
-MINI_BATCH = 1024
+_SMALLEST_BATCH = 256
 _BLOCK = 32
-_FORGETTING = 2.0
-_UNUSED = 1e-4
+_FORGETTING = 5.0
+_UNUSED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class OnlineState:
-    """atoms (atom, sample); the sums codes^T codes (atom, atom), codes^T patches (atom, sample)."""
+    """atoms (atom, sample), and sums over the past, the recent counting more.
+
+    code_sums: codes^T codes (atom, atom). patch_sums: codes^T patches (atom, sample). uses: (atom,)
+    """
 
     atoms: Array
     code_sums: Array
     patch_sums: Array
+    uses: Array
     history: tuple[Iteration, ...] = ()
+
+
+def mini_batch(atoms: int) -> int:
+    """Return how many patches are coded at once: more where moving the atoms costs more."""
+    return max(_SMALLEST_BATCH, atoms // 4)
 
 
 def online_step(
@@ -52,16 +61,12 @@ def online_step(
 
     The error of a step is that of every mini-batch when it is coded, so before it is learnt from.
     """
-    atoms, code_sums, patch_sums = (
-        state.atoms.copy(),
-        state.code_sums.copy(),
-        state.patch_sums.copy(),
-    )
+    atoms, uses = state.atoms.copy(), state.uses.copy()
+    code_sums, patch_sums = state.code_sums.copy(), state.patch_sums.copy()
     passes = len(state.history)
     order = np.random.default_rng([settings.seed, passes]).permutation(len(patches))
-    batches = np.array_split(order, -(-len(order) // MINI_BATCH))
-    total = 0.0
-    residuals, errors = patches[:0], squared_norms(patches[:0])
+    batches = np.array_split(order, -(-len(order) // mini_batch(settings.atoms)))
+    total, replaced = 0.0, 0
     for i, batch in enumerate(batches):
         rows = patches[batch]
         indices, coefficients = batch_omp(atoms, rows, settings.sparsity)
@@ -69,18 +74,28 @@ def online_step(
         # NO_ATOM is -1: what has no atom goes into the spare last column.
         np.put_along_axis(codes, indices.astype(np.intp), coefficients, axis=1)
         codes = codes[:, :-1]
-        residuals = (rows - codes @ atoms).astype(np.float32, copy=False)
-        errors = squared_norms(residuals)
+        left = (rows - codes @ atoms).astype(np.float32, copy=False)
+        errors = squared_norms(left)
         total += float(errors.sum())
         kept = np.float32((1 - 1 / (passes * len(batches) + i + 1)) ** _FORGETTING)
         code_sums *= kept
-        code_sums += codes.T @ codes
         patch_sums *= kept
+        uses *= kept
+        if passes and i == 0:
+            poor = poor_atoms(atoms, uses, settings, fixed)
+            worst = np.argsort(-errors, kind="stable")[: len(poor)]
+            worst = worst[errors[worst] > 0]
+            poor = poor[: len(worst)]
+            replaced = len(poor)
+            atoms[poor] = left[worst] / np.sqrt(errors[worst])[:, None]
+            for gone in (code_sums, code_sums.T, patch_sums, uses, codes.T):
+                gone[poor] = 0
+        code_sums += codes.T @ codes
         patch_sums += codes.T @ rows
+        uses += np.count_nonzero(codes, axis=0)
         _descend(atoms, code_sums, patch_sums, fixed)
-    replaced = _replace_atoms(atoms, code_sums, patch_sums, residuals, errors, settings, fixed)
-    done = Iteration(passes + 1, float(np.sqrt(total / patches.size)), None, replaced)
-    return OnlineState(atoms, code_sums, patch_sums, (*state.history, done))
+    done = Iteration(passes + 1, replaced, float(np.sqrt(total / patches.size)), None)
+    return OnlineState(atoms, code_sums, patch_sums, uses, (*state.history, done))
 
 
 def learn_online(
@@ -94,8 +109,9 @@ def learn_online(
     check_patches(patches, settings, patch_shape)
     if start is None:
         atoms = first_state(patches, settings, patch_shape).atoms
-        sums = np.zeros((len(atoms), len(atoms)), np.float32), np.zeros_like(atoms)
-        start = OnlineState(atoms, *sums)
+        count = len(atoms)
+        code_sums, uses = np.zeros((count, count), np.float32), np.zeros(count, np.float32)
+        start = OnlineState(atoms, code_sums, np.zeros_like(atoms), uses)
     if start.atoms.shape != (settings.atoms, patches.shape[1]):
         raise DictionaryError("the state to resume from is of other patches or settings")
     state, fixed = start, len(fixed_atoms(settings, patch_shape))
@@ -108,7 +124,8 @@ def learn_online(
 
 def _descend(atoms: Array, code_sums: Array, patch_sums: Array, fixed: int) -> None:
     """Move every used atom to its best place for the sums, one after another, in place."""
-    used = _uses_enough(code_sums)
+    strengths = np.diagonal(code_sums)
+    used = strengths > _UNUSED * float(strengths.mean())
     for begin in range(fixed, len(atoms), _BLOCK):
         block = slice(begin, min(begin + _BLOCK, len(atoms)))
         slopes = patch_sums[block] - code_sums[block] @ atoms
@@ -124,32 +141,3 @@ def _descend(atoms: Array, code_sums: Array, patch_sums: Array, fixed: int) -> N
                 code_sums[atom + 1 : block.stop, atom], moved - atoms[atom]
             )
             atoms[atom] = moved
-
-
-def _uses_enough(code_sums: Array) -> np.ndarray:
-    strength = np.diagonal(code_sums)
-    return strength > _UNUSED * float(strength.mean())
-
-
-def _replace_atoms(
-    atoms: Array,
-    code_sums: Array,
-    patch_sums: Array,
-    residuals: Array,
-    errors: np.ndarray,
-    settings: LearningSettings,
-    fixed: int,
-) -> int:
-    """Put residuals of the worst patches in place of unused and doubled atoms; return the count."""
-    poor = ~_uses_enough(code_sums)
-    poor |= doubled_atoms(atoms, np.diagonal(code_sums), settings.largest_coherence)
-    poor[:fixed] = False
-    worst = np.argsort(-errors, kind="stable")
-    worst = worst[errors[worst] > 0]
-    places = np.flatnonzero(poor)[: len(worst)]
-    worst = worst[: len(places)]
-    atoms[places] = residuals[worst] / np.sqrt(errors[worst])[:, None]
-    code_sums[places] = 0
-    code_sums[:, places] = 0
-    patch_sums[places] = 0
-    return len(places)

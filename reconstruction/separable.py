@@ -110,7 +110,7 @@ def separable_step(
             fit += seen @ kept[some].transpose(1, 0, 2).reshape(views, -1).T
         view_bases[pair] = _nearest_orthonormal(fit)
     rmse = float(np.sqrt(max(error, 0.0) / patches.size))
-    done = Iteration(len(state.history) + 1, rmse, None, 0)
+    done = Iteration(len(state.history) + 1, 0, rmse, None)
     return SeparableState(view_bases, sample_bases, (*state.history, done))
 
 
