@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.box import SIMPLE
@@ -119,12 +119,13 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
+def _size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
     if text is None:
         return None
     rows, cross, columns = text.lower().partition("x")
     if not (cross and rows.isdigit() and columns.isdigit()):
-        raise AppError(f"--size {text}: write ROWSxCOLUMNS, for instance 192x256")
+        example = "192x256" if option == "--size" else "9x9"
+        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
     return int(rows), int(columns)
 
 
@@ -391,6 +392,59 @@ def chart(
     typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
 
 
+@app.command()
+def train(
+    out: Annotated[Path, typer.Option("--out", help="the dictionary to write, FILE.h5")],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scenes",
+            help="a folder of scenes, a scene, or a built-in name; may repeat "
+            "(default: the built-in scenes)",
+        ),
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option("--leave-out", help="a scene not to train on, by its name; may repeat"),
+    ] = None,
+    kind: Annotated[str, typer.Option("--kind", help="ksvd, online or separable")] = "ksvd",
+    atoms: Annotated[int, typer.Option("--atoms", help="number of atoms")] = 1024,
+    patch: Annotated[str, typer.Option("--patch", help="ROWSxCOLUMNS of a patch")] = "9x9",
+    patches: Annotated[int, typer.Option("--patches", help="patches to train on")] = 10_000,
+    sparsity: Annotated[int, typer.Option("--sparsity", help="atoms per patch at most")] = 8,
+    iterations: Annotated[int, typer.Option("--iterations", help="steps in all")] = 15,
+    seed: SeedOption = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on where the same training stopped")
+    ] = False,
+) -> None:
+    """Train a dictionary of light-field patches; Ctrl-C leaves a checkpoint for --resume."""
+    from emmc_rig.train import InterruptedTrainingError, picture_path, train_settings
+    from emmc_rig.train import train as run
+
+    size = _size(patch, "--patch")
+    assert size is not None
+    chosen = {
+        "patches": {"rows": size[0], "columns": size[1], "count": patches, "seed": seed},
+        "learning": {"atoms": atoms, "sparsity": sparsity, "iterations": iterations, "seed": seed},
+    }
+    settings = train_settings(out, scenes or (), leave_out or (), kind, chosen, resume)
+    try:
+        with _progress() as progress:
+            bars = Bars(progress)
+            dictionary, told = run(settings, bars)
+            bars.finish()
+    except InterruptedTrainingError as stop:
+        _fail(str(stop), INTERRUPTED)
+    last = told["history"][-1]
+    typer.echo(
+        f"{dictionary.size} atoms from {patches} patches of {len(told['sources'])} scene(s): error "
+        f"{last['updated_rmse'] or last['coded_rmse']:.5f} with {sparsity} atoms per patch; "
+        f"{told['learning_seconds']:.1f} s, peak memory {told['peak_memory_gib']:.2f} GiB"
+    )
+    typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
+
+
 def main() -> None:
     """Run the program; never shows a traceback for a fault that the user can mend."""
     try:
@@ -414,6 +468,6 @@ def main() -> None:
         sys.exit(code)
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str, code: int) -> NoReturn:
     console.print(f"[bold red]emmc-rig:[/] {message}", highlight=False, soft_wrap=True)
     sys.exit(code)

@@ -147,9 +147,9 @@ class Dictionary:
                         f"{path}: not a dictionary of this program (format {found!r}, "
                         f"needs {FORMAT!r}); `emmc-rig train` makes one"
                     )
-                atoms, kind = file["atoms"][()], file.attrs["kind"]
-                provenance = file["provenance"].asstr()[()]
-        except (OSError, RuntimeError, KeyError, AttributeError, TypeError) as fault:
+                atoms, kind = np.asarray(file["atoms"]), str(file.attrs["kind"])
+                provenance = np.asarray(file["provenance"]).item().decode("utf-8")
+        except (OSError, RuntimeError, KeyError, AttributeError, ValueError) as fault:
             raise DictionaryError(
                 f"{path}: damaged or cut short ({_one_line(fault)}); copy it again or train anew"
             ) from fault
@@ -318,7 +318,7 @@ def _line(blur_px: float) -> Callable[[NDArray], NDArray]:
 
 def _offsets(reach_px: float, step_px: float) -> NDArray[np.float64]:
     last = int(reach_px / step_px)
-    return step_px * np.arange(-last, last + 1)
+    return np.arange(-last, last + 1, dtype=np.float64) * step_px
 
 
 def _ridges(
