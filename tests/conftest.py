@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 
 
@@ -34,3 +35,24 @@ def random_psi():
         return ImagingMatrix(weights, colour, binning)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def coded_psi():
+    """Return a function that makes a small Psi of a random colour mask near the sensor."""
+
+    def made(cfa="rggb", binning=1, shots=1, size=(6, 8), views=(2, 3), dtype=np.float32):
+        pattern = {"kind": "random_rgbw", "seed": 0}
+        camera = Camera.model_validate(
+            {
+                "title": "test",
+                "views": views,
+                "sensor": {"cfa": cfa, "binning": binning},
+                "masks": {"m": {"distance_mm": 0.24, "cell_um": 24.0, "pattern": pattern}},
+                "more_shots_step_um": {"m": (72, 48)},
+            }
+        )
+        psi = build_imaging_matrix(camera.with_shots(shots), size)
+        return ImagingMatrix(psi.weights.astype(dtype), psi.colour, binning, psi.camera_json)
+
+    return made

@@ -75,7 +75,7 @@ def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
     outs = np.empty((2, *psi.light_field_shape), dtype=np.float32)
     for out, source in zip(outs, (psi, saved), strict=True):
         reconstruct_in_tiles("tv", source, frames, 0.01, out, tile=40)
-    np.testing.assert_array_equal(*outs)
+    np.testing.assert_array_equal(outs[0], outs[1])
 
 
 def test_results_go_straight_into_a_file_and_progress_is_told(random_psi, tmp_path):
