@@ -351,18 +351,25 @@ def chart(
     kernels: Annotated[
         bool, typer.Option("--kernels", help="time the kernels against a memory triad")
     ] = False,
+    solvers: Annotated[
+        bool, typer.Option("--solvers", help="time the sparse solvers, and scikit-learn's beside")
+    ] = False,
+    dictionary: DictionaryOption = None,
     camera: CameraOption = "rgbw-bayer-1shot",
     size: SizeOption = "593x840",
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
     out: OutOption = Path("emmc-kernels"),
 ) -> None:
-    """Measure speed: `--kernels` prints every kernel as a ratio to its memory bound."""
+    """Measure speed: kernels against their memory bound, sparse solvers against theirs."""
     from emmc_rig.benchmark import kernel_timings, reconstruction_memory
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
+    if solvers:
+        _chart_solvers(camera, dictionary, out)
+        return
     if not kernels:
-        raise typer.BadParameter("say what to chart: --kernels")
+        raise typer.BadParameter("say what to chart: --kernels or --solvers")
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
@@ -443,6 +450,50 @@ def train(
         f"{told['learning_seconds']:.1f} s, peak memory {told['peak_memory_gib']:.2f} GiB"
     )
     typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
+
+
+def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.reconstruct import open_dictionary
+    from emmc_rig.sparse_benchmark import TIMED_SIZE, peer_timings, solver_timings
+
+    described = find_camera(camera)
+    atoms = open_dictionary(dictionary, described.views, described.sensor.binning)
+    table = Table("solver", "ms/patch", "passes", "GFLOP/s", "times its bound", "gap", "dB")
+    rows, peers = [], []
+    with result_folder(out) as folder:
+        for timing in solver_timings(described, TIMED_SIZE, atoms):
+            rows.append(timing.as_dict())
+            table.add_row(
+                timing.name,
+                f"{timing.milliseconds:.2f}",
+                f"{timing.passes:.0f}",
+                f"{timing.gigaflops:.1f}",
+                f"{timing.ratio:.1f}",
+                f"{timing.gap:.1e}",
+                f"{timing.psnr_db:.2f}",
+            )
+        Console().print(table)
+        try:
+            peers = [timing.as_dict() for timing in peer_timings(described, TIMED_SIZE, atoms)]
+        except AppError as missing:
+            console.print(f"[yellow]not compared:[/] {missing}", highlight=False)
+        metrics = {
+            "camera": camera,
+            "dictionary": atoms.kind,
+            "atoms": atoms.size,
+            "solvers": rows,
+            "peers": peers,
+            "command": command_line(),
+            "versions": versions(),
+        }
+        write_metrics(folder, metrics)
+    for peer in peers:
+        typer.echo(
+            f"{peer['name']}: ours {peer['ours_ms']:.2f} ms a patch, scikit-learn's "
+            f"{peer['theirs_ms']:.2f} ms: {peer['ratio']:.1f} times faster"
+        )
 
 
 def main() -> None:

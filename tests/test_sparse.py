@@ -68,7 +68,7 @@ def test_patches_of_few_atoms_come_back(random_psi, scene, method, shots, stored
 def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
     """The penalty shrinks coefficients by the same amount: a longer atom loses less by it."""
     dictionary = random_atoms()
-    truth = np.broadcast_to(np.float32([0.8, 0.5, 0.2]), (*VIEWS, 12, 12, 3))
+    truth = np.broadcast_to(np.array([0.8, 0.5, 0.2], np.float32), (*VIEWS, 12, 12, 3))
     psi = random_psi(1, VIEWS, (12, 12), stored=3)
     losses = []
     for favour in (1, 8):
