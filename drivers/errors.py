@@ -145,3 +145,99 @@ class RawFrameError(DriverError):
     def __init__(self, reason: str) -> None:
         super().__init__(f"unusable RAW frame, {reason}: capture it again")
         self.reason = reason
+
+
+class UsbUnavailableError(DriverError):
+    """USB cannot be used on this computer at all."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"USB cannot be used here ({reason}): reinstall libusb-package, and in a container "
+            "pass /dev/bus/usb through"
+        )
+        self.reason = reason
+
+
+class UsbNotFoundError(DriverError):
+    """No device that matches is plugged in; `present` names those that are."""
+
+    def __init__(self, wanted: str, present: tuple[str, ...] = ()) -> None:
+        seen = ", ".join(present) if present else "no device of that kind"
+        super().__init__(
+            f"no {wanted} on USB ({seen} found): check cable, power and the device's USB mode"
+        )
+        self.wanted = wanted
+        self.present = present
+
+
+class UsbPermissionError(DriverError):
+    """The device is there but this user may not open it."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(
+            f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
+            "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
+        )
+        self.device = device
+
+
+class UsbClaimedError(DriverError):
+    """Another program holds the device; `holders` are its name and process id, where known."""
+
+    def __init__(self, device: str, holders: tuple[str, ...], advice: str) -> None:
+        by = ", ".join(holders) if holders else "another program"
+        super().__init__(f"{device} is claimed by {by}: {advice}")
+        self.device = device
+        self.holders = holders
+        self.advice = advice
+
+
+class UsbGoneError(DriverError):
+    """The device was unplugged, or lost its power, while it was open."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(f"{device} went away: plug it in, switch it on and open it again")
+        self.device = device
+
+
+class UsbStalledError(DriverError):
+    """The device halted an endpoint: it did not accept what it was sent."""
+
+    def __init__(self, device: str, endpoint: int) -> None:
+        super().__init__(
+            f"{device} stalled endpoint {endpoint:#04x}: clear the halt and try again, "
+            "or switch the device off and on"
+        )
+        self.device = device
+        self.endpoint = endpoint
+
+
+class UsbTimeoutError(DriverError):
+    """A transfer did not finish in time; `done` is how many bytes of it passed."""
+
+    def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
+        got = f"stopped after {done} bytes" if done else "was silent"
+        super().__init__(
+            f"{device} {got} for {timeout_s:g} s: check the cable, and that it is awake and not busy"
+        )
+        self.device = device
+        self.timeout_s = timeout_s
+        self.done = done
+
+
+class UsbTransferError(DriverError):
+    """The transfer failed in any other way; `reason` is what libusb says."""
+
+    def __init__(self, device: str, reason: str, advice: str) -> None:
+        super().__init__(f"{device}: transfer failed ({reason}): {advice}")
+        self.device = device
+        self.reason = reason
+
+
+class CameraSettingError(DriverError):
+    """The camera cannot be set to that; nothing was sent to it."""
+
+    def __init__(self, setting: str, reason: str) -> None:
+        super().__init__(f"the camera's {setting} {reason}")
+        self.setting = setting
+        self.reason = reason

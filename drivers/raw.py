@@ -3,7 +3,8 @@
 import hashlib
 import io
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,12 @@ class RawFrame:
     `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
     `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
-    `exposure_s`: None where the file does not say.
+    `exposure_s`: None where neither the file nor the camera says.
     `original`: the camera's own bytes, `sha256` their digest in hexadecimal.
+    `gain`: linear, 1 at the camera's base sensitivity; None where nobody says.
+    `camera_time_s`: the camera's own timestamp, from an origin of its own.
+    `host_time_s`: when the frame had arrived, on the clock that the camera was given.
+    `metadata`: what else the camera said of the frame.
     """
 
     mosaic: Array
@@ -52,6 +57,10 @@ class RawFrame:
     exposure_s: float | None
     original: bytes
     sha256: str
+    gain: float | None = None
+    camera_time_s: float | None = None
+    host_time_s: float | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
 
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
