@@ -218,7 +218,7 @@ class UsbTimeoutError(DriverError):
     def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
         got = f"stopped after {done} bytes" if done else "was silent"
         super().__init__(
-            f"{device} {got} for {timeout_s:g} s: check the cable, and that it is awake and not busy"
+            f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
         )
         self.device = device
         self.timeout_s = timeout_s
