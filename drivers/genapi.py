@@ -117,10 +117,6 @@ class Features:
         """Return the least and the greatest value of a number."""
         return self._asked(name, self._limits)
 
-    def step(self, name: str) -> int:
-        """Return the step between an integer's values."""
-        return self._asked(name, lambda node: int(self._linked(node, "Inc", 1)))
-
     def unit(self, name: str) -> str:
         """Return a number's unit, "" where it has none."""
         return self._asked(name, lambda node: (node.text("Unit") or "").strip())
@@ -136,6 +132,10 @@ class Features:
         take or while it may not be changed.
         """
         self._asked(name, lambda node: self._set(node, value))
+
+    def set_nearest(self, name: str, value: Number) -> None:
+        """Store the nearest to a number that the feature can take; raises as `set`."""
+        self._asked(name, lambda node: self._set_nearest(node, value))
 
     def execute(self, name: str) -> None:
         """Carry a command out."""
@@ -452,6 +452,15 @@ class Features:
         if step > 1 and (_whole(value) - _whole(low)) % step:
             raise CameraSettingError(node.name, f"goes in steps of {step} from {low}, not {value}")
         self._store(node, value)
+
+    def _set_nearest(self, node: _Node, value: Number) -> None:
+        low, high = self._limits(node)
+        value = min(max(value, low), high)
+        if node.kind == "Integer":
+            step = max(1, int(self._linked(node, "Inc", 1)))
+            value = _whole(low) + round((value - low) / step) * step
+            value -= step if value > high else 0
+        self._set(node, value)
 
     def _execute(self, node: _Node) -> None:
         if node.kind != "Command":

@@ -54,8 +54,8 @@ COMPARISONS: dict[str, Callable[[Number, Number], bool]] = {
 CONSTANTS = {"PI": math.pi, "E": math.e}
 FUNCTIONS: dict[str, Callable[..., Number]] = {
     "SGN": lambda x: (x > 0) - (x < 0),
-    "NEG": operator.neg,
-    "ABS": abs,
+    "NEG": lambda x: -x,
+    "ABS": lambda x: abs(x),
     "SQRT": math.sqrt,
     "SIN": math.sin,
     "COS": math.cos,
@@ -117,11 +117,8 @@ class Formula:
             yes = self._choice()
             self._needs(":")
             no = self._choice()
-            chosen = condition
-
-            def condition(scope: _Scope) -> Number:
-                return yes(scope) if chosen(scope) else no(scope)
-
+            self._depth -= 1
+            return lambda scope: yes(scope) if condition(scope) else no(scope)
         self._depth -= 1
         return condition
 

@@ -84,9 +84,10 @@ IMAGE, IMAGE_WITH_CHUNKS = 0x0001, 0x4001
 
 _LEADER = struct.Struct("<IHHQHHQIIIIIHH")
 _TRAILER = struct.Struct("<IHHQHHQ")
+LEADER_SIZE = _LEADER.size
 _U32 = struct.Struct("<I")
-TRAILER_SIZES = (_TRAILER.size + 4, _TRAILER.size + 8, _TRAILER.size)
-"""An image's trailer adds its lines; one with chunks their layout too."""
+TRAILER_SIZES = range(_TRAILER.size, 68, 4)
+"""An image's trailer adds its lines, one with chunks their layout; makers may add more."""
 
 _MANIFEST_ENTRY = struct.Struct("<HBBIQQ20s")
 MANIFEST_ENTRY_SIZE = 64
