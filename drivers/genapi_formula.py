@@ -66,7 +66,7 @@ FUNCTIONS: dict[str, Callable[..., Number]] = {
     "EXP": math.exp,
     "LN": math.log,
     "LG": math.log10,
-    "TRUNC": math.trunc,
+    "TRUNC": lambda x: math.trunc(x),
     "FLOOR": math.floor,
     "CEIL": math.ceil,
     "ROUND": lambda x: math.floor(abs(x) + 0.5) * (1 if x >= 0 else -1),

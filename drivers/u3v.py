@@ -445,9 +445,9 @@ def read_description(control: U3vControl) -> bytes:
 
 def _unzipped(data: bytes) -> bytes:
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            with archive.open(archive.infolist()[0]) as file:
-                xml = file.read(UNZIPPED_LIMIT + 1)
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        with archive.open(archive.infolist()[0]) as file:
+            xml = file.read(UNZIPPED_LIMIT + 1)
     except _DAMAGED_ZIP as error:
         raise CameraDescriptionError(f"its zipped XML cannot be unpacked ({error})") from error
     if len(xml) > UNZIPPED_LIMIT:
