@@ -109,18 +109,22 @@ def check_setting(setting: str, value: float, limits: Limits) -> None:
 
 
 def check_frame(
-    frame: RawFrame, cfa: str | None = None, exposure_s: float | None = None
+    frame: RawFrame,
+    cfa: str | None = None,
+    exposure_s: float | None = None,
+    tolerance_s: float = 0.0,
 ) -> RawFrame:
     """Return the frame; raises `RawFrameError` unless its colours and exposure are as expected.
 
-    An exposure that the file does not state is not checked.
+    An exposure that the file does not state is not checked; else it may be off by
+    `EXPOSURE_AGREEMENT` or `tolerance_s`, whichever is more.
     """
     if cfa is not None and frame.cfa != cfa:
         raise RawFrameError(f"its colours are {frame.cfa} instead of {cfa}")
     if (
         exposure_s is not None
         and frame.exposure_s is not None
-        and abs(frame.exposure_s / exposure_s - 1) > EXPOSURE_AGREEMENT
+        and abs(frame.exposure_s - exposure_s) > max(EXPOSURE_AGREEMENT * exposure_s, tolerance_s)
     ):
         raise RawFrameError(
             f"it was exposed for {frame.exposure_s:g} s instead of {exposure_s:g} s"
