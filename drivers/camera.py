@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraSettingError, RawFrameError
+from drivers.errors import CameraClosedError, CameraSettingError, RawFrameError
 from drivers.raw import RawFrame, decode_raw
 
 EXPOSURE_AGREEMENT = 0.1
@@ -165,6 +165,7 @@ class RawFileCamera:
         self.identity = identity or CameraIdentity()
         self.shape = shape
         self.cfa = cfa
+        self._closed = False
         self.set_exposure_s(exposure_s)
 
     def set_exposure_s(self, exposure_s: float) -> None:
@@ -181,9 +182,12 @@ class RawFileCamera:
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `RawFrameError` or an error of the transport."""
+        if self._closed:
+            raise CameraClosedError(self.identity.model or "the camera")
         frame = decode_raw(self._transport.capture(self.exposure_s), self.shape)
         check_frame(frame, self.cfa, self.exposure_s)
         return replace(frame, gain=self.gain, host_time_s=self._clock.now_s())
 
     def close(self) -> None:
-        """Do nothing: there is nothing to let go of."""
+        """Refuse further frames; closing twice is allowed."""
+        self._closed = True

@@ -316,3 +316,11 @@ class FolderCameraError(DriverError):
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
         self.folder = folder
         self.reason = reason
+
+
+class CameraClosedError(DriverError):
+    """The camera was closed by this program."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"{camera} was closed: open it again")
+        self.camera = camera

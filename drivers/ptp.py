@@ -21,6 +21,7 @@ from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
+    CameraClosedError,
     CameraSettingError,
     CaptureError,
     CardFullError,
@@ -80,7 +81,7 @@ class PtpSettings:
     capture_limit_s: float = 20.0
     pair_limit_s: float = 2.0
     event_poll_s: float = 0.5
-    part_bytes: int = 1 << 24
+    part_bytes: int = 1 << 22
     attempts: int = 3
 
 
@@ -151,12 +152,12 @@ class PtpSession:
         with self.lock:
             if self._closed:
                 return
-            self._closed = True
             try:
                 # It may be unplugged or off: then there is no session to end.
                 with suppress(DriverError):
-                    self.request(Operation.CLOSE_SESSION)
+                    self.request(Operation.CLOSE_SESSION, patient=False)
             finally:
+                self._closed = True
                 self._transport.close()
 
     def can(self, operation: Operation) -> bool:
@@ -261,9 +262,8 @@ class PtpSession:
     ) -> bytes:
         """Return the bytes of an object, in parts where the camera can.
 
-        A part that breaks off is asked for again from where it broke, `settings.attempts` times
-        without any progress. `on_progress` gets bytes done and in all. Raises `DownloadError`, or
-        as `request` does.
+        A part that breaks off is asked for again, `settings.attempts` times without progress.
+        `on_progress` gets bytes done and in all. Raises `DownloadError`, or as `request` does.
         """
         with self.lock:
             if info.size != codec.EVERYTHING and self.can(Operation.GET_PARTIAL_OBJECT):
@@ -309,6 +309,8 @@ class PtpSession:
         transaction: int | None = None,
     ) -> Message:
         with self.lock:
+            if self._closed:
+                raise CameraClosedError(self.name)
             if self._broken:
                 self._transport.recover(self._transaction)
             if transaction is None:
@@ -410,10 +412,8 @@ class PtpSession:
                 if told and told[0] != came:
                     reason = f"{came} bytes came of the {told[0]} that it says it sent"
                     received.seek(done)
-            except (UsbTimeoutError, UsbStalledError) as error:
-                # What came before the fault is whole packets in their order.
-                reason = str(error)
-            except PtpFormatError as error:
+            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+                # Nobody knows whether what came before the fault is in its place.
                 reason = str(error)
                 received.seek(done)
             if received.tell() > done:

@@ -30,6 +30,9 @@ class Kind(IntEnum):
     EVENT = 4
 
 
+KINDS = frozenset(Kind)
+
+
 class Operation(IntEnum):
     """What a camera can be asked to do."""
 
@@ -151,7 +154,7 @@ def decode_header(data: bytes | memoryview) -> Header:
     if len(data) < HEADER_SIZE:
         raise PtpFormatError(bytes(data), "shorter than a container's header")
     header = Header(*HEADER.unpack_from(data))
-    if header.length < HEADER_SIZE or header.kind not in set(Kind):
+    if header.length < HEADER_SIZE or header.kind not in KINDS:
         raise PtpFormatError(bytes(data[:HEADER_SIZE]), "no header of a container")
     return header
 

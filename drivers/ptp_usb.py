@@ -132,11 +132,9 @@ class PtpUsb:
                 index=self._interface,
                 data=struct.pack("<HI", CANCELLATION, transaction),
             )
-        self._in.drain(most=MOST_UNDER_WAY)
+        self._flush()
         self._await_ready()
-        for pipe in (self._in, self._out):
-            self._unhalt(pipe)
-        self._in.drain(most=MOST_UNDER_WAY)
+        self._flush()
 
     def reset(self) -> None:
         """Close whatever session the camera believes to be open."""
@@ -147,6 +145,11 @@ class PtpUsb:
     def close(self) -> None:
         """Let go of the camera; closing twice is allowed."""
         self._device.close()
+
+    def _flush(self) -> None:
+        for pipe in (self._in, self._out):
+            self._unhalt(pipe)
+        self._in.drain(most=MOST_UNDER_WAY)
 
     def _await_ready(self) -> None:
         for _ in range(STATUS_POLLS):
@@ -205,7 +208,10 @@ class PtpUsb:
         self._read_rest(length - had, sink)
 
     def _read_rest(self, length: int, sink: Sink) -> None:
-        """Read exactly `length` bytes, however the camera cuts them into transfers."""
+        """Read exactly `length` bytes, in as many transfers as it takes.
+
+        A short packet before the end means that some were lost: what follows is the response.
+        """
         room = memoryview(self._buffer)
         empty = 0
         while length:
@@ -221,6 +227,8 @@ class PtpUsb:
             if empty > EMPTY_READS_TOLERATED:
                 raise PtpFormatError(b"", f"{length} bytes of data are missing")
             length -= count
+            if length and count % self._in.packet_size:
+                raise PtpFormatError(b"", f"{length} bytes of data are missing")
 
     def _take_events(self, data: bytes) -> None:
         while data:

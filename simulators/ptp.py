@@ -110,7 +110,8 @@ class PtpCameraSimulator:
 
     `render(exposure_s)` returns the uint16 `(y, x)` mosaic in DN that the sensor reads at the
     lowest ISO, called when the exposure is over. `exposures`: the choices in units of 0.1 ms, or
-    (lowest, highest, step). `quality`: "raw", "raw+jpeg" or "jpeg". Faults are armed with
+    (lowest, highest, step) in `span`. `quality`: "raw", "raw+jpeg" or "jpeg". `lacks`: operations
+    that it does not know. Faults are armed with
     `faults.inject`; those of the wire strike there.
     """
 
@@ -126,7 +127,7 @@ class PtpCameraSimulator:
         span: tuple[int, int, int] | None = None,
         isos: tuple[int, ...] = ISOS,
         quality: str = "raw",
-        partial: bool = True,
+        lacks: tuple[Operation, ...] = (Operation.GET_THUMB,),
         capacity_bytes: int = 1 << 36,
         serial: str = "S1",
     ) -> None:
@@ -141,7 +142,7 @@ class PtpCameraSimulator:
         self._cfa = cfa
         self._black_dn = black_level_dn
         self._white_dn = white_level_dn
-        self._partial = partial
+        self._lacks = frozenset(lacks)
         self._capacity_bytes = capacity_bytes
         self._exposures, self._span, self._isos = exposures, span, isos
         self._values = {
@@ -194,17 +195,16 @@ class PtpCameraSimulator:
                 operation = Operation(request.code)
             except ValueError:
                 return Answer(Code.OPERATION_NOT_SUPPORTED)
+            if operation in self._lacks:
+                return Answer(Code.OPERATION_NOT_SUPPORTED)
             if not self.session and operation not in _WITHOUT_SESSION:
                 return Answer(Code.SESSION_NOT_OPEN)
             arguments = (*request.parameters, 0, 0, 0, 0, 0)
             return _ANSWERS[operation](self, arguments, data, request.transaction)
 
     def _device_info(self, *request: object) -> Answer:
-        operations = set(Operation) - {Operation.GET_THUMB}
-        if not self._partial:
-            operations -= {Operation.GET_PARTIAL_OBJECT}
         info = DeviceInfo(
-            operations=tuple(sorted(operations)),
+            operations=tuple(o for o in Operation if o not in self._lacks),
             events=tuple(EventCode),
             properties=tuple(self._values),
             capture_formats=(Format.DNG,),
@@ -267,8 +267,6 @@ class PtpCameraSimulator:
 
     def _partial_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         handle, offset, most = arguments[:3]
-        if not self._partial:
-            return Answer(Code.OPERATION_NOT_SUPPORTED)
         if handle not in self.objects:
             return Answer(Code.INVALID_HANDLE)
         part = memoryview(self.objects[handle][1])[offset : offset + most]
