@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraSettingError, RawFrameError
+from drivers.errors import CameraClosedError, CameraSettingError, RawFrameError
 from drivers.raw import RawFrame, decode_raw
 
 EXPOSURE_AGREEMENT = 0.1
@@ -109,18 +109,22 @@ def check_setting(setting: str, value: float, limits: Limits) -> None:
 
 
 def check_frame(
-    frame: RawFrame, cfa: str | None = None, exposure_s: float | None = None
+    frame: RawFrame,
+    cfa: str | None = None,
+    exposure_s: float | None = None,
+    tolerance_s: float = 0.0,
 ) -> RawFrame:
     """Return the frame; raises `RawFrameError` unless its colours and exposure are as expected.
 
-    An exposure that the file does not state is not checked.
+    An exposure that the file does not state is not checked; else it may be off by
+    `EXPOSURE_AGREEMENT` or `tolerance_s`, whichever is more.
     """
     if cfa is not None and frame.cfa != cfa:
         raise RawFrameError(f"its colours are {frame.cfa} instead of {cfa}")
     if (
         exposure_s is not None
         and frame.exposure_s is not None
-        and abs(frame.exposure_s / exposure_s - 1) > EXPOSURE_AGREEMENT
+        and abs(frame.exposure_s - exposure_s) > max(EXPOSURE_AGREEMENT * exposure_s, tolerance_s)
     ):
         raise RawFrameError(
             f"it was exposed for {frame.exposure_s:g} s instead of {exposure_s:g} s"
@@ -161,6 +165,7 @@ class RawFileCamera:
         self.identity = identity or CameraIdentity()
         self.shape = shape
         self.cfa = cfa
+        self._closed = False
         self.set_exposure_s(exposure_s)
 
     def set_exposure_s(self, exposure_s: float) -> None:
@@ -177,9 +182,12 @@ class RawFileCamera:
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `RawFrameError` or an error of the transport."""
+        if self._closed:
+            raise CameraClosedError(self.identity.model or "the camera")
         frame = decode_raw(self._transport.capture(self.exposure_s), self.shape)
         check_frame(frame, self.cfa, self.exposure_s)
         return replace(frame, gain=self.gain, host_time_s=self._clock.now_s())
 
     def close(self) -> None:
-        """Do nothing: there is nothing to let go of."""
+        """Refuse further frames; closing twice is allowed."""
+        self._closed = True

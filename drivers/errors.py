@@ -246,6 +246,10 @@ class CameraSettingError(DriverError):
 class U3vFormatError(DriverError):
     """Bytes from a USB3 Vision camera that are not the packet that must come now."""
 
+
+class PtpFormatError(DriverError):
+    """Bytes from a camera that are no PTP message, or not the one that must come now."""
+
     def __init__(self, raw: bytes, reason: str) -> None:
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
         super().__init__(
@@ -295,3 +299,80 @@ class FrameLostError(DriverError):
         super().__init__(f"frame lost, {reason}: {advice}")
         self.reason = reason
         self.advice = advice
+
+
+            f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw
+        self.reason = reason
+
+
+class PtpRefusedError(DriverError):
+    """The camera understood the request and said no; `code` is its answer."""
+
+    def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
+        super().__init__(f"the camera refused {operation} with {answer}: {advice}")
+        self.operation = operation
+        self.code = code
+        self.answer = answer
+
+
+class CameraBusyError(DriverError):
+    """The camera answered "busy" for too long."""
+
+    def __init__(self, operation: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
+            "has stored its pictures, check its battery and close its menus"
+        )
+        self.operation = operation
+        self.waited_s = waited_s
+
+
+class CardFullError(DriverError):
+    """There is no room for another picture."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"the card of {camera} is full or missing: empty or insert it")
+        self.camera = camera
+
+
+class CaptureError(DriverError):
+    """The camera was released but gave no usable picture."""
+
+    def __init__(self, reason: str, advice: str) -> None:
+        super().__init__(f"no picture, {reason}: {advice}")
+        self.reason = reason
+        self.advice = advice
+
+
+class DownloadError(DriverError):
+    """A picture is on the card but could not be fetched whole."""
+
+    def __init__(self, name: str, got: int, size: int, reason: str) -> None:
+        super().__init__(
+            f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
+            "the picture is still on the card"
+        )
+        self.name = name
+        self.got = got
+        self.size = size
+        self.reason = reason
+
+
+class FolderCameraError(DriverError):
+    """A folder of recorded frames has none to give."""
+
+    def __init__(self, folder: str, reason: str) -> None:
+        super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
+        self.folder = folder
+        self.reason = reason
+
+
+class CameraClosedError(DriverError):
+    """The camera was closed by this program."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"{camera} was closed: open it again")
+        self.camera = camera

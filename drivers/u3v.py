@@ -13,7 +13,6 @@ import logging
 import lzma
 import math
 import struct
-import threading
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -37,7 +36,7 @@ from drivers.errors import (
 )
 from drivers.genapi import Features
 from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
-from drivers.raw import RawFrame
+from drivers.raw import RawFrame, hashed
 from drivers.u3v_control import U3vControl
 from drivers.u3v_stream import U3vStream
 from drivers.usb import BULK, UsbDevice, UsbListing, list_devices, open_device
@@ -75,7 +74,6 @@ FRAME_GRACE_S = 2.0
 LOST_IN_A_ROW = 3
 IN_FLIGHT = 3
 """Frames that a camera may have begun before a new setting counts."""
-HASH_BESIDE_BYTES = 1 << 20
 
 
 def list_u3v(backend: Any = None) -> list[UsbListing]:
@@ -399,22 +397,6 @@ def decode_u3v(
             "offset_y": str(leader.offset_y),
         },
     )
-
-
-@contextmanager
-def hashed(data: bytes) -> Iterator[Any]:
-    """Yield the data's SHA-256, complete when the block ends; big data in a thread of its own."""
-    digest = hashlib.sha256()
-    if len(data) < HASH_BESIDE_BYTES:
-        digest.update(data)
-        yield digest
-        return
-    thread = threading.Thread(target=digest.update, args=(data,), name="sha256")
-    thread.start()
-    try:
-        yield digest
-    finally:
-        thread.join()
 
 
 def read_description(control: U3vControl) -> bytes:

@@ -25,8 +25,8 @@ from drivers.clock import Clock
 
 HIGH_SPEED, SUPER_SPEED = 3, 4
 ENGLISH = 0x0409
-GET_DESCRIPTOR, STRING = 6, 3
-IN = 0x80
+GET_STATUS, GET_DESCRIPTOR, STRING = 0, 6, 3
+IN, ENDPOINT_IN = 0x80, 0x82
 
 
 @dataclass(frozen=True)
@@ -356,11 +356,13 @@ class SimulatedUsb(usb.backend.IBackend):
         data: array.array[int],
         timeout: int,
     ) -> int:
-        """Answer a request for a string, or let the device answer."""
+        """Answer a request for a string or an endpoint's state, or let the device answer."""
         plug = _plug(dev_handle)
         with self._hook(plug, 0):
             if bmRequestType == IN and bRequest == GET_DESCRIPTOR:
                 answer = _string_descriptor(plug.function.spec, wValue)
+            elif bmRequestType == ENDPOINT_IN and bRequest == GET_STATUS:
+                answer = bytes((wIndex in plug.halted, 0))
             else:
                 answer = plug.function.control(
                     bmRequestType, bRequest, wValue, wIndex, data.tobytes()
