@@ -243,64 +243,12 @@ class CameraSettingError(DriverError):
         self.reason = reason
 
 
-class U3vFormatError(DriverError):
-    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
-
-
 class PtpFormatError(DriverError):
     """Bytes from a camera that are no PTP message, or not the one that must come now."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
         super().__init__(
-            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
-            "check the cable, then open the camera again"
-        )
-        self.raw = raw[:64]
-        self.reason = reason
-
-
-class U3vRefusedError(DriverError):
-    """The camera understood a command and said no; `status` is its answer."""
-
-    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
-        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
-        self.command = command
-        self.status = status
-
-
-class U3vBusyError(DriverError):
-    """The camera kept asking for more time for one command."""
-
-    def __init__(self, command: str, waited_s: float) -> None:
-        super().__init__(
-            f"the camera was still busy with {command} after {waited_s:.3g} s: "
-            "switch it off and on, then open it again"
-        )
-        self.command = command
-        self.waited_s = waited_s
-
-
-class CameraDescriptionError(DriverError):
-    """The camera's own description of its features (GenICam) cannot be used."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(
-            f"unusable camera description, {reason}: update the camera's firmware, "
-            "or use another camera"
-        )
-        self.reason = reason
-
-
-class FrameLostError(DriverError):
-    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
-
-    def __init__(self, reason: str, advice: str = "capture it again") -> None:
-        super().__init__(f"frame lost, {reason}: {advice}")
-        self.reason = reason
-        self.advice = advice
-
-
             f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
             "check the cable, then open the camera again"
         )
@@ -376,3 +324,57 @@ class CameraClosedError(DriverError):
     def __init__(self, camera: str) -> None:
         super().__init__(f"{camera} was closed: open it again")
         self.camera = camera
+
+
+class U3vFormatError(DriverError):
+    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
+
+    def __init__(self, raw: bytes, reason: str) -> None:
+        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
+        super().__init__(
+            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw[:64]
+        self.reason = reason
+
+
+class U3vRefusedError(DriverError):
+    """The camera understood a command and said no; `status` is its answer."""
+
+    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
+        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
+        self.command = command
+        self.status = status
+
+
+class U3vBusyError(DriverError):
+    """The camera kept asking for more time for one command."""
+
+    def __init__(self, command: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was still busy with {command} after {waited_s:.3g} s: "
+            "switch it off and on, then open it again"
+        )
+        self.command = command
+        self.waited_s = waited_s
+
+
+class CameraDescriptionError(DriverError):
+    """The camera's own description of its features (GenICam) cannot be used."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"unusable camera description, {reason}: update the camera's firmware, "
+            "or use another camera"
+        )
+        self.reason = reason
+
+
+class FrameLostError(DriverError):
+    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
+
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"frame lost, {reason}: {advice}")
+        self.reason = reason
+        self.advice = advice
