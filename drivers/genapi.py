@@ -365,7 +365,7 @@ class Features:
                 low = max(self._linked(node, "Min", inner[0]), inner[0])
                 high = min(self._linked(node, "Max", inner[1]), inner[1])
             elif node.kind in ("SwissKnife", "IntSwissKnife"):
-                low = high = self._number(node)
+                low, high = _OPEN["Integer" if node.kind == "IntSwissKnife" else "Float"]
             else:
                 raise CameraDescriptionError(f"{node.name} ({node.kind}) has no limits")
             return low, high
@@ -487,10 +487,11 @@ def _read_nodes(xml: bytes) -> dict[str, _Node]:
         for element in group:
             if _tag(element) == "Group":
                 groups.append(element)
-            elif element.get("Name"):
+            else:
                 node = _read_node(element)
-                nodes[node.name] = node
                 nodes.update(_struct_entries(node))
+                if node.name:
+                    nodes[node.name] = node
     return nodes
 
 

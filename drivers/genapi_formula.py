@@ -1,8 +1,10 @@
 """GenICam formulas: parsed by hand and evaluated with bounds, since a device wrote them.
 
-Nothing of the text is ever run as code. Source: EMVA GenICam Standard 2.1.1, "Formulas in
-SwissKnife and Converter": C's operators and order, with `**` for powers, `=` for equality and
-`<>` for inequality; integers have 64 bits and divide towards zero.
+Nothing of the text is ever run as code. Order and meaning of the operators are those of EMVA's
+reference implementation (GenApi 3.5, package `genicam`), which are not C's: comparisons, `&&`,
+`||` and `?:` are equal in rank, and so are `**`, shifts and the operators on bits, which bind
+most; equals go from left to right. `=` is equality, `<>` inequality; integers have 64 bits and
+divide towards zero.
 """
 
 from __future__ import annotations
@@ -24,28 +26,20 @@ DEPTH_LIMIT = 50
 
 _TOKEN = re.compile(
     r"\s*(?:(0[xX][0-9a-fA-F]+)|(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
-    r"|([A-Za-z_][\w.]*)|(\*\*|<<|>>|<=|>=|<>|!=|==|&&|\|\||[-+*/%&|^~<>=?:(),]))"
+    r"|([A-Za-z_][\w.]*)|(\*\*|<<|>>|<=|>=|<>|&&|\|\||[-+*/%&|^~<>=?:(),]))"
 )
 
 LEVELS = (
-    ("||",),
-    ("&&",),
-    ("|",),
-    ("^",),
-    ("&",),
-    ("=", "==", "<>", "!="),
-    ("<", ">", "<=", ">="),
-    ("<<", ">>"),
+    ("<", ">", "<=", ">=", "=", "<>", "&&", "||", "?"),
     ("+", "-"),
     ("*", "/", "%"),
+    ("**", "<<", ">>", "&", "|", "^"),
 )
-"""Binary operators, those that bind least first; `**`, which binds most, is to the right."""
+"""Binary operators, those that bind least first; equals go from left to right."""
 
 COMPARISONS: dict[str, Callable[[Number, Number], bool]] = {
     "=": operator.eq,
-    "==": operator.eq,
     "<>": operator.ne,
-    "!=": operator.ne,
     "<": operator.lt,
     ">": operator.gt,
     "<=": operator.le,
@@ -82,6 +76,12 @@ class _Scope:
     lookup: Lookup
     integers: bool
 
+    def number(self, value: Number) -> Number:
+        """Return the value as numbers are here: of 64 bits, or floating."""
+        if self.integers:
+            return _wrapped(value) if isinstance(value, int) else value
+        return float(value)
+
 
 class Formula:
     """A formula, ready to be evaluated; raises `FormulaError` for text that is none."""
@@ -112,15 +112,9 @@ class Formula:
         self._depth += 1
         if self._depth > DEPTH_LIMIT:
             raise FormulaError("the formula is nested deeper than allowed")
-        condition = self._binary(0)
-        if self._takes("?"):
-            yes = self._choice()
-            self._needs(":")
-            no = self._choice()
-            self._depth -= 1
-            return lambda scope: yes(scope) if condition(scope) else no(scope)
+        value = self._binary(0)
         self._depth -= 1
-        return condition
+        return value
 
     def _binary(self, level: int) -> Evaluate:
         if level == len(LEVELS):
@@ -128,22 +122,28 @@ class Formula:
         first = self._binary(level + 1)
         rest: list[tuple[Join, Evaluate]] = []
         while (symbol := self._takes(*LEVELS[level])) is not None:
-            rest.append((JOINS[symbol], self._binary(level + 1)))
+            join = JOINS[symbol] if symbol != "?" else self._branch()
+            rest.append((join, self._binary(level + 1)))
         if not rest:
             return first
 
         def chain(scope: _Scope) -> Number:
             value = first(scope)
             for join, operand in rest:
-                value = join(scope, value, operand)
+                value = scope.number(join(scope, value, operand))
             return value
 
         return chain
 
+    def _branch(self) -> Join:
+        yes = self._choice()
+        self._needs(":")
+        return lambda scope, left, right: yes(scope) if left else right(scope)
+
     def _signed(self) -> Evaluate:
         symbol = self._takes("-", "+", "~")
         if symbol is None:
-            return self._power()
+            return self._single()
         self._depth += 1
         if self._depth > DEPTH_LIMIT:
             raise FormulaError("the formula is nested deeper than allowed")
@@ -152,15 +152,8 @@ class Formula:
         if symbol == "-":
             return lambda scope: -operand(scope)
         if symbol == "~":
-            return lambda scope: ~_integer(operand(scope))
+            return lambda scope: scope.number(~_integer(operand(scope)))
         return operand
-
-    def _power(self) -> Evaluate:
-        base = self._single()
-        if self._takes("**") is None:
-            return base
-        exponent = self._signed()
-        return lambda scope: _power(base(scope), exponent(scope), scope.integers)
 
     def _single(self) -> Evaluate:
         if self._takes("("):
@@ -178,14 +171,13 @@ class Formula:
         if text in FUNCTIONS and self._takes("("):
             function, operand = FUNCTIONS[text], self._choice()
             self._needs(")")
-            return lambda scope: function(operand(scope))
+            return lambda scope: scope.number(function(operand(scope)))
         if text in CONSTANTS:
             constant = CONSTANTS[text]
             return lambda scope: constant
 
         def variable(scope: _Scope) -> Number:
-            value = scope.lookup(text)
-            return value if scope.integers else float(value)
+            return scope.number(scope.lookup(text))
 
         return variable
 
@@ -227,15 +219,11 @@ def _literal(text: str) -> Evaluate:
         value = int(text)
     else:
         value = float(text)
-    return lambda scope: value if scope.integers else float(value)
+    return lambda scope: scope.number(value)
 
 
 def _computing(compute: Callable[[Number, Number], Number]) -> Join:
-    def run(scope: _Scope, left: Number, right: Evaluate) -> Number:
-        result = compute(left, right(scope))
-        return _wrapped(result) if scope.integers and isinstance(result, int) else result
-
-    return run
+    return lambda scope, left, right: compute(left, right(scope))
 
 
 def _comparing(compare: Callable[[Number, Number], bool]) -> Join:
@@ -265,7 +253,7 @@ def _shifted(a: Number, b: Number, by: Callable[[int, int], int]) -> int:
 def _power(base: Number, exponent: Number, integers: bool) -> Number:
     if integers and isinstance(base, int) and isinstance(exponent, int) and exponent >= 0:
         # Reduced on the way: the whole power could have more digits than memory.
-        return _wrapped(pow(base, exponent, 1 << 64))
+        return pow(base, exponent, 1 << 64)
     return math.pow(base, exponent)
 
 
@@ -293,6 +281,7 @@ ARITHMETIC: dict[str, Callable[[Number, Number], Number]] = {
 JOINS: dict[str, Join] = {
     "&&": lambda scope, left, right: int(bool(left) and bool(right(scope))),
     "||": lambda scope, left, right: int(bool(left) or bool(right(scope))),
+    "**": lambda scope, left, right: _power(left, right(scope), scope.integers),
     **{symbol: _comparing(compare) for symbol, compare in COMPARISONS.items()},
     **{symbol: _computing(compute) for symbol, compute in ARITHMETIC.items()},
 }

@@ -171,6 +171,7 @@ class U3vCameraSimulator(UsbFunction):
         self._update_sizes()
         self._answers: deque[tuple[float, bytes]] = deque()
         self._busy_request: int | None = None
+        self._longest = False
         self._messages: deque[bytes | memoryview] = deque()
         self._acquisition: _Acquisition | None = None
         self._halted = False
@@ -206,8 +207,11 @@ class U3vCameraSimulator(UsbFunction):
         return message
 
     def ends_with_empty_packet(self, endpoint: int) -> bool:
-        """Whether a full last packet is followed by an empty one: frames fill what was agreed."""
-        return endpoint == ANSWER_IN
+        """Whether a full last packet is followed by an empty one.
+
+        Not where the host knows the length: frames and the longest answers fill what was agreed.
+        """
+        return endpoint == ANSWER_IN and not self._longest
 
     def control(
         self, request_type: int, request: int, value: int, index: int, data: bytes
@@ -234,6 +238,7 @@ class U3vCameraSimulator(UsbFunction):
         if not self._answers or self._answers[0][0] > now_s + timeout_s:
             return None
         ready_s, answer = self._answers.popleft()
+        self._longest = len(answer) == ANSWER_SIZE
         self._clock.sleep(max(0.0, ready_s - now_s))
         return answer
 

@@ -45,6 +45,8 @@ def describe(
         _knife("OffsetYLimit", "ALL - USED", {"ALL": "HeightMax", "USED": "HeightReg"}),
         _register("WidthMax", WIDTH_MAX, "RO"),
         _register("HeightMax", HEIGHT_MAX, "RO"),
+        _register("SensorWidth", WIDTH_MAX, "RO"),
+        _register("SensorHeight", HEIGHT_MAX, "RO"),
         _register("PayloadSize", PAYLOAD, "RO"),
         f'<Enumeration Name="PixelFormat"><pIsLocked>TLParamsLocked</pIsLocked>{entries}'
         "<pValue>PixelFormatReg</pValue></Enumeration>",
@@ -92,15 +94,18 @@ def describe(
         '<Integer Name="TLParamsLocked"><Visibility>Invisible</Visibility>'
         "<pValue>TLParamsLockedReg</pValue><Min>0</Min><Max>1</Max></Integer>",
         _register("TLParamsLockedReg", LOCKED),
-        f'<StringReg Name="SensorName"><Address>{BASE + SENSOR:#x}</Address><Length>32</Length>'
-        "<AccessMode>RO</AccessMode><pPort>Device</pPort></StringReg>",
+        _text("SensorName", BASE + SENSOR, 32),
+        _text("DeviceVendorName", 0x0004, 64),
+        _text("DeviceModelName", 0x0044, 64),
+        _text("DeviceSerialNumber", 0x0144, 64),
         '<Port Name="Device"/>',
     )
     features = (
-        "Width Height OffsetX OffsetY WidthMax HeightMax PixelFormat PayloadSize AcquisitionMode "
+        "Width Height OffsetX OffsetY WidthMax HeightMax SensorWidth SensorHeight PixelFormat "
+        "PayloadSize AcquisitionMode "
         "AcquisitionStart AcquisitionStop TriggerSelector TriggerMode TriggerSource "
         "TriggerSoftware ExposureAuto ExposureTime GainAuto Gain BlackLevel AcquisitionFrameRate "
-        "TLParamsLocked SensorName"
+        "TLParamsLocked SensorName DeviceVendorName DeviceModelName DeviceSerialNumber"
     )
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in features.split())
     xml = (
@@ -123,6 +128,13 @@ def _register(name: str, offset: int, access: str = "RW", extra: str = "") -> st
         f'<IntReg Name="{name}"><Address>{BASE + offset:#x}</Address><Length>4</Length>'
         f"<AccessMode>{access}</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>"
         f"{extra}<Endianess>LittleEndian</Endianess></IntReg>"
+    )
+
+
+def _text(name: str, address: int, length: int) -> str:
+    return (
+        f'<StringReg Name="{name}"><Address>{address:#x}</Address><Length>{length}</Length>'
+        "<AccessMode>RO</AccessMode><pPort>Device</pPort></StringReg>"
     )
 
 
