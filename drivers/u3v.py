@@ -15,7 +15,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -186,7 +186,7 @@ class U3vCamera:
         with self._acquisition("SingleFrame"):
             return self._decode(self._receive())
 
-    def stream(self) -> Iterator[RawFrame]:
+    def stream(self) -> Generator[RawFrame, None, None]:
         """Yield frames as they come; closing the generator stops the acquisition.
 
         `metadata["frames_lost"]` counts the frames missing right before this one, by the camera's
@@ -223,7 +223,9 @@ class U3vCamera:
             self._start(mode)
             yield
         except GeneratorExit:
-            self._stop()
+            # A camera that was closed meanwhile has been stopped by that.
+            if self._acquiring:
+                self._stop()
             raise
         except BaseException:
             # The first fault is the one to tell; a camera that is gone cannot be stopped.

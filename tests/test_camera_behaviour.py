@@ -11,11 +11,13 @@ from drivers.errors import CameraSettingError, DriverError
 from drivers.folder import FolderCamera
 from drivers.ptp import PtpCamera, PtpSession
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.u3v import open_u3v
 from drivers.usb import open_device
 from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
 from simulators.dng import encode_dng
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 
 SHAPE, CFA = (40, 48), "grbg"
@@ -44,7 +46,18 @@ def folder_camera(folder):
     return FolderCamera(folder, ManualClock())
 
 
-CAMERAS = {"raw file": raw_file_camera, "ptp": ptp_camera, "folder": folder_camera}
+def u3v_camera(folder):
+    clock = ManualClock()
+    bus = SimulatedUsb(clock, U3vCameraSimulator(see, clock, SHAPE, CFA))
+    return open_u3v(backend=bus, clock=clock)
+
+
+CAMERAS = {
+    "raw file": raw_file_camera,
+    "ptp": ptp_camera,
+    "folder": folder_camera,
+    "u3v": u3v_camera,
+}
 """A new camera joins by a line here; it must see `MOSAIC` with black at 64 and white at 4095."""
 
 
