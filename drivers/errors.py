@@ -145,3 +145,236 @@ class RawFrameError(DriverError):
     def __init__(self, reason: str) -> None:
         super().__init__(f"unusable RAW frame, {reason}: capture it again")
         self.reason = reason
+
+
+class UsbUnavailableError(DriverError):
+    """USB cannot be used on this computer at all."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"USB cannot be used here ({reason}): reinstall libusb-package, and in a container "
+            "pass /dev/bus/usb through"
+        )
+        self.reason = reason
+
+
+class UsbNotFoundError(DriverError):
+    """No device that matches is plugged in; `present` names those that are."""
+
+    def __init__(self, wanted: str, present: tuple[str, ...] = ()) -> None:
+        seen = ", ".join(present) if present else "no device of that kind"
+        super().__init__(
+            f"no {wanted} on USB ({seen} found): check cable, power and the device's USB mode"
+        )
+        self.wanted = wanted
+        self.present = present
+
+
+class UsbPermissionError(DriverError):
+    """The device is there but this user may not open it."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(
+            f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
+            "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
+        )
+        self.device = device
+
+
+class UsbClaimedError(DriverError):
+    """Another program holds the device; `holders` are its name and process id, where known."""
+
+    def __init__(self, device: str, holders: tuple[str, ...], advice: str) -> None:
+        by = ", ".join(holders) if holders else "another program"
+        super().__init__(f"{device} is claimed by {by}: {advice}")
+        self.device = device
+        self.holders = holders
+        self.advice = advice
+
+
+class UsbGoneError(DriverError):
+    """The device was unplugged, or lost its power, while it was open."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(f"{device} went away: plug it in, switch it on and open it again")
+        self.device = device
+
+
+class UsbStalledError(DriverError):
+    """The device halted an endpoint: it did not accept what it was sent."""
+
+    def __init__(self, device: str, endpoint: int) -> None:
+        super().__init__(
+            f"{device} stalled endpoint {endpoint:#04x}: clear the halt and try again, "
+            "or switch the device off and on"
+        )
+        self.device = device
+        self.endpoint = endpoint
+
+
+class UsbTimeoutError(DriverError):
+    """A transfer did not finish in time; `done` is how many bytes of it passed."""
+
+    def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
+        got = f"stopped after {done} bytes" if done else "was silent"
+        super().__init__(
+            f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
+        )
+        self.device = device
+        self.timeout_s = timeout_s
+        self.done = done
+
+
+class UsbTransferError(DriverError):
+    """The transfer failed in any other way; `reason` is what libusb says."""
+
+    def __init__(self, device: str, reason: str, advice: str) -> None:
+        super().__init__(f"{device}: transfer failed ({reason}): {advice}")
+        self.device = device
+        self.reason = reason
+
+
+class CameraSettingError(DriverError):
+    """The camera cannot be set to that; nothing was sent to it."""
+
+    def __init__(self, setting: str, reason: str) -> None:
+        super().__init__(f"the camera's {setting} {reason}")
+        self.setting = setting
+        self.reason = reason
+
+
+class PtpFormatError(DriverError):
+    """Bytes from a camera that are no PTP message, or not the one that must come now."""
+
+    def __init__(self, raw: bytes, reason: str) -> None:
+        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
+        super().__init__(
+            f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw
+        self.reason = reason
+
+
+class PtpRefusedError(DriverError):
+    """The camera understood the request and said no; `code` is its answer."""
+
+    def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
+        super().__init__(f"the camera refused {operation} with {answer}: {advice}")
+        self.operation = operation
+        self.code = code
+        self.answer = answer
+
+
+class CameraBusyError(DriverError):
+    """The camera answered "busy" for too long."""
+
+    def __init__(self, operation: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
+            "has stored its pictures, check its battery and close its menus"
+        )
+        self.operation = operation
+        self.waited_s = waited_s
+
+
+class CardFullError(DriverError):
+    """There is no room for another picture."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"the card of {camera} is full or missing: empty or insert it")
+        self.camera = camera
+
+
+class CaptureError(DriverError):
+    """The camera was released but gave no usable picture."""
+
+    def __init__(self, reason: str, advice: str) -> None:
+        super().__init__(f"no picture, {reason}: {advice}")
+        self.reason = reason
+        self.advice = advice
+
+
+class DownloadError(DriverError):
+    """A picture is on the card but could not be fetched whole."""
+
+    def __init__(self, name: str, got: int, size: int, reason: str) -> None:
+        super().__init__(
+            f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
+            "the picture is still on the card"
+        )
+        self.name = name
+        self.got = got
+        self.size = size
+        self.reason = reason
+
+
+class FolderCameraError(DriverError):
+    """A folder of recorded frames has none to give."""
+
+    def __init__(self, folder: str, reason: str) -> None:
+        super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
+        self.folder = folder
+        self.reason = reason
+
+
+class CameraClosedError(DriverError):
+    """The camera was closed by this program."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"{camera} was closed: open it again")
+        self.camera = camera
+
+
+class U3vFormatError(DriverError):
+    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
+
+    def __init__(self, raw: bytes, reason: str) -> None:
+        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
+        super().__init__(
+            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw[:64]
+        self.reason = reason
+
+
+class U3vRefusedError(DriverError):
+    """The camera understood a command and said no; `status` is its answer."""
+
+    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
+        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
+        self.command = command
+        self.status = status
+
+
+class U3vBusyError(DriverError):
+    """The camera kept asking for more time for one command."""
+
+    def __init__(self, command: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was still busy with {command} after {waited_s:.3g} s: "
+            "switch it off and on, then open it again"
+        )
+        self.command = command
+        self.waited_s = waited_s
+
+
+class CameraDescriptionError(DriverError):
+    """The camera's own description of its features (GenICam) cannot be used."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"unusable camera description, {reason}: update the camera's firmware, "
+            "or use another camera"
+        )
+        self.reason = reason
+
+
+class FrameLostError(DriverError):
+    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
+
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"frame lost, {reason}: {advice}")
+        self.reason = reason
+        self.advice = advice

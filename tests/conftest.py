@@ -1,4 +1,4 @@
-"""What all tests share: which optional checks this machine can run."""
+"""What all tests share: options, and which optional checks this machine can run."""
 
 import os
 from pathlib import Path
@@ -10,14 +10,21 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption("--fuzz-cases", type=int, default=2000, help="random cases of each fuzz test")
+    parser.addoption("--camera", default="", help="camera of the tests marked hardware: ptp:SERIAL")
+
+
+def pytest_collection_modifyitems(config, items):
     folder = os.environ.get("EMMC_LIGHTFIELDS")
-    if folder and Path(folder).is_dir():
-        return
-    reason = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
+    lightfields = bool(folder) and Path(folder).is_dir()
+    camera = bool(config.getoption("--camera"))
     for item in items:
-        if "real_data" in item.keywords:
+        if "real_data" in item.keywords and not lightfields:
+            reason = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
             item.add_marker(pytest.mark.skip(reason=reason))
+        if "hardware" in item.keywords and "camera_kind" in item.fixturenames and not camera:
+            item.add_marker(pytest.mark.skip(reason="--camera names no camera"))
 
 
 @pytest.fixture(scope="session")
