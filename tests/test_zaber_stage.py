@@ -449,10 +449,17 @@ def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch
 def test_bytes_of_an_incomplete_answer_wait_for_the_rest():
     class Halves:
         unplugged = False
+        plugs = 1
         answers = iter([b"@01 1 10 OK", b" IDLE -- 0\r\n"])
 
         def feed(self, data):
             return next(self.answers)
+
+        def due(self):
+            return b""
+
+        def next_due_s(self):
+            return None
 
     transport = MemoryTransport(Halves(), ManualClock())
     transport.write(b"/\n")
