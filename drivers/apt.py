@@ -338,7 +338,8 @@ class _Channel:
         try:
             self.link.send(codec.encode(message_id, self._destination, param1, param2, data))
         except DriverError as error:
-            raise error.about(axis=self.name, command=message_id.name)
+            error.about(axis=self.name, command=message_id.name)
+            raise
 
     def query(self, question: Id, answer: Id, with_channel: bool = True) -> Message:
         """Send a question and return its answer; an error carries the command and the axis."""
@@ -346,7 +347,8 @@ class _Channel:
         try:
             return self.link.query(raw, answer, self, with_channel)
         except DriverError as error:
-            raise error.about(axis=self.name, command=question.name)
+            error.about(axis=self.name, command=question.name)
+            raise
 
     def settle(self) -> None:
         """Take everything off the wire until nothing comes."""

@@ -234,7 +234,8 @@ class _Controller:
                 self.raise_alarm()
                 self._raise_restart()
                 if attempt == QUERY_ATTEMPTS:
-                    raise error.about(command="?")
+                    error.about(command="?")
+                    raise
                 _log.warning("attempt %d of '?' failed: %s", attempt, error)
         raise AssertionError("unreachable")
 
@@ -280,7 +281,8 @@ class _Controller:
         except (TransportTimeoutError, GarbledReplyError) as error:
             self._drain()
             self.raise_alarm()
-            raise error.about(axis=axis, command=line)
+            error.about(axis=axis, command=line)
+            raise
 
     def start_homing(self, lines: list[str]) -> None:
         """Send the homing commands; each is answered when it is done."""

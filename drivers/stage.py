@@ -550,6 +550,6 @@ class HostStage(ABC):
             for axis in axes:
                 try:
                     self._stop_axis(axis)
-                except BaseException as stop_error:  # noqa: BLE001
+                except BaseException as stop_error:
                     error.add_note(f"{axis} could not be stopped: {stop_error}")
             raise

@@ -197,7 +197,7 @@ class SerialTransport:
         with self._lock:
             self._serial.close()
 
-    def _open(self, device: str) -> serial.SerialBase:
+    def _open(self, device: str) -> serial.Serial:
         try:
             opened = serial.serial_for_url(
                 device,
@@ -243,7 +243,7 @@ def _port_error(wanted: str, device: str, error: Exception) -> DriverError:
     return PortBusyError(wanted, text, holder_of(device))
 
 
-def _cycle_rts(opened: serial.SerialBase) -> None:
+def _cycle_rts(opened: serial.Serial) -> None:
     """Drop and raise RTS, which wakes an FTDI adapter that was left in the middle of a message.
 
     A pseudo-terminal has no such line and says so.

@@ -236,7 +236,8 @@ class _Chain:
         try:
             message = self._exchange(device, number, data, name)
         except DriverError as error:
-            raise error.about(axis=name, command=data or "(status)")
+            error.about(axis=name, command=data or "(status)")
+            raise
         if not message.accepted:
             advice = REFUSAL_ADVICE.get(message.data, "see the protocol manual")
             raise CommandRefusedError(data, message.data, name, advice)
@@ -300,15 +301,16 @@ def find_devices(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> list[Zabe
         except CommandRefusedError:
             return ""
 
-    return [
-        ZaberDevice(
-            address=address,
-            axis_count=int(count)
-            if (count := setting(address, "system.axiscount")).isdigit()
-            else 1,
-            device_id=setting(address, "device.id"),
-            serial_number=setting(address, "system.serial"),
-            firmware=setting(address, "version"),
+    found = []
+    for address in addresses:
+        count = setting(address, "system.axiscount")
+        found.append(
+            ZaberDevice(
+                address=address,
+                axis_count=int(count) if count.isdecimal() else 1,
+                device_id=setting(address, "device.id"),
+                serial_number=setting(address, "system.serial"),
+                firmware=setting(address, "version"),
+            )
         )
-        for address in addresses
-    ]
+    return found
