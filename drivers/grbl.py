@@ -28,6 +28,7 @@ BOOT_S = 4.0
 """Opening the port resets an Arduino, which answers after its boot loader."""
 REPORTS_UNTIL_OFFSET = 40
 """Grbl tells the work offset in every 30th report at the latest ("Interface", WCO)."""
+POLL_S = 0.05
 AXIS_LETTERS = "XYZABC"
 REPORT_STEP_UM = 1.0
 """Reports have three decimals of a millimetre."""
@@ -202,8 +203,7 @@ class _Controller:
         self._alarm: codec.Alarm | None = None
         self._restarted = False
         self._homing_lines: list[str] = []
-        self._refusal: codec.Refusal | None = None
-        self._unasked_state = ""
+        self._rests = False
         self._offset_mm: tuple[float, ...] | None = None
 
     @property
@@ -288,35 +288,42 @@ class _Controller:
         """Send the homing commands; each is answered when it is done."""
         with self._transport.lock:
             self._take_waiting()
-            self._refusal, self._unasked_state = None, ""
+            self._rests = False
             self._homing_lines = list(lines)
             for line in lines:
                 self._transport.write(codec.encode_line(line))
 
     def is_homing(self) -> bool:
-        """Return whether homing goes on: it ends with an `ok` for every line sent.
+        """Wait for the next line, and return whether homing goes on.
 
-        Grbl reports no state while it homes. A report of rest although the `ok` did not come
-        means that homing never began, or that nobody knows how it ended.
+        It ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
+        of rest that no `ok` follows means that homing never began, or that nobody knows how it
+        ended.
         """
+        if not self._homing_lines:
+            return False
+        line = self._homing_lines[0]
         with self._transport.lock:
-            state, self._unasked_state = self._unasked_state, ""
-            self._take_waiting()
-            if not self._homing_lines:
-                return False
-            line = self._homing_lines[0]
-            if self._refusal is not None:
+            try:
+                message = self._read_message()
+            except TransportTimeoutError:
+                if self._rests:
+                    self._homing_lines.clear()
+                    raise LostPositionError(ALL_AXES, "homing ended without an answer").about(
+                        command=line
+                    ) from None
+                self._transport.write(codec.STATUS_QUERY)
+                return True
+            except GarbledReplyError as error:
+                _log.warning("dropped: %s", error)
+                return True
+            if isinstance(message, codec.Refusal):
                 self._homing_lines.clear()
-                raise _refused(line, self._refusal, ALL_AXES)
+                raise _refused(line, message, ALL_AXES)
+            self._note(message)
             self.raise_alarm()
             self._raise_restart()
-            if state in ("Idle", "Alarm"):
-                self._homing_lines.clear()
-                raise LostPositionError(ALL_AXES, "homing ended without an answer").about(
-                    command=line, reply=state
-                )
-            self._transport.write(codec.STATUS_QUERY)
-        return True
+        return bool(self._homing_lines)
 
     def abandon_homing(self) -> None:
         """Reset a controller that homes, which stops it wherever it is."""
@@ -365,12 +372,14 @@ class _Controller:
             raise LostPositionError(ALL_AXES, "the controller restarted")
 
     def _wait_for_status(self, boot_s: float) -> None:
+        """Return when it answers and stands; one that moves on is left to be found out later."""
         deadline_s = self._clock.now_s() + boot_s
         while True:
             try:
                 self._alarm, self._restarted = None, False
-                self.status()
-                return
+                if self.status().state in ("Idle", "Alarm") or self._clock.now_s() >= deadline_s:
+                    return
+                self._clock.sleep(POLL_S)
             except AxisFaultError as fault:
                 _log.debug("while starting: %s", fault)
             except (TransportTimeoutError, GarbledReplyError):
@@ -421,10 +430,8 @@ class _Controller:
         """Remember what an unasked message says about homing."""
         if isinstance(message, codec.Ok) and self._homing_lines:
             self._homing_lines.pop(0)
-        elif isinstance(message, codec.Refusal):
-            self._refusal = message
         elif isinstance(message, codec.Status):
-            self._unasked_state = message.state
+            self._rests = message.state in ("Idle", "Alarm")
 
     def _read_message(self) -> codec.Message | None:
         """Read one line, and take note of an alarm, a restart or a setting."""

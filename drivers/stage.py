@@ -266,13 +266,15 @@ class HostStage(ABC):
     def reconnect(self, wait_s: float = 10.0) -> None:
         """Open the ports again after an unplug, wherever they are now; nothing moves.
 
-        Waits up to `wait_s` for each port, restores the settings, and marks every position as
-        unknown: an axis must be homed before its next move. Raises a `PortError` when a port
-        stays away, and what talking to the device raises.
+        Waits up to `wait_s` for each port, stops what still moves, restores the settings, and
+        marks every position as unknown: an axis must be homed before its next move. Raises a
+        `PortError` when a port stays away, and what talking to the device raises.
         """
         self._distrust(self._axes, "the connection was lost")
         for transport in self._transports:
             self._reopen(transport, self._clock.now_s() + wait_s)
+        for axis in self._axes:
+            self._stop_axis(axis)
         self._start_up()
 
     def is_homed(self, axis: str) -> bool:
@@ -349,10 +351,11 @@ class HostStage(ABC):
         for axis, target_um in targets_um.items():
             check_within_limits(axis, target_um, self.limits_um(axis))
         start_um = {axis: self.position_um(axis) for axis in self._choose(targets_um)}
+        approach_um = self._settings.approach_um
         waypoints_um = {
-            axis: target_um - self._settings.approach_um
+            axis: target_um - approach_um
             for axis, target_um in targets_um.items()
-            if needs_approach(start_um[axis], target_um, self._settings.approach_um)
+            if approach_um and needs_approach(start_um[axis], target_um, approach_um)
         }
         with self._stopped_on_error(targets_um):
             reached_um = start_um | self._travel(start_um, waypoints_um)
@@ -437,7 +440,9 @@ class HostStage(ABC):
                 return again
             _log.warning("%s: read %s, then %s", axis, reading, again)
             reading, before_s = again, self._clock.now_s()
-        raise GarbledReplyError(b"", f"{axis} never reads the same twice").about(axis=axis)
+        raise GarbledReplyError(b"", f"{axis} never reads the same twice").about(
+            axis=axis, command="position"
+        )
 
     def _full_travel_time_s(self, axis: str) -> float:
         low_um, high_um = self._travel_um(axis)

@@ -120,6 +120,7 @@ class SerialTransport:
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError` or `TransportTimeoutError`."""
         with self._lock:
+            self._require_open()
             try:
                 self._serial.write(data)
             except serial.SerialTimeoutException as error:
@@ -152,6 +153,7 @@ class SerialTransport:
     def waiting(self) -> int:
         """Return how many bytes can be read at once; raises `PortGoneError`."""
         with self._lock:
+            self._require_open()
             try:
                 arrived = self._serial.in_waiting
                 if arrived:
@@ -164,6 +166,7 @@ class SerialTransport:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
         with self._lock:
             self._unread.clear()
+            self._require_open()
             try:
                 self._serial.reset_input_buffer()
             except _PORT_FAILURES as error:
@@ -195,7 +198,11 @@ class SerialTransport:
     def close(self) -> None:
         """Let go of the port; closing twice is allowed."""
         with self._lock:
+            # pyserial forgets to close a socket that the other side has closed already.
+            opened = getattr(self._serial, "_socket", None)
             self._serial.close()
+            if opened is not None:
+                opened.close()
 
     def _open(self, device: str) -> serial.Serial:
         try:
@@ -217,6 +224,7 @@ class SerialTransport:
 
     def _receive(self, deadline_s: float) -> None:
         """Read what there is, or wait for a byte; raises when the deadline has passed."""
+        self._require_open()
         if time.monotonic() > deadline_s:
             raise TransportTimeoutError(self.port, self.timeout_s, bytes(self._unread))
         try:
@@ -228,6 +236,11 @@ class SerialTransport:
         message = bytes(self._unread[:count])
         del self._unread[:count]
         return message
+
+    def _require_open(self) -> None:
+        """Raise `PortGoneError` for a port that was closed; pyserial would trip over itself."""
+        if not self._serial.is_open:
+            raise PortGoneError(self.port)
 
 
 def _port_error(wanted: str, device: str, error: Exception) -> DriverError:

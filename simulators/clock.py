@@ -25,12 +25,16 @@ class ManualClock:
 
 
 class JumpingClock(ManualClock):
-    """As `ManualClock`, but real time passes too: for wires on which bytes really travel."""
+    """As `ManualClock`, but real time passes too: for wires on which bytes really travel.
 
-    def __init__(self) -> None:
+    `pace` seconds pass in a real one.
+    """
+
+    def __init__(self, pace: float = 1.0) -> None:
         super().__init__()
+        self.pace = pace
         self._made_s = time.monotonic()
 
     def now_s(self) -> float:
         """Return the time in seconds since the clock was made."""
-        return super().now_s() + time.monotonic() - self._made_s
+        return super().now_s() + self.pace * (time.monotonic() - self._made_s)

@@ -35,7 +35,7 @@ class SimulatedController(ABC):
 
     Faults, armed with `faults.inject`: `drop_command` and `drop_reply` lose one message,
     `lose_command_byte` and `lose_reply_byte` the byte in its middle, `garble_reply` flips a bit
-    there, `late_reply` holds it back for `late_by_s`, `duplicate_reply` sends it twice, `unplug`
+    there (another one each time), `late_reply` holds it back for `late_by_s`, `duplicate_reply` sends it twice, `unplug`
     pulls the cable at the next byte from the host. `stall` blocks the next move half way, `drift`
     shifts the axis by `drift_um` unnoticed at the end of the next move, after `busy_forever` an
     axis says for ever that it moves.
@@ -52,6 +52,7 @@ class SimulatedController(ABC):
         self._command = b""
         self._outbox: list[tuple[float, int, bytes]] = []
         self._sent = 0
+        self._garbled = 0
 
     @abstractmethod
     def power_cycle(self) -> None:
@@ -139,8 +140,10 @@ class SimulatedController(ABC):
         if self.faults.strikes("lose_reply_byte", occasion):
             message = _without_middle(message)
         if self.faults.strikes("garble_reply", occasion):
+            self._garbled += 1
+            bit = 1 << self._garbled % 7
             middle = len(message) // 2
-            message = message[:middle] + bytes([message[middle] ^ 1]) + message[middle + 1 :]
+            message = message[:middle] + bytes([message[middle] ^ bit]) + message[middle + 1 :]
         due_s = self._clock.now_s()
         if self.faults.strikes("late_reply", occasion):
             due_s += self.late_by_s

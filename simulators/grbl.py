@@ -32,7 +32,8 @@ OVERRIDES_EVERY = {True: 20, False: 10}
 """Reports between two with WCO and Ov, while moving and while not (config.h)."""
 PULL_OFF_MM = 1.0
 LOCATE_MM_MIN = 25.0
-SILENT_WORDS = set("G4 G17 G40 G49 G54 G61 G80 G94 M0 M2 M5 M9 M30".split())
+SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 5, 9, 30)}
+"""Words that are accepted and change nothing here."""
 
 _WORD = re.compile(r"([A-Z])(-?\d+\.?\d*|-?\.\d+)")
 _SETTING_LINE = re.compile(r"\$(\d{1,3})=(-?\d+\.?\d*)")
@@ -453,8 +454,8 @@ class GrblController(SimulatedController):
                 modes.absolute = word == "G90"
             elif word == "G53":
                 machine = True
-            elif letter in "GM":
-                if word not in SILENT_WORDS:
+            elif letter in SILENT_WORDS:
+                if value not in SILENT_WORDS[letter]:
                     raise _RefusedError(20)
             elif letter not in "FSTNP" and letter not in self.axes:
                 raise _RefusedError(20)

@@ -171,6 +171,11 @@ class _Server(ABC):
         self._wake_read, self._wake_write = os.pipe()
         self._opened = False
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the port can be opened now."""
+        return self._opened
+
     @abstractmethod
     def _open(self) -> None:
         """Make the port exist and note its name."""
