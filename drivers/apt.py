@@ -368,6 +368,15 @@ class _Channel:
         )
 
 
+def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> codec.HardwareInfo:
+    """Return what the APT controller on a port says of itself; moves nothing.
+
+    Raises `TransportTimeoutError` or `GarbledReplyError` when none is there.
+    """
+    channel = _Channel("the controller", AptAxis(transport), {transport: _Link(transport, clock)})
+    return codec.decode_info(channel.query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False))
+
+
 def _fault(axis: str, status: codec.MotorStatus) -> AxisFaultError | None:
     reply = f"status {status.bits:#010x}"
     for bit, (fault, meaning) in FAULTS_BY_BIT.items():

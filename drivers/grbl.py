@@ -346,10 +346,10 @@ class _Controller:
     def wait_for_boot(self, boot_s: float) -> None:
         """Return when the controller answers; one that stays silent is reset once."""
         try:
-            self._wait_for_status(boot_s)
+            self.wait_for_status(boot_s)
         except (TransportTimeoutError, GarbledReplyError):
             self._reset()
-            self._wait_for_status(boot_s)
+            self.wait_for_status(boot_s)
         self._alarm, self._restarted = None, False
 
     def raise_alarm(self) -> None:
@@ -371,7 +371,7 @@ class _Controller:
             self._homing_lines.clear()
             raise LostPositionError(ALL_AXES, "the controller restarted")
 
-    def _wait_for_status(self, boot_s: float) -> None:
+    def wait_for_status(self, boot_s: float) -> None:
         """Return when it answers and stands; one that moves on is left to be found out later."""
         deadline_s = self._clock.now_s() + boot_s
         while True:
@@ -447,6 +447,17 @@ class _Controller:
         elif message is not None and not isinstance(message, codec.Ok | codec.Status):
             _log.debug("%r", message)
         return message
+
+
+def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK, boot_s: float = BOOT_S) -> str:
+    """Return version and options of the Grbl on a port; moves nothing, and resets nothing.
+
+    Raises `TransportTimeoutError` or `GarbledReplyError` when no Grbl is there.
+    """
+    controller = _Controller(transport, clock, _log.info)
+    controller.wait_for_status(boot_s)
+    told = controller.command("$I")
+    return f"version {told.get('VER', 'unknown')}, options {told.get('OPT', 'unknown')}"
 
 
 def _refused(line: str, refusal: codec.Refusal, axis: str) -> CommandRefusedError:

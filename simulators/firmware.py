@@ -35,10 +35,11 @@ class SimulatedController(ABC):
 
     Faults, armed with `faults.inject`: `drop_command` and `drop_reply` lose one message,
     `lose_command_byte` and `lose_reply_byte` the byte in its middle, `garble_reply` flips a bit
-    there (another one each time), `late_reply` holds it back for `late_by_s`, `duplicate_reply` sends it twice, `unplug`
-    pulls the cable at the next byte from the host. `stall` blocks the next move half way, `drift`
-    shifts the axis by `drift_um` unnoticed at the end of the next move, after `busy_forever` an
-    axis says for ever that it moves.
+    there (another one each time), `late_reply` holds it back for `late_by_s`, `duplicate_reply`
+    sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
+    next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
+    move, after `busy_forever` an axis says for ever that it moves. `fed` counts how often the host
+    wrote.
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
@@ -53,6 +54,7 @@ class SimulatedController(ABC):
         self._outbox: list[tuple[float, int, bytes]] = []
         self._sent = 0
         self._garbled = 0
+        self.fed = 0
 
     @abstractmethod
     def power_cycle(self) -> None:
@@ -106,6 +108,7 @@ class SimulatedController(ABC):
                 return b""
             if self.faults.strikes("lose_command_byte", Occasion(data)):
                 data = _without_middle(data)
+            self.fed += 1
             self._advance()
             self._receive(data)
             return self._due()

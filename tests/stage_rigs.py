@@ -1,8 +1,10 @@
 """Stages for tests: each protocol's simulated firmware on each kind of wire, or a real one."""
 
 import time
+from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any, ClassVar
 
 from drivers import grbl_codec as codec
 from drivers.apt import AptAxis, AptStage
@@ -27,11 +29,24 @@ QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
 """mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
 
 
-class Rig:
+class Rig(ABC):
     """One stage: simulated firmware, the wire to it, and where its axes really are."""
 
+    axes: tuple[str, ...]
     senses_stalls = True
     hardware = False
+
+    @abstractmethod
+    def make_device(self) -> Any: ...
+
+    @abstractmethod
+    def make_from(self, settings): ...
+
+    @abstractmethod
+    def true_um(self, axis): ...
+
+    @abstractmethod
+    def is_move(self, occasion): ...
 
     def __init__(self, wire: str, opened: ExitStack, tmp_path):
         self.wire = wire
@@ -41,8 +56,9 @@ class Rig:
         self.device = self.make_device()
         self.device.late_by_s = 1.5 * self.timeout_on_clock_s
         self.server = None
+        self.link = tmp_path / "stage"
         if wire == "pty":
-            self.server = opened.enter_context(PtyServer(self.device, link=tmp_path / "stage"))
+            self.server = opened.enter_context(PtyServer(self.device, self.link))
         elif wire == "tcp":
             self.server = opened.enter_context(TcpServer(self.device))
         self.transport = self.make_transport()
@@ -51,7 +67,7 @@ class Rig:
     def make_transport(self):
         if self.server is None:
             return self.device.transport(self.timeout_s)
-        port = f"{self.server._link}*" if self.wire == "pty" else self.server.port
+        port = f"{self.link}*" if self.wire == "pty" else self.server.port
         return SerialTransport(port, timeout_s=self.timeout_s, flow_control=False)
 
     def let_bytes_arrive(self):
@@ -68,18 +84,18 @@ class Rig:
 
     def make_stage(self, **settings):
         poll_s = DEFAULT_SETTINGS.poll_s if self.server is None else WIRE_POLL_S
-        return self._stage(replace(DEFAULT_SETTINGS, poll_s=poll_s, **settings))
+        return self.make_from(replace(DEFAULT_SETTINGS, poll_s=poll_s, **settings))
 
 
 class ZaberRig(Rig):
     axes = ("mask_x", "mask_y")
-    addresses = {"mask_x": (1, 1), "mask_y": (2, 1)}
+    addresses: ClassVar = {"mask_x": (1, 1), "mask_y": (2, 1)}
     spec = AxisSpec()
 
-    def make_device(self):
+    def make_device(self) -> Any:
         return ZaberChain(self.clock, dict.fromkeys(self.addresses.values(), self.spec))
 
-    def _stage(self, settings):
+    def make_from(self, settings):
         return ZaberStage(
             self.transport, self.addresses, self.spec.microstep_um, self.clock, settings
         )
@@ -96,13 +112,13 @@ class ZaberRig(Rig):
 
 class GrblRig(Rig):
     axes = ("mask_x", "mask_y")
-    letters = {"mask_x": "X", "mask_y": "Y"}
+    letters: ClassVar = {"mask_x": "X", "mask_y": "Y"}
     senses_stalls = False
 
-    def make_device(self):
+    def make_device(self) -> Any:
         return GrblController(self.clock, settings=QUICK_HOMING)
 
-    def _stage(self, settings):
+    def make_from(self, settings):
         return GrblStage(self.transport, self.letters, self.clock, settings)
 
     def true_um(self, axis):
@@ -119,10 +135,10 @@ class GrblRig(Rig):
 class AptRig(Rig):
     axes = ("mask_x",)
 
-    def make_device(self):
+    def make_device(self) -> Any:
         return AptController(self.clock)
 
-    def _stage(self, settings):
+    def make_from(self, settings):
         return AptStage({"mask_x": AptAxis(self.transport)}, self.clock, settings)
 
     def true_um(self, axis):
