@@ -9,6 +9,7 @@ when it comes back under another name.
 import glob
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,12 +127,10 @@ def _pids_with_lock(device: str) -> Iterator[int]:
 def _pids_with_open_file(device: str) -> Iterator[int]:
     real = os.path.realpath(device)
     for process in glob.iglob("/proc/[0-9]*"):
-        try:
-            opened = [os.readlink(entry.path) for entry in os.scandir(f"{process}/fd")]
-        except OSError:
-            continue
-        if real in opened:
-            yield int(os.path.basename(process))
+        with suppress(OSError):  # a process of another user, or one that has just ended
+            numbers = os.listdir(f"{process}/fd")
+            if any(os.readlink(f"{process}/fd/{number}") == real for number in numbers):
+                yield int(os.path.basename(process))
 
 
 def _program(pid: int) -> str:
