@@ -23,6 +23,7 @@ from rich.table import Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
+from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
@@ -43,6 +44,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(devices, name="devices")
 console = Console(stderr=True)
 
 SceneOption = Annotated[

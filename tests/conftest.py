@@ -11,20 +11,29 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 
 def pytest_addoption(parser):
-    parser.addoption("--fuzz-cases", type=int, default=2000, help="random cases of each fuzz test")
-    parser.addoption("--camera", default="", help="camera of the tests marked hardware: ptp:SERIAL")
+    parser.addoption(
+        "--stage", help="a real stage for tests marked hardware: zaber:/dev/ttyUSB0, or a YAML file"
+    )
+    parser.addoption("--camera", help="a real camera for tests marked hardware: ptp:SERIAL")
+    parser.addoption(
+        "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
+    )
 
 
 def pytest_collection_modifyitems(config, items):
     folder = os.environ.get("EMMC_LIGHTFIELDS")
-    lightfields = bool(folder) and Path(folder).is_dir()
-    camera = bool(config.getoption("--camera"))
+    skips = {}
+    if not (folder and Path(folder).is_dir()):
+        skips["real_data"] = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
     for item in items:
-        if "real_data" in item.keywords and not lightfields:
-            reason = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
-            item.add_marker(pytest.mark.skip(reason=reason))
-        if "hardware" in item.keywords and "camera_kind" in item.fixturenames and not camera:
-            item.add_marker(pytest.mark.skip(reason="--camera names no camera"))
+        for marker, reason in skips.items():
+            if marker in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=reason))
+        if "hardware" in item.keywords:
+            device = "camera" if "camera_kind" in item.fixturenames else "stage"
+            if not config.getoption(f"--{device}"):
+                reason = f"no real {device}: name one with --{device}"
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(scope="session")

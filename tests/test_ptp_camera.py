@@ -269,7 +269,7 @@ def test_a_picture_that_comes_too_late_does_not_pass_for_the_next(bench):
 def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(after):
     bench = Bench(PtpSettings(part_bytes=3000))
     camera = bench.open()
-    bench.faults.inject("unplug_in_download", after=after)
+    bench.faults.inject("unplug_in_download", skip=after)
     with pytest.raises(UsbGoneError, match="plug it in"):
         camera.snap()
     with pytest.raises(UsbGoneError):

@@ -305,7 +305,7 @@ def test_a_stream_that_asks_for_absurd_sizes_is_refused(leader, payload):
 @pytest.mark.parametrize("after", range(0, 12, 3))
 def test_a_read_that_goes_wrong_is_repeated(bench, faults, fault, after):
     camera = bench.open()
-    faults.inject(fault, after=after)
+    faults.inject(fault, skip=after)
     for name in ("Width", "Height", "PayloadSize", "BlackLevel") * 4:
         camera.features.number(name)
     assert camera.features.number("Width") == SHAPE[1]

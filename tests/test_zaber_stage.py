@@ -252,6 +252,7 @@ def test_an_interrupt_during_a_move_stops_every_axis_that_moves(stage, bench, mo
     with pytest.raises(KeyboardInterrupt):
         stage.move_to_um({"mask_x": 20_000.0, "aperture_y": 20_000.0})
     assert len(bench.stops_sent()) == 2
+    ManualClock.sleep(bench.clock, 2 * SPEC.max_speed_um_s / SPEC.acceleration_um_s2)
     stopped_um = [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)]
     ManualClock.sleep(bench.clock, 60.0)
     assert [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)] == stopped_um
@@ -327,6 +328,7 @@ def test_a_reply_to_another_message_is_not_taken_for_ours(stale):
     clock = ManualClock()
     chain = ZaberChain(clock)
     stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
+    stage.home()
     feed = chain.feed
     chain.feed = lambda data: with_checksum(stale) + feed(data)
     assert stage.position_um("mask_x") == 0.0
@@ -449,10 +451,17 @@ def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch
 def test_bytes_of_an_incomplete_answer_wait_for_the_rest():
     class Halves:
         unplugged = False
+        plugs = 1
         answers = iter([b"@01 1 10 OK", b" IDLE -- 0\r\n"])
 
         def feed(self, data):
             return next(self.answers)
+
+        def due(self):
+            return b""
+
+        def next_due_s(self):
+            return None
 
     transport = MemoryTransport(Halves(), ManualClock())
     transport.write(b"/\n")
