@@ -43,6 +43,9 @@ LAST_TRANSACTION = 0xFFFFFFFE
 MOST_DATASET_BYTES = 1 << 24
 STALE_EVENTS_TOLERATED = 64
 NO_WAIT_S = 0.001
+MOST_NEW_OBJECTS = 64
+LONGEST_EXPOSURE_S = 3600.0
+"""What a camera that states nonsense can make the driver wait."""
 
 EXPOSURE_UNIT_S = 1e-4
 EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
@@ -338,7 +341,7 @@ class PtpSession:
         all_of_it: bool,
     ) -> Capture:
         settings, clock = self.settings, self.clock
-        exposed_s = clock.now_s() + exposure_s
+        exposed_s = clock.now_s() + min(exposure_s, LONGEST_EXPOSURE_S)
         deadline_s = exposed_s + settings.capture_limit_s
         found: tuple[int, ObjectInfo] | None = None
         others: list[tuple[int, ObjectInfo]] = []
@@ -347,7 +350,10 @@ class PtpSession:
             event = self._transport.event(min(settings.event_poll_s, deadline_s - now_s))
             if event is None and clock.now_s() < exposed_s:
                 continue
-            for handle in self._new_objects(event, seen):
+            new = self._new_objects(event, seen)
+            if len(new) > MOST_NEW_OBJECTS:
+                raise CaptureError(f"{len(new)} new objects at once", "open the camera again")
+            for handle in new:
                 seen.add(handle)
                 info = self.object_info(handle)
                 if info.format == Format.FOLDER:
@@ -614,7 +620,10 @@ class PtpCamera:
         self, described: codec.PropertyDescription, target: float, special: frozenset[int]
     ) -> int | None:
         value = codec.nearest(described, target, special)
-        made = self.session.write(described, value)
+        try:
+            made = self.session.write(described, value)
+        except ValueError as error:
+            raise CameraSettingError(f"property {described.code:#06x}", str(error)) from error
         return made if isinstance(made, int) and made > 0 else None
 
 
