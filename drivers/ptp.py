@@ -565,6 +565,19 @@ class PtpCamera:
         described = self.session.describe(Property.BATTERY_LEVEL)
         return _number(described)
 
+    def details(self) -> dict[str, str]:
+        """Return what else the camera says of itself, by name."""
+        battery = self.battery_percent
+        cards = ", ".join(
+            f"{card.free_bytes / 1e9:.3g} of {card.capacity_bytes / 1e9:.3g} GB free"
+            for card in self.session.storages()
+        )
+        return {
+            "battery": "not told" if battery is None else f"{battery:g} %",
+            "cards": cards or "none",
+            "downloads": "in parts" if self.session.can(Operation.GET_PARTIAL_OBJECT) else "whole",
+        }
+
     def set_exposure_s(self, exposure_s: float) -> None:
         """Choose the exposure of the frames that follow: the nearest that the camera has.
 
@@ -605,7 +618,7 @@ class PtpCamera:
             gain=self.gain,
             camera_time_s=_camera_time_s(taken.info.captured),
             host_time_s=arrived_s,
-            metadata={**frame.metadata, "name": taken.info.name, "camera": self.identity.model},
+            metadata={**frame.metadata, "name": taken.info.name},
         )
 
     def close(self) -> None:
