@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from reconstruction.dictionary import (
-    DISPARITIES,
     KINDS,
     OPPONENT,
     Dictionary,
     dct_dictionary,
     lambertian_dictionary,
+    plane_disparities,
 )
 from reconstruction.errors import DictionaryError, ReconstructionError
 
@@ -267,8 +267,21 @@ def test_no_two_lambertian_atoms_are_nearly_the_same():
 
 def test_more_disparities_hold_fewer_ones_luminance_atoms():
     few = lambertian_dictionary((3, 3), (6, 6), [0, 1], colours=1).matrix
-    many = lambertian_dictionary((3, 3), (6, 6), DISPARITIES, colours=1).matrix
+    many = lambertian_dictionary((3, 3), (6, 6), [-1, 0, 0.5, 1], colours=1).matrix
     assert (np.abs(few @ many.T).max(axis=1) > 0.99).all()
+
+
+def test_planes_are_one_pixel_apart_in_the_outermost_view():
+    assert plane_disparities((5, 5), (9, 9)) == (-2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2)
+    assert plane_disparities((3, 3), (8, 8)) == (-2, -1, 0, 1, 2)
+    assert plane_disparities((9, 9), (8, 8)) == (-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1)
+    assert plane_disparities((5, 5), (1, 1)) == (0,)
+
+
+@pytest.mark.parametrize(("views", "patch"), [((2, 2), (4, 6)), ((7, 7), (8, 8)), ((9, 9), (3, 3))])
+def test_the_defaults_fit_any_views_and_patch(views, patch):
+    for make in (dct_dictionary, lambertian_dictionary):
+        assert make(views, patch).checked(views, patch, 3).size > 3
 
 
 @pytest.mark.parametrize("disparities", [[], [np.nan], [0, np.inf], [5]])
