@@ -112,9 +112,7 @@ def from_patches(
         _check_weight(share)
         place = np.s_[y : y + rows, x : x + columns]
         if not np.isfinite(patch).all():
-            raise ReconstructionError(
-                f"patch {number} is not finite everywhere: leave it out"
-            )
+            raise ReconstructionError(f"patch {number} is not finite everywhere: leave it out")
         weight[place] += share
         total[(slice(None), slice(None), *place)] += share[..., None] * patch
     return PatchTerm(_mean(total, weight), weight)

@@ -106,9 +106,7 @@ def reconstruct_tv(
     data = np.where(usable, frames, 0).astype(dtype)
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
-    gamma = settings.primal_step or choose_primal_step(
-        contrast(guess), mu, settings.chroma_weight
-    )
+    gamma = settings.primal_step or choose_primal_step(contrast(guess), mu, settings.chroma_weight)
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)

@@ -207,9 +207,7 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
         if order == 1:
             kernels.sweep(data, steps, state, dual_state, shares, moved)
         else:
-            difference_kernels.sweep(
-                data, steps, taps, state, dual_state, room, shares, moved
-            )
+            difference_kernels.sweep(data, steps, taps, state, dual_state, room, shares, moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved
 
 
@@ -253,9 +251,7 @@ def test_the_fused_sweep_is_the_plain_primal_dual_step(
     before = flat
     for _ in range(3):
         before = flat
-        flat, flat_dual = plain_step(
-            psi, usable, frames, flat, flat_dual, STEPS, order, flat_pull
-        )
+        flat, flat_dual = plain_step(psi, usable, frames, flat, flat_dual, STEPS, order, flat_pull)
     np.testing.assert_allclose(found.ravel(), flat, atol=100 * EPS * np.abs(flat).max())
     np.testing.assert_allclose(found_dual.ravel(), flat_dual, atol=200 * EPS)
     change = np.sum(np.square((flat - before) / STEPS[4]))
