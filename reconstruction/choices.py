@@ -1,8 +1,6 @@
-"""What the data choose where the settings do not: mu, the primal step and the light field to begin with."""
+"""What the data choose where the settings do not: mu, the primal step, where to begin."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np

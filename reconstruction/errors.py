@@ -3,3 +3,7 @@
 
 class ReconstructionError(Exception):
     """Root of the reconstruction's errors; shown to the user as one line."""
+
+
+class DictionaryError(ReconstructionError):
+    """A dictionary that cannot be made, read or written, or does not fit the patches."""

@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
+NO_SHARE = np.zeros((0, 0), dtype=np.float32)
+NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
+
 
 NO_SHARE = np.zeros((0, 0), dtype=np.float32)
 NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)

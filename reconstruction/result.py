@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Progress:
-    """One step of a solver, as given to `on_step`; the objective is None where not evaluated."""
+    """One step of a solver, as given to `on_step`; None where not evaluated or not known.
+
+    total: steps there will be.
+    """
 
     step: int
-    relative_change: float
+    relative_change: float | None
     objective: float | None
+    total: int | None = None
 
 
 @dataclass(frozen=True)
@@ -32,3 +36,8 @@ class Reconstruction:
     objective: tuple[tuple[int, float], ...]
     seconds: float
     parameters: dict[str, float]
+
+    def without_light_field(self) -> Reconstruction:
+        """Return the result with an empty light field, to keep many."""
+        empty = np.empty((0, 0, 0, 0, 3), dtype=np.float32)
+        return replace(self, light_field=empty)

@@ -1,0 +1,215 @@
+"""Sparse codes of measurements in a sensed dictionary: six solvers behind one interface.
+
+`admm`, `lars`, `ista` and `fista` minimise 1/2 |A beta - I|^2 + eta |beta|_1 (eq. 8); `omp` and
+`sl0` look for few atoms that explain the measurements. The penalty and the tolerance follow from
+the noise unless the settings say otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from emmc_rig.model.settings import Settings
+from reconstruction import bpdn_kernels as kernels
+from reconstruction.errors import ReconstructionError
+from reconstruction.patches import padded
+
+Array32 = NDArray[np.float32]
+Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
+MINIMISERS = ("admm", "lars", "ista", "fista")
+SL0_RIDGE = 1e-5
+
+
+class BPDNSettings(Settings):
+    """Which solver, and when it stops; None lets noise and data choose."""
+
+    method: Method = "lars"
+    penalty: float | None = Field(
+        default=None, gt=0, description="eta, in units of readings times a sensed atom's norm"
+    )
+    penalty_factor: float = Field(
+        default=0.2, gt=0, description="of sigma |a| sqrt(2 log atoms), which sets eta"
+    )
+    smallest_penalty: float = Field(
+        default=5e-4, gt=0, lt=1, description="eta against |data| |a|, where noise says less"
+    )
+    rtol: float = Field(
+        default=1e-3, gt=0, description="relative duality gap; float32 certifies about 1e-5"
+    )
+    max_steps: int = Field(default=3000, ge=1)
+    relaxation: float = Field(default=1.8, ge=1, lt=2, description="of ADMM")
+    threshold: float = Field(
+        default=0.04, gt=0, description="of ADMM: eta / rho, against the size of the data"
+    )
+    atoms: int = Field(default=20, ge=1, description="most atoms that omp takes")
+    tolerance_factor: float = Field(
+        default=1.0, ge=0, description="of the noise's norm, at which omp and sl0 rest"
+    )
+    sl0_shrink: float = Field(default=0.7, gt=0, lt=1, description="of the widths of sl0")
+    sl0_inner_steps: int = Field(default=3, ge=1)
+    sl0_narrowest: float = Field(default=0.005, gt=0, lt=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """weights: (atom,). penalty: eta (0 for omp and sl0). gap: relative, NaN for omp and sl0.
+
+    residual: norm of what the atoms leave of the data (NaN where the solver does not know it).
+    steps: passes over all atoms.
+    """
+
+    weights: Array32
+    penalty: float
+    gap: float
+    residual: float
+    steps: float
+    converged: bool
+
+
+EMPTY = Code(np.zeros(0, np.float32), 0.0, 0.0, 0.0, 0.0, True)
+
+
+@njit(cache=True, nogil=True)
+def assemble(atoms, weights, out):
+    """Set out (sample,) to the atoms (atom, sample) weighted by the code."""
+    kernels.combine(atoms, weights, out)
+
+
+def median_norm(atoms: Array32) -> float:
+    """Return the median norm of atoms (atom, measurement)."""
+    sizes = np.empty(len(atoms), dtype=np.float32)
+    kernels.norms(atoms, sizes)
+    return float(np.median(sizes))
+
+
+def penalty_of(
+    size: float, count: int, data: Array32, noise_sigma: float, settings: BPDNSettings
+) -> float:
+    """Return eta: as set, or c sigma |a| sqrt(2 log n), the largest that noise alone reaches.
+
+    size: |a|, the median norm of the sensed atoms; count: how many there are (Donoho and
+    Johnstone 1994 for the form). Never below a small share of |data| |a|.
+    """
+    if settings.penalty is not None:
+        return settings.penalty
+    universal = noise_sigma * size * np.sqrt(2 * np.log(max(count, 2)))
+    smallest = settings.smallest_penalty * size * float(np.linalg.norm(data))
+    return max(settings.penalty_factor * universal, smallest)
+
+
+def prepared(
+    atoms: Array32, data: Array32, noise_sigma: float, settings: BPDNSettings
+) -> Callable[[Array32, int], Code]:
+    """Return what codes measurements in a sensed dictionary, its factors computed once.
+
+    atoms: (atom, padded measurement), C-contiguous. data: (patch, padded measurement), all that
+    will be coded, for the scale of ADMM's rho. The returned function takes one patch's data and
+    how many of its measurements are usable.
+    """
+    size = median_norm(atoms)
+    scale = float(np.sqrt(np.mean(np.sum(np.square(data, dtype=np.float64), axis=1))))
+    count, length = atoms.shape
+
+    def greedy(one: Array32, measured: int) -> Code:
+        weights = np.empty(count, dtype=np.float32)
+        tolerance = settings.tolerance_factor * noise_sigma * np.sqrt(measured)
+        if settings.method == "omp":
+            steps, residual = kernels.omp(
+                atoms, one, min(settings.atoms, measured), tolerance, weights
+            )
+        else:
+            steps, residual = kernels.sl0(
+                atoms,
+                one,
+                tolerance,
+                settings.sl0_shrink,
+                settings.sl0_inner_steps,
+                settings.sl0_narrowest,
+                SL0_RIDGE,
+                weights,
+            )
+        return Code(weights, 0.0, np.nan, float(residual), float(steps), True)
+
+    if settings.method not in MINIMISERS:
+        return greedy
+    if not size * scale > 0:
+        return lambda one, measured: Code(np.zeros(count, np.float32), 0, 0, 0, 0, True)
+    rho = inverse = None
+    if settings.method == "admm":
+        # One factor serves all patches of a class, so their penalties share one rho.
+        eta = np.median([penalty_of(size, count, one, noise_sigma, settings) for one in data])
+        rho = np.float32(eta / (settings.threshold * scale / size))
+        inverse = np.empty((length, length), dtype=np.float32)
+        if not kernels.factor(atoms, rho, inverse):
+            raise ReconstructionError("a sensed dictionary is singular: raise the penalty")
+
+    def minimise(one: Array32, measured: int) -> Code:
+        weights = np.empty(count, dtype=np.float32)
+        eta = penalty_of(size, count, one, noise_sigma, settings)
+        if settings.method == "admm":
+            steps, gap = kernels.admm(
+                atoms,
+                inverse,
+                one,
+                np.float32(eta),
+                rho,
+                np.float32(settings.relaxation),
+                settings.rtol,
+                settings.max_steps,
+                weights,
+            )
+        elif settings.method == "lars":
+            steps = kernels.lars(atoms, one, eta, settings.max_steps, weights)
+            correlation = np.empty(count, dtype=np.float32)
+            gap = kernels.judge(atoms, one, np.float32(eta), weights, correlation)[1]
+            if steps != kernels.NONE:
+                return Code(weights, eta, gap, np.nan, steps, True)
+            steps = settings.max_steps
+        else:
+            steps, gap = kernels.proximal_gradient(
+                atoms,
+                one,
+                np.float32(eta),
+                settings.method == "fista",
+                settings.rtol,
+                settings.max_steps,
+                weights,
+            )
+        return Code(weights, eta, float(gap), np.nan, float(steps), gap <= settings.rtol)
+
+    return minimise
+
+
+def solve_bpdn(
+    atoms: NDArray[np.floating],
+    data: NDArray[np.floating],
+    noise_sigma: float = 0.0,
+    settings: BPDNSettings | None = None,
+) -> Code:
+    """Return the sparse code of data (measurement,) in atoms (atom, measurement).
+
+    Raises ReconstructionError for shapes that do not fit, values that are not finite, and a noise
+    level that is negative.
+    """
+    settings = settings or BPDNSettings()
+    if atoms.ndim != 2 or not atoms.size or data.shape != atoms.shape[1:]:
+        raise ReconstructionError(
+            f"atoms of shape {atoms.shape} and data of shape {data.shape}: needed are "
+            "(atom, measurement) and (measurement,)"
+        )
+    if not (np.isfinite(atoms).all() and np.isfinite(data).all()):
+        raise ReconstructionError("atoms or data hold values that are not finite")
+    if not 0 <= noise_sigma < np.inf:
+        raise ReconstructionError(f"a noise level of {noise_sigma:g}: it must be at least 0")
+    wide = np.zeros((len(atoms), padded(data.size)), dtype=np.float32)
+    wide[:, : data.size] = atoms
+    one = np.zeros((1, wide.shape[1]), dtype=np.float32)
+    one[0, : data.size] = data
+    return prepared(wide, one, noise_sigma, settings)(one[0], data.size)

@@ -1,0 +1,40 @@
+"""What every method is given, checked once: frames that fit Psi, finite where they are used."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.errors import ReconstructionError
+
+Array = NDArray[np.floating]
+
+
+def checked_inputs(
+    psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_] | None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the frames in Psi's type, 0 where not usable, and the mask of usable pixels.
+
+    frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError for frames that do not
+    fit Psi or are not finite where usable, for a noise level that is negative or not finite, and
+    when no pixel is usable.
+    """
+    if not 0 <= noise_sigma < np.inf:
+        raise ReconstructionError(
+            f"a noise level of {noise_sigma:g}: it must be finite, at least 0"
+        )
+    if frames.shape != psi.frames_shape:
+        raise ReconstructionError(
+            f"frames of shape {frames.shape} given, Psi needs {psi.frames_shape} "
+            "(shot, row, column): use the Psi measured with these shots"
+        )
+    if usable is None:
+        usable = np.ones(psi.frames_shape, dtype=bool)
+    if usable.shape != psi.frames_shape:
+        raise ReconstructionError(f"the mask of usable pixels has shape {usable.shape}")
+    if not usable.any():
+        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
+    if not np.isfinite(frames[usable]).all():
+        raise ReconstructionError("the frames hold values that are not finite: exclude them")
+    return np.where(usable, frames, 0).astype(psi.weights.dtype), usable
