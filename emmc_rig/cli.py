@@ -356,6 +356,9 @@ def chart(
     solvers: Annotated[
         bool, typer.Option("--solvers", help="time the sparse solvers, and scikit-learn's beside")
     ] = False,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="time the primal-dual step, and pyproximal's beside")
+    ] = False,
     dictionary: DictionaryOption = None,
     camera: CameraOption = "rgbw-bayer-1shot",
     size: SizeOption = "593x840",
@@ -370,8 +373,11 @@ def chart(
     if solvers:
         _chart_solvers(camera, dictionary, out)
         return
-    if not kernels:
-        raise typer.BadParameter("say what to chart: --kernels or --solvers")
+    if not kernels and not peers:
+        raise typer.BadParameter("say what to chart: --kernels, --solvers or --peers")
+    if peers:
+        _chart_peers(camera, size, repeats, out)
+        return
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
@@ -452,6 +458,24 @@ def train(
         f"{told['learning_seconds']:.1f} s, peak memory {told['peak_memory_gib']:.2f} GiB"
     )
     typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
+
+
+def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.variational_benchmark import variational_timings
+
+    described, shape = find_camera(camera), _size(size)
+    assert shape is not None
+    table = Table("primal-dual step", "ms", "times ours")
+    rows = []
+    with result_folder(out) as folder:
+        for timing in variational_timings(described, shape, repeats):
+            rows.append(timing.as_dict())
+            table.add_row(timing.name, f"{timing.seconds * 1e3:.1f}", f"{timing.times_ours:.1f}")
+        metrics = {"camera": camera, "size": list(shape), "steps": rows}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
 
 
 def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:

@@ -99,6 +99,8 @@ def reconstruct_tv(
     """
     settings = settings or TVSettings()
     started = clock()
+    if settings.rho == 0:
+        patch_term = None
     check(psi, frames, noise_sigma, usable, patch_term, start)
     if usable is None:
         usable = np.ones(psi.frames_shape, dtype=bool)
@@ -162,7 +164,7 @@ def _sweep(
     total = 1 / gamma + pull
     inverse = psi.solver(np.where(problem.usable, total, np.inf)).inverse
     fit = kernels.Data(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
-    if problem.patch_term is not None and problem.rho > 0:
+    if problem.patch_term is not None:
         share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
         pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
         fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
