@@ -483,12 +483,75 @@ def test_a_description_that_unpacks_without_end_is_refused(bench):
         bench.open()
 
 
-def test_a_camera_without_an_exposure_is_refused(bench):
-    xml = bench.simulator.description.replace(b'"ExposureTime"', b'"ExposureTimf"')
-    bench.simulator._file = simulation._zip(xml)
+def described_as(bench, old, new):
+    """Change what the camera says of itself, as another maker would have it."""
+    assert old in bench.simulator.description
+    bench.simulator._file = simulation._zip(bench.simulator.description.replace(old, new))
     bench.simulator.plugged()
+    return bench.open()
+
+
+def test_a_camera_without_single_frames_gives_one_all_the_same(bench):
+    camera = described_as(bench, b'"SingleFrame"', b'"MultiFrame"')
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    assert not bench.simulator.streaming
+
+
+@pytest.mark.parametrize(("unit", "exposure_s"), [(b"us", 0.01), (b"ms", 10.0), (b"s", 10_000.0)])
+def test_the_exposure_is_read_in_the_unit_that_the_camera_states(bench, unit, exposure_s):
+    camera = described_as(bench, b"<Unit>us</Unit>", b"<Unit>%b</Unit>" % unit)
+    assert camera.exposure_s == pytest.approx(exposure_s)
+
+
+def test_a_gain_that_is_no_decibels_is_linear(bench):
+    camera = described_as(bench, b"<Unit>dB</Unit>", b"<Unit>x</Unit>")
+    camera.set_gain(4.0)
+    assert camera.features.value("Gain") == pytest.approx(4.0)
+
+
+def test_a_camera_without_gain_or_black_level_has_gain_1_and_black_0(bench):
+    camera = described_as(bench, b'Name="Gain"', b'Name="Gein"')
+    assert (camera.gain, camera.gain_limits) == (1.0, (1.0, 1.0))
+    camera.close()
+    camera = described_as(bench, b'Name="BlackLevel"', b'Name="BleckLevel"')
+    assert camera.snap().black_level_dn[1, 1] == 0
+
+
+def test_a_black_level_in_per_cent_is_one_of_white(bench):
+    camera = described_as(
+        bench, b"<pValue>BlackLevelKnife</pValue>", b"<Value>2</Value><Unit>%</Unit>"
+    )
+    assert camera.snap().black_level_dn[0, 0] == pytest.approx(0.02 * 4095)
+
+
+def test_a_feature_of_another_kind_than_usual_does_not_stop_the_opening(bench):
+    camera = described_as(
+        bench, b'<Port Name="Device"/>', b'<Integer Name="GainSelector"><Value>1</Value></Integer>'
+    )
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+@pytest.mark.parametrize("where", [simulation.ANSWER_IN, simulation.STREAM_IN])
+def test_ctrl_c_stops_the_camera(bench, monkeypatch, where):
+    camera = bench.open()
+    read, armed = bench.simulator.bulk_in, [True]
+
+    def interrupt(endpoint, length, timeout_s):
+        if armed and endpoint == where and bench.simulator.streaming:
+            armed.clear()
+            raise KeyboardInterrupt
+        return read(endpoint, length, timeout_s)
+
+    monkeypatch.setattr(bench.simulator, "bulk_in", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        camera.snap()
+    assert not bench.simulator.streaming
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+def test_a_camera_without_an_exposure_is_refused(bench):
     with pytest.raises(CameraDescriptionError, match="none of ExposureTime"):
-        bench.open()
+        described_as(bench, b'"ExposureTime"', b'"ExposureTimf"')
 
 
 SEEDS = st.integers(0, 1 << 62)
