@@ -247,6 +247,10 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     struct.pack_into("<I", original, 28, 0x02180014)
     with pytest.raises(RawFrameError, match="0x02180014 is not raw"):
         decode_u3v(bytes(original))
+    struct.pack_into("<I", original, 28, 0x010C0059)
+    struct.pack_into("<Q", original, len(original) - 12, 100)
+    with pytest.raises(RawFrameError, match="100 bytes are not the 2880 of 40x48"):
+        decode_u3v(bytes(original))
     struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
     with pytest.raises(RawFrameError, match="bytes are not the"):
         decode_u3v(bytes(original))
@@ -409,6 +413,69 @@ def test_a_stream_passes_over_a_torn_frame_and_counts_it(fault, shape):
     block = int(frame.metadata["block_id"])
     assert int(frame.metadata["frames_lost"]) == block - 1 >= 1
     assert next(stream).metadata["frames_lost"] == "0"
+
+
+def test_only_one_frame_is_lost_where_only_its_end_is_missing(bench, faults):
+    stream = bench.open().stream()
+    next(stream)
+    faults.inject("lost_trailer")
+    assert [next(stream).metadata["frames_lost"] for _ in range(2)] == ["1", "0"]
+
+
+def test_the_end_of_another_frame_does_not_make_this_one_whole(bench):
+    camera = bench.open()
+    send = bench.simulator._send
+
+    def send_wrong_end(exposure_s, block, start_s):
+        send(exposure_s, block, start_s)
+        trailer = bytearray(bench.simulator._messages.pop())
+        trailer[8] += 3
+        bench.simulator._messages.append(bytes(trailer))
+
+    bench.simulator._send = send_wrong_end
+    with pytest.raises(FrameLostError, match="begins as frame 0 and ends as 3"):
+        camera.snap()
+
+
+def test_the_stream_is_halted_and_cleared_before_it_is_enabled(bench, monkeypatch):
+    camera = bench.open()
+    done = []
+    simulator = bench.simulator
+    control, cleared, store = simulator.control, simulator.cleared, simulator._store
+
+    def note_store(address, data):
+        if address == simulation.SIRM + codec.SIRM_CONTROL:
+            done.append("enable" if data[0] else "disable")
+        return store(address, data)
+
+    monkeypatch.setattr(simulator, "control", lambda *a: done.append("halt") or control(*a))
+    monkeypatch.setattr(simulator, "cleared", lambda end: done.append("clear") or cleared(end))
+    monkeypatch.setattr(simulator, "_store", note_store)
+    camera.snap()
+    assert done == ["disable", "halt", "clear", "enable", "disable", "halt", "clear"]
+
+
+def test_settings_are_unlocked_after_an_acquisition(bench):
+    camera = bench.open()
+    with closing(camera.stream()) as stream:
+        next(stream)
+        assert not camera.features.is_writable("Width")
+    assert camera.features.is_writable("Width")
+
+
+def test_a_payload_may_be_smaller_than_the_camera_reserves(bench, monkeypatch):
+    simulator = bench.simulator
+    update = simulator._update_sizes
+
+    def reserve_more():
+        update()
+        struct.pack_into("<Q", simulator._regions[simulation.SIRM], 0x08, 40 * 48 * 2 + 5000)
+
+    monkeypatch.setattr(simulator, "_update_sizes", reserve_more)
+    camera = bench.open()
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    for frame in itertools.islice(camera.stream(), 3):
+        np.testing.assert_array_equal(frame.mosaic, MOSAIC)
 
 
 def test_dropped_frames_are_counted_by_the_cameras_numbers(bench, faults):
