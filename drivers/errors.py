@@ -189,7 +189,6 @@ class UsbClaimedError(DriverError):
         super().__init__(f"{device} is claimed by {by}: {advice}")
         self.device = device
         self.holders = holders
-        self.advice = advice
 
 
 class UsbGoneError(DriverError):
@@ -292,7 +291,6 @@ class CaptureError(DriverError):
     def __init__(self, reason: str, advice: str) -> None:
         super().__init__(f"no picture, {reason}: {advice}")
         self.reason = reason
-        self.advice = advice
 
 
 class DownloadError(DriverError):

@@ -43,6 +43,9 @@ LAST_TRANSACTION = 0xFFFFFFFE
 MOST_DATASET_BYTES = 1 << 24
 STALE_EVENTS_TOLERATED = 64
 NO_WAIT_S = 0.001
+MOST_NEW_OBJECTS = 64
+LONGEST_EXPOSURE_S = 3600.0
+"""What a camera that states nonsense can make the driver wait."""
 
 EXPOSURE_UNIT_S = 1e-4
 EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
@@ -338,7 +341,7 @@ class PtpSession:
         all_of_it: bool,
     ) -> Capture:
         settings, clock = self.settings, self.clock
-        exposed_s = clock.now_s() + exposure_s
+        exposed_s = clock.now_s() + min(exposure_s, LONGEST_EXPOSURE_S)
         deadline_s = exposed_s + settings.capture_limit_s
         found: tuple[int, ObjectInfo] | None = None
         others: list[tuple[int, ObjectInfo]] = []
@@ -347,7 +350,10 @@ class PtpSession:
             event = self._transport.event(min(settings.event_poll_s, deadline_s - now_s))
             if event is None and clock.now_s() < exposed_s:
                 continue
-            for handle in self._new_objects(event, seen):
+            new = self._new_objects(event, seen)
+            if len(new) > MOST_NEW_OBJECTS:
+                raise CaptureError(f"{len(new)} new objects at once", "open the camera again")
+            for handle in new:
                 seen.add(handle)
                 info = self.object_info(handle)
                 if info.format == Format.FOLDER:
@@ -559,6 +565,19 @@ class PtpCamera:
         described = self.session.describe(Property.BATTERY_LEVEL)
         return _number(described)
 
+    def details(self) -> dict[str, str]:
+        """Return what else the camera says of itself, by name."""
+        battery = self.battery_percent
+        cards = ", ".join(
+            f"{card.free_bytes / 1e9:.3g} of {card.capacity_bytes / 1e9:.3g} GB free"
+            for card in self.session.storages()
+        )
+        return {
+            "battery": "not told" if battery is None else f"{battery:g} %",
+            "cards": cards or "none",
+            "downloads": "in parts" if self.session.can(Operation.GET_PARTIAL_OBJECT) else "whole",
+        }
+
     def set_exposure_s(self, exposure_s: float) -> None:
         """Choose the exposure of the frames that follow: the nearest that the camera has.
 
@@ -599,7 +618,7 @@ class PtpCamera:
             gain=self.gain,
             camera_time_s=_camera_time_s(taken.info.captured),
             host_time_s=arrived_s,
-            metadata={**frame.metadata, "name": taken.info.name, "camera": self.identity.model},
+            metadata={**frame.metadata, "name": taken.info.name},
         )
 
     def close(self) -> None:
@@ -614,7 +633,10 @@ class PtpCamera:
         self, described: codec.PropertyDescription, target: float, special: frozenset[int]
     ) -> int | None:
         value = codec.nearest(described, target, special)
-        made = self.session.write(described, value)
+        try:
+            made = self.session.write(described, value)
+        except ValueError as error:
+            raise CameraSettingError(f"property {described.code:#06x}", str(error)) from error
         return made if isinstance(made, int) and made > 0 else None
 
 

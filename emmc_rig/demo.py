@@ -134,11 +134,11 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         psi_error = calibration.psi.relative_difference(exact)
         design_error = design.relative_difference(exact)
     with stages("capture", design.shots):
-        frames_dn = capture_shots(rig, camera, watcher.step)
+        frames_dn, exposures_s = capture_shots(rig, camera, watcher.step)
     with stages("reconstruct", settings.solver.max_steps):
-        readings = calibration.readings(frames_dn, camera.exposures_s())
+        readings = calibration.readings(frames_dn, exposures_s)
         usable = frames_dn < camera.sensor.noise.white_level_dn
-        variance = calibration.reading_variance(frames_dn, camera.exposures_s())
+        variance = calibration.reading_variance(frames_dn, exposures_s)
         sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
 
         def reconstruct(psi: ImagingMatrix) -> Reconstruction:
@@ -183,7 +183,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": psnr})
         focus = focus_disparities(truth)
         export_pictures(folder / "pictures", estimate, focus)
-        save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s())
+        save_frames(folder / "frames.h5", frames_dn, readings, exposures_s)
         calibration.psi.save(folder / "psi.h5")
         metrics["seconds"] = dict(stages.seconds)
         write_report(

@@ -1,4 +1,4 @@
-"""The only place that chooses devices: here the simulated rig, which speaks the real bytes.
+"""The only place that chooses devices: real ones by name, or simulated ones on the same bytes.
 
 The stage chain: device 1 carries the coded mask (axes x, y), device 2 the aperture plate (axes
 x, y), which has a pinhole of one aperture cell and, beside it, a window that leaves the whole
@@ -7,21 +7,29 @@ aperture open.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import Camera as CameraDevice
-from drivers.camera import RawFileCamera
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.folder import FolderCamera
+from drivers.ptp import PtpCamera, PtpSession
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.stage import Stage, StageSettings
+from drivers.usb import open_device
 from drivers.zaber import ZaberStage
-from emmc_rig.model.camera import Camera
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, Sensor
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.scene import open_scene
 from simulators.bench import Bench
-from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
+from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb
 from simulators.zaber import AxisSpec, ZaberChain
 
 STAGE_AXES = {
@@ -120,9 +128,82 @@ def simulated_rig(
     )
     noise = camera.sensor.noise
     cfa = camera.sensor.cfa_name
-    device = SimulatedRawCamera(
-        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn
+    simulator = PtpCameraSimulator(
+        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
     )
     k = camera.sensor.binning
-    raw = RawFileCamera(device, (size[0] // k, size[1] // k), cfa)
-    return Rig(stage, raw, SimulatedAttendant(bench), zero_um, window_um), bench
+    still = _ptp_camera(
+        clock,
+        SimulatedUsb(clock, PtpUsbFunction(simulator)),
+        shape=(size[0] // k, size[1] // k),
+        cfa=cfa,
+        # The card lies in this computer's memory.
+        from_card=True,
+    )
+    return Rig(stage, still, SimulatedAttendant(bench), zero_um, window_um), bench
+
+
+def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
+    """Open the camera that `spec` names: a kind, a colon and what tells it from others.
+
+    `ptp:` or `ptp:SERIAL`, `folder:DIR`, `simulated`. `backend`: of pyusb, for a simulated bus.
+    Raises AppError for any other kind, or an error of the driver.
+    """
+    kind, _, rest = spec.partition(":")
+    if kind not in CAMERAS:
+        raise AppError(f"--camera {spec}: no such kind of camera; use {CAMERA_KINDS}")
+    return CAMERAS[kind](rest, clock, backend)
+
+
+def _ptp_camera(
+    clock: Clock,
+    backend: Any,
+    serial: str = "",
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    device = open_device(PTP_INTERFACE, serial=serial, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+
+
+def _open_ptp(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return _ptp_camera(clock, backend, serial)
+
+
+def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
+    return FolderCamera(folder or ".", clock)
+
+
+def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
+    """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
+    bus = SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
+    return _ptp_camera(clock, bus, from_card=True)
+
+
+CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {
+    "ptp": _open_ptp,
+    "folder": _open_folder,
+    "simulated": _open_simulated,
+}
+CAMERA_KINDS = "ptp:, ptp:SERIAL, folder:DIR or simulated"
+SCENE_SIZE = (240, 320)
+
+
+def scene_simulator(clock: Clock, seed: int = 0) -> PtpCameraSimulator:
+    """Return a simulated camera with a plain lens before a built-in scene."""
+    sensor = Sensor(cfa="rggb")
+    noise, rng = sensor.noise, np.random.default_rng(seed)
+    view = open_scene("deep-occlusions", SCENE_SIZE, (1, 1)).light_field[0, 0]
+    tile = cfa_tile(sensor.cfa)
+    repeats = (-(-SCENE_SIZE[0] // tile.shape[0]), -(-SCENE_SIZE[1] // tile.shape[1]), 1)
+    colours = np.tile(tile, repeats)[: SCENE_SIZE[0], : SCENE_SIZE[1]]
+    readings = (view * colours).sum(axis=2)
+    return PtpCameraSimulator(
+        lambda exposure_s: noise.expose_dn(readings, exposure_s, 1.0, rng),
+        clock,
+        sensor.cfa_name,
+        noise.black_level_dn,
+        noise.white_level_dn,
+        exposures=THIRD_STOPS,
+    )

@@ -1,39 +1,76 @@
 """Faults of simulated devices: armed by name, each strikes a stated number of times."""
 
-from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
 
-ALWAYS = 1 << 62
+from drivers.clock import Clock
+
+Condition = Callable[[Any], bool]
+
+
+@dataclass
+class _Armed:
+    """One fault that waits for its moment."""
+
+    times: float
+    skip: int
+    from_s: float
+    when: Condition | None
 
 
 class Faults:
-    """The faults one device knows, when each strikes next and how often."""
+    """The faults one device knows, and those that are still to strike.
 
-    def __init__(self, known: Iterable[str]) -> None:
+    `clock` is needed for faults that wait for a time.
+    """
+
+    def __init__(self, known: Iterable[str], clock: Clock | None = None) -> None:
         self.known = tuple(known)
-        self._armed: Counter[str] = Counter()
-        self._passed_over: Counter[str] = Counter()
+        self._clock = clock
+        self._armed: dict[str, list[_Armed]] = {name: [] for name in self.known}
 
-    def inject(self, name: str, times: int = 1, after: int = 0) -> None:
-        """Arm a fault for the next `times` occasions, `after` so many have passed unharmed.
+    def inject(
+        self,
+        name: str,
+        times: float = 1,
+        skip: int = 0,
+        after_s: float = 0.0,
+        when: Condition | None = None,
+    ) -> None:
+        """Arm a fault for the next `times` occasions (`math.inf`: from then on, always).
 
-        Raises `ValueError` for an unknown name.
+        It lets pass what happens within the next `after_s` seconds, then whatever `when` does not
+        hold for (it is given what the device states of the occasion), then `skip` occasions.
+        Raises `ValueError` for an unknown name, or a time without a clock.
         """
-        if name not in self.known:
+        if name not in self._armed:
             raise ValueError(f"no fault {name!r}: use one of {', '.join(self.known)}")
-        self._armed[name] += times
-        self._passed_over[name] = after
+        from_s = 0.0
+        if after_s:
+            if self._clock is None:
+                raise ValueError(f"fault {name!r} cannot wait: this device was given no clock")
+            from_s = self._clock.now_s() + after_s
+        self._armed[name].append(_Armed(times, skip, from_s, when))
 
     def clear(self) -> None:
         """Disarm every fault."""
-        self._armed.clear()
+        for armed in self._armed.values():
+            armed.clear()
 
-    def strikes(self, name: str) -> bool:
+    def strikes(self, name: str, occasion: Any = None) -> bool:
         """Return whether the fault strikes now, and count it."""
-        if not self._armed[name]:
-            return False
-        if self._passed_over[name]:
-            self._passed_over[name] -= 1
-            return False
-        self._armed[name] -= 1
-        return True
+        armed = self._armed[name]
+        for fault in armed:
+            if fault.from_s and self._clock is not None and self._clock.now_s() < fault.from_s:
+                continue
+            if fault.when is not None and not fault.when(occasion):
+                continue
+            if fault.skip:
+                fault.skip -= 1
+                continue
+            fault.times -= 1
+            if fault.times <= 0:
+                armed.remove(fault)
+            return True
+        return False

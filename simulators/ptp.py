@@ -131,7 +131,7 @@ class PtpCameraSimulator:
         capacity_bytes: int = 1 << 36,
         serial: str = "S1",
     ) -> None:
-        self.faults = Faults(FAULTS)
+        self.faults = Faults(FAULTS, clock)
         self.quality = quality
         self.serial = serial
         self.session = 0

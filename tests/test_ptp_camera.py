@@ -1,5 +1,6 @@
 """A PTP camera over simulated USB: right frames, and for every fault one clear line or a cure."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from drivers.ptp_codec import Format, ObjectInfo, Operation
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.usb import open_device
 from simulators.clock import ManualClock
-from simulators.faults import ALWAYS
 from simulators.ptp import ANY_EXPOSURE, FAULTS, PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb
 
@@ -225,14 +225,14 @@ def test_the_driver_makes_up_for(fault, times, partial):
     [
         ("torn_raw", 1, RawFrameError, "torn"),
         ("wrong_size", 1, RawFrameError, "58x80 pixels"),
-        ("busy", ALWAYS, CameraBusyError, r"busy for 10\.\d s .*battery"),
+        ("busy", math.inf, CameraBusyError, r"busy for 10\.\d s .*battery"),
         ("late", 1, CaptureError, "nothing new on the card"),
         ("silent", 1, UsbTimeoutError, "silent for 5 s"),
         ("garbled_header", 1, PtpFormatError, "garbled"),
         ("card_full", 1, CardFullError, "full or missing"),
-        ("lost_bytes", ALWAYS, DownloadError, "still on the card"),
-        ("short_part", ALWAYS, DownloadError, "the camera sent nothing"),
-        ("stall_in_download", ALWAYS, DownloadError, "stalled"),
+        ("lost_bytes", math.inf, DownloadError, "still on the card"),
+        ("short_part", math.inf, DownloadError, "the camera sent nothing"),
+        ("stall_in_download", math.inf, DownloadError, "stalled"),
     ],
 )
 def test_a_fault_is_one_clear_line_and_the_camera_is_good_again(fault, times, error, message):
@@ -265,11 +265,11 @@ def test_a_picture_that_comes_too_late_does_not_pass_for_the_next(bench):
     assert frame.metadata["name"] == "EMMC0002.DNG"
 
 
-@pytest.mark.parametrize("after", range(4))
-def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(after):
+@pytest.mark.parametrize("parts", range(4))
+def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(parts):
     bench = Bench(PtpSettings(part_bytes=3000))
     camera = bench.open()
-    bench.faults.inject("unplug_in_download", after=after)
+    bench.faults.inject("unplug_in_download", skip=parts)
     with pytest.raises(UsbGoneError, match="plug it in"):
         camera.snap()
     with pytest.raises(UsbGoneError):
@@ -286,7 +286,7 @@ def test_a_session_that_somebody_left_open_is_ended(bench):
 
 def test_an_exchange_that_an_earlier_program_left_in_the_pipes_is_cleared(bench):
     first = bench.open()
-    bench.faults.inject("stall_in_download", ALWAYS)
+    bench.faults.inject("stall_in_download", math.inf)
     first.session.settings = PtpSettings(attempts=1)
     with pytest.raises(DownloadError):
         first.snap()
