@@ -307,11 +307,15 @@ class U3vCamera:
     def _set_if_possible(self, name: str, value: str | int) -> bool:
         """Set a feature where the camera has it and takes that value; return whether it did."""
         features = self.features
-        if not features.is_writable(name):
+        try:
+            if not features.is_writable(name):
+                return False
+            if isinstance(value, str) and value not in features.choices(name):
+                return False
+            features.set(name, value)
+        except (CameraDescriptionError, CameraSettingError, U3vRefusedError) as error:
+            _log.debug("%s: %s stays as it is (%s)", self._device.name, name, error)
             return False
-        if isinstance(value, str) and value not in features.choices(name):
-            return False
-        features.set(name, value)
         return True
 
     def _read_settings(self) -> None:

@@ -247,6 +247,10 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     struct.pack_into("<I", original, 28, 0x02180014)
     with pytest.raises(RawFrameError, match="0x02180014 is not raw"):
         decode_u3v(bytes(original))
+    struct.pack_into("<I", original, 28, 0x010C0059)
+    struct.pack_into("<Q", original, len(original) - 12, 100)
+    with pytest.raises(RawFrameError, match="100 bytes are not the 2880 of 40x48"):
+        decode_u3v(bytes(original))
     struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
     with pytest.raises(RawFrameError, match="bytes are not the"):
         decode_u3v(bytes(original))
@@ -411,6 +415,69 @@ def test_a_stream_passes_over_a_torn_frame_and_counts_it(fault, shape):
     assert next(stream).metadata["frames_lost"] == "0"
 
 
+def test_only_one_frame_is_lost_where_only_its_end_is_missing(bench, faults):
+    stream = bench.open().stream()
+    next(stream)
+    faults.inject("lost_trailer")
+    assert [next(stream).metadata["frames_lost"] for _ in range(2)] == ["1", "0"]
+
+
+def test_the_end_of_another_frame_does_not_make_this_one_whole(bench):
+    camera = bench.open()
+    send = bench.simulator._send
+
+    def send_wrong_end(exposure_s, block, start_s):
+        send(exposure_s, block, start_s)
+        trailer = bytearray(bench.simulator._messages.pop())
+        trailer[8] += 3
+        bench.simulator._messages.append(bytes(trailer))
+
+    bench.simulator._send = send_wrong_end
+    with pytest.raises(FrameLostError, match="begins as frame 0 and ends as 3"):
+        camera.snap()
+
+
+def test_the_stream_is_halted_and_cleared_before_it_is_enabled(bench, monkeypatch):
+    camera = bench.open()
+    done = []
+    simulator = bench.simulator
+    control, cleared, store = simulator.control, simulator.cleared, simulator._store
+
+    def note_store(address, data):
+        if address == simulation.SIRM + codec.SIRM_CONTROL:
+            done.append("enable" if data[0] else "disable")
+        return store(address, data)
+
+    monkeypatch.setattr(simulator, "control", lambda *a: done.append("halt") or control(*a))
+    monkeypatch.setattr(simulator, "cleared", lambda end: done.append("clear") or cleared(end))
+    monkeypatch.setattr(simulator, "_store", note_store)
+    camera.snap()
+    assert done == ["disable", "halt", "clear", "enable", "disable", "halt", "clear"]
+
+
+def test_settings_are_unlocked_after_an_acquisition(bench):
+    camera = bench.open()
+    with closing(camera.stream()) as stream:
+        next(stream)
+        assert not camera.features.is_writable("Width")
+    assert camera.features.is_writable("Width")
+
+
+def test_a_payload_may_be_smaller_than_the_camera_reserves(bench, monkeypatch):
+    simulator = bench.simulator
+    update = simulator._update_sizes
+
+    def reserve_more():
+        update()
+        struct.pack_into("<Q", simulator._regions[simulation.SIRM], 0x08, 40 * 48 * 2 + 5000)
+
+    monkeypatch.setattr(simulator, "_update_sizes", reserve_more)
+    camera = bench.open()
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    for frame in itertools.islice(camera.stream(), 3):
+        np.testing.assert_array_equal(frame.mosaic, MOSAIC)
+
+
 def test_dropped_frames_are_counted_by_the_cameras_numbers(bench, faults):
     stream = bench.open().stream()
     next(stream)
@@ -483,12 +550,75 @@ def test_a_description_that_unpacks_without_end_is_refused(bench):
         bench.open()
 
 
-def test_a_camera_without_an_exposure_is_refused(bench):
-    xml = bench.simulator.description.replace(b'"ExposureTime"', b'"ExposureTimf"')
-    bench.simulator._file = simulation._zip(xml)
+def described_as(bench, old, new):
+    """Change what the camera says of itself, as another maker would have it."""
+    assert old in bench.simulator.description
+    bench.simulator._file = simulation._zip(bench.simulator.description.replace(old, new))
     bench.simulator.plugged()
+    return bench.open()
+
+
+def test_a_camera_without_single_frames_gives_one_all_the_same(bench):
+    camera = described_as(bench, b'"SingleFrame"', b'"MultiFrame"')
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    assert not bench.simulator.streaming
+
+
+@pytest.mark.parametrize(("unit", "exposure_s"), [(b"us", 0.01), (b"ms", 10.0), (b"s", 10_000.0)])
+def test_the_exposure_is_read_in_the_unit_that_the_camera_states(bench, unit, exposure_s):
+    camera = described_as(bench, b"<Unit>us</Unit>", b"<Unit>%b</Unit>" % unit)
+    assert camera.exposure_s == pytest.approx(exposure_s)
+
+
+def test_a_gain_that_is_no_decibels_is_linear(bench):
+    camera = described_as(bench, b"<Unit>dB</Unit>", b"<Unit>x</Unit>")
+    camera.set_gain(4.0)
+    assert camera.features.value("Gain") == pytest.approx(4.0)
+
+
+def test_a_camera_without_gain_or_black_level_has_gain_1_and_black_0(bench):
+    camera = described_as(bench, b'Name="Gain"', b'Name="Gein"')
+    assert (camera.gain, camera.gain_limits) == (1.0, (1.0, 1.0))
+    camera.close()
+    camera = described_as(bench, b'Name="BlackLevel"', b'Name="BleckLevel"')
+    assert camera.snap().black_level_dn[1, 1] == 0
+
+
+def test_a_black_level_in_per_cent_is_one_of_white(bench):
+    camera = described_as(
+        bench, b"<pValue>BlackLevelKnife</pValue>", b"<Value>2</Value><Unit>%</Unit>"
+    )
+    assert camera.snap().black_level_dn[0, 0] == pytest.approx(0.02 * 4095)
+
+
+def test_a_feature_of_another_kind_than_usual_does_not_stop_the_opening(bench):
+    camera = described_as(
+        bench, b'<Port Name="Device"/>', b'<Integer Name="GainSelector"><Value>1</Value></Integer>'
+    )
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+@pytest.mark.parametrize("where", [simulation.ANSWER_IN, simulation.STREAM_IN])
+def test_ctrl_c_stops_the_camera(bench, monkeypatch, where):
+    camera = bench.open()
+    read, armed = bench.simulator.bulk_in, [True]
+
+    def interrupt(endpoint, length, timeout_s):
+        if armed and endpoint == where and bench.simulator.streaming:
+            armed.clear()
+            raise KeyboardInterrupt
+        return read(endpoint, length, timeout_s)
+
+    monkeypatch.setattr(bench.simulator, "bulk_in", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        camera.snap()
+    assert not bench.simulator.streaming
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+def test_a_camera_without_an_exposure_is_refused(bench):
     with pytest.raises(CameraDescriptionError, match="none of ExposureTime"):
-        bench.open()
+        described_as(bench, b'"ExposureTime"', b'"ExposureTimf"')
 
 
 SEEDS = st.integers(0, 1 << 62)
