@@ -479,10 +479,11 @@ class HostStage(ABC):
             return {}
         self._send_once(targets_um, partial(self._start_moves, targets_um, start_um))
         started_s = self._clock.now_s()
-        limits_s = {
-            axis: move_time_limit_s(target_um - start_um[axis], self.speed_um_s(axis))
+        slowest_s = max(
+            move_time_limit_s(target_um - start_um[axis], self.speed_um_s(axis))
             for axis, target_um in targets_um.items()
-        }
+        )
+        limits_s = dict.fromkeys(targets_um, slowest_s)
         while True:
             moved_s = self._wait_until_idle(limits_s, started_s, self._is_moving)
             reached_um = self._positions_after_move_um(targets_um)

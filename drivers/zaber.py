@@ -120,7 +120,9 @@ class ZaberStage(HostStage):
         if reply.flag in (codec.NO_FLAG, *REFERENCE_FLAGS) or reply.flag.startswith("N"):
             homed = reply.flag not in REFERENCE_FLAGS
         else:
-            homed = REFERENCE_FLAGS.isdisjoint(self._warnings(axis))
+            flags = self._warnings(axis)
+            self._raise_fault(axis, flags, LostPositionError)
+            homed = REFERENCE_FLAGS.isdisjoint(flags)
         return Reading(self._number(axis, reply) * self._microstep_um[axis], homed, reply.busy)
 
     def _start_home(self, axes: tuple[str, ...]) -> None:
@@ -146,11 +148,7 @@ class ZaberStage(HostStage):
     def _is_moving(self, axis: str) -> bool:
         reply = self._query(axis, "")
         if reply.flag != codec.NO_FLAG and not reply.flag.startswith("N"):
-            for flag in self._warnings(axis):
-                if flag.startswith("F") or flag in FAULTS_BY_FLAG:
-                    fault = FAULTS_BY_FLAG.get(flag, AxisFaultError)
-                    meaning = codec.FLAG_MEANINGS.get(flag, "see the protocol manual")
-                    raise fault(axis, f"{flag} ({meaning})").about(reply=flag)
+            self._raise_fault(axis, self._warnings(axis), AxisFaultError)
         return reply.busy
 
     def _travel_um(self, axis: str) -> tuple[float, float]:
@@ -174,6 +172,15 @@ class ZaberStage(HostStage):
         if not (count.isdigit() and int(count) == len(flags)):
             raise GarbledReplyError(reply.data.encode("ascii"), f"no list of warnings of {axis}")
         return flags
+
+    def _raise_fault(self, axis: str, flags: list[str], kind: type[AxisFaultError]) -> None:
+        """Raise the most severe fault of a kind among the flags, if there is one."""
+        for flag in flags:
+            if flag.startswith("F") or flag in FAULTS_BY_FLAG:
+                fault = FAULTS_BY_FLAG.get(flag, AxisFaultError)
+                if issubclass(fault, kind):
+                    meaning = codec.FLAG_MEANINGS.get(flag, "see the protocol manual")
+                    raise fault(axis, f"{flag} ({meaning})").about(reply=flag)
 
     def _length_um(self, axis: str, setting: str) -> float:
         return self._number(axis, self._query(axis, f"get {setting}")) * self._microstep_um[axis]

@@ -303,11 +303,14 @@ class GrblController(SimulatedController):
     def _execute(self, line: str) -> None:
         if line == "OVERFLOW":
             raise _RefusedError(11)
+        if not line:
+            self._say("ok")
+            return
         if line.startswith("$"):
             self._execute_system(line)
         elif self._state in ("Alarm", "Jog", "Door"):
             raise _RefusedError(9)
-        elif line:
+        else:
             self._execute_gcode(line)
             if self._waits_for_reset:
                 return
@@ -404,7 +407,7 @@ class GrblController(SimulatedController):
             return
         for letter, (place_um, speed_um_s) in self._homing.popleft().items():
             acceleration_um_s2 = self._setting(codec.ACCELERATION, letter) * 1e3
-            self._motors[letter].seek(place_um, speed_um_s, acceleration_um_s2)
+            self._motors[letter].seek(place_um, speed_um_s, acceleration_um_s2, start_s)
 
     def _fail_homing(self, code: int) -> None:
         self._homing_letters = ()

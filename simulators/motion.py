@@ -193,9 +193,16 @@ class Motor:
         start_s = self._clock.now_s() if start_s is None else start_s
         self._course = Motion(self._motor_um, end_um, start_s, speed_um_s, acceleration_um_s2)
 
-    def seek(self, true_um: float, speed_um_s: float, acceleration_um_s2: float) -> None:
+    def seek(
+        self,
+        true_um: float,
+        speed_um_s: float,
+        acceleration_um_s2: float,
+        start_s: float | None = None,
+    ) -> None:
         """Begin a move to a true position, as homing to a switch does."""
-        self.go(true_um - self._counted_from_um, speed_um_s, acceleration_um_s2)
+        counted_um = true_um - self._counted_from_um
+        self.go(counted_um, speed_um_s, acceleration_um_s2, start_s=start_s)
         self._end = End.ARRIVED
 
     def brake(self, acceleration_um_s2: float) -> None:
