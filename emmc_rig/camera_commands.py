@@ -31,11 +31,12 @@ from emmc_rig.frame_view import (
     histogram_text,
     preview,
 )
-from emmc_rig.hardware import CAMERA_KINDS, open_camera
 
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
-CameraSpec = Annotated[str, typer.Option("--camera", help=CAMERA_KINDS)]
+CameraSpec = Annotated[
+    str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+]
 ExposureOption = Annotated[
     float | None, typer.Option("--exposure", help="in seconds (default: as the camera is set)")
 ]
@@ -43,6 +44,13 @@ GainOption = Annotated[
     float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
 ]
 OutFolder = Annotated[Path, typer.Option("--out", help="folder to save frames in")]
+
+
+def open_camera(spec: str) -> Camera:
+    """Open a camera by name; see `emmc_rig.hardware.open_camera`, which takes a second to load."""
+    from emmc_rig.hardware import open_camera as opened
+
+    return opened(spec)
 
 
 def register(app: typer.Typer) -> None:

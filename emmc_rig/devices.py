@@ -20,6 +20,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from emmc_rig.camera_commands import register
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -43,11 +44,15 @@ RigOption = Annotated[
 AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (default: all)")]
 
 
+register(app)
+
+
 @app.command("list")
 def list_devices() -> None:
-    """List the serial ports: their USB adapter, what usually answers there, who holds them."""
+    """List serial ports (adapter, what usually answers there, who holds them) and USB cameras."""
     from drivers.ports import holder_of, list_serial_ports
 
+    _list_cameras()
     ports = list_serial_ports()
     if not ports:
         typer.echo("no serial port: plug a stage in, or try --rig simulated")
@@ -64,6 +69,30 @@ def list_devices() -> None:
             port.guess,
             holder_of(port.device),
         )
+    Console().print(table)
+
+
+def _list_cameras() -> None:
+    """Print the PTP and USB3 Vision cameras that are plugged in."""
+    from drivers.errors import DriverError
+    from drivers.ptp_usb import PTP_INTERFACE
+    from drivers.u3v_codec import CONTROL
+    from drivers.usb import list_devices as list_usb
+
+    found = []
+    for kind, interface in (("ptp", PTP_INTERFACE), ("u3v", CONTROL)):
+        try:
+            found += [(kind, one) for one in list_usb(interface)]
+        except DriverError as fault:
+            typer.echo(f"USB cameras cannot be listed: {fault}")
+            return
+    if not found:
+        typer.echo("no USB camera: plug one in and switch it on, or try --camera simulated")
+        return
+    table = Table("camera", "maker", "model", "may be opened", box=SIMPLE)
+    for kind, one in found:
+        allowed = "yes" if one.accessible else "no: see `emmc-rig devices udev-rule`"
+        table.add_row(f"{kind}:{one.serial}", one.maker, one.model, allowed)
     Console().print(table)
 
 
@@ -164,9 +193,11 @@ def bench(
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 300,
     out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
 ) -> None:
-    """Time what a stage command costs on a simulated wire that itself takes no time."""
+    """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
     from emmc_rig.device_benchmark import stage_timings
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.picture_benchmark import picture_timing
+    from emmc_rig.u3v_benchmark import u3v_timings
 
     timings = stage_timings(repeats)
     table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
@@ -179,13 +210,27 @@ def bench(
             f"{one.milliseconds / one.exchanges:.3f}",
         )
     Console().print(table)
+    picture = picture_timing()
+    typer.echo(
+        f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
+        f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times rawpy "
+        "alone"
+    )
+    streams = list(u3v_timings())
+    for one in streams:
+        typer.echo(
+            f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, {one.gigabytes_per_s:.2f} GB/s"
+        )
     if out is not None:
-        rows = [one.as_dict() for one in timings]
+        metrics = {
+            "stage_commands": [one.as_dict() for one in timings],
+            "picture": picture.as_dict(),
+            "usb3_vision": [one.as_dict() for one in streams],
+            "command": command_line(),
+            "versions": versions(),
+        }
         with result_folder(out) as folder:
-            write_metrics(
-                folder,
-                {"stage_commands": rows, "command": command_line(), "versions": versions()},
-            )
+            write_metrics(folder, metrics)
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """USB3 Vision timings: unpacking on one core, and whole frames from the simulated camera.
 
-Run as `python -m emmc_rig.u3v_benchmark`. Gigabytes count the camera's bytes, not the pixels
+Part of `emmc-rig devices bench`. Gigabytes count the camera's bytes, not the pixels
 made of them. The simulated stream includes everything but the cable: packets into the host's
 buffer, the frame put together, its SHA-256 and its mosaic.
 """
@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
@@ -38,6 +38,10 @@ class U3vTiming:
     def gigabytes_per_s(self) -> float:
         """Camera bytes per second."""
         return self.gigabytes / self.seconds
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the row with its rate."""
+        return {**asdict(self), "gigabytes_per_s": self.gigabytes_per_s}
 
 
 def unpacking_timings(size: tuple[int, int] = SIZE_24MP, repeats: int = 9) -> Iterator[U3vTiming]:
@@ -91,10 +95,8 @@ def _median_s(call: Callable[[], object], repeats: int) -> float:
     return statistics.median(seconds)
 
 
-def _main() -> None:
-    for timing in (*unpacking_timings(), stream_timing(), command_timing()):
-        print(f"{timing.name:32} {timing.seconds * 1e3:9.3f} ms {timing.gigabytes_per_s:7.2f} GB/s")
-
-
-if __name__ == "__main__":
-    _main()
+def u3v_timings() -> Iterator[U3vTiming]:
+    """Yield all of them."""
+    yield from unpacking_timings()
+    yield stream_timing()
+    yield command_timing()

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -133,7 +134,7 @@ def test_ctrl_c_in_a_download_leaves_no_file_and_frees_the_camera(tmp_path, monk
     clock = ManualClock()
     function = PtpUsbFunction(scene_simulator(clock))
     bus = SimulatedUsb(clock, function)
-    camera = open_camera("ptp:S1", clock, bus)
+    camera: Any = open_camera("ptp:S1", clock, bus)
 
     def interrupt(done, size):
         raise KeyboardInterrupt

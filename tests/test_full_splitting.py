@@ -1,5 +1,7 @@
 """The paper's eq. 10-13 against the exact data step: one minimiser; and its step sizes."""
 
+from typing import Any
+
 import numba
 import numpy as np
 import pytest
@@ -86,13 +88,14 @@ def test_the_start_does_not_change_the_minimiser_and_a_good_one_saves_steps(code
     term = from_patches([(0, 0)], [truth], None, truth.shape)
     settings = TVSettings(mu=1e-3, rho=0.1, rtol=1e-9, max_steps=4000, primal_step=30.0)
     plain = reconstruct_tv(psi, frames, 0.0, settings, patch_term=term)
-    for algorithm, chosen in (
+    algorithms: list[tuple[Any, Any]] = [
         (reconstruct_tv, settings),
         (
             reconstruct_full_splitting,
             FullSplittingSettings(mu=1e-3, rho=0.1, chroma_weight=2.0, rtol=1e-9),
         ),
-    ):
+    ]
+    for algorithm, chosen in algorithms:
         again = algorithm(psi, frames, 0.0, chosen, patch_term=term, start=plain.light_field)
         far = algorithm(
             psi, frames, 0.0, chosen, patch_term=term, start=np.ones_like(plain.light_field)
