@@ -1,0 +1,75 @@
+"""The tables and findings as a person reads them in a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.box import SIMPLE
+from rich.table import Table
+from rich.text import Text
+
+from emmc_rig.tables.findings import Finding
+from emmc_rig.tables.grids import Grid, Pair
+from emmc_rig.tables.plan import METHOD_TITLES
+
+COLOURS = {"holds": "green", "does not hold": "red", "not measured": "dim"}
+WIDE = 4
+
+
+def tables_of(grids: Sequence[Grid]) -> Iterator[Table]:
+    """Yield one table per grid: ours, and the paper's behind a bar or, in wide ones, below."""
+    for grid in grids:
+        table = Table(title=grid.title, box=SIMPLE, title_justify="left", caption_justify="left")
+        for head in grid.heads:
+            table.add_column(head)
+        stacked = len(grid.columns) > WIDE
+        for column in grid.columns:
+            table.add_column(column, justify="right")
+        table.caption = "PSNR in dB: ours" + (
+            ", the paper's below" if stacked else " | the paper's"
+        )
+        before: tuple[str, ...] = ()
+        for line in grid.lines:
+            if before and line.heads[0] != before[0]:
+                table.add_section()
+            heads = [
+                "" if before[: i + 1] == line.heads[: i + 1] else head
+                for i, head in enumerate(line.heads[:-1])
+            ]
+            pairs = [_shown(pair, stacked) for pair in line.pairs]
+            table.add_row(*heads, line.heads[-1], *pairs, style="bold" if line.mean else "")
+            before = line.heads
+        yield table
+
+
+def _shown(pair: Pair, stacked: bool) -> Text:
+    text = Text(_db(pair.ours))
+    if pair.paper is not None:
+        text.append("\n" if stacked else " | ", style="dim")
+        text.append(_db(pair.paper), style="dim")
+    return text
+
+
+def _db(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    """Return the findings: verdict, by how much, in how many scenes, and in the paper."""
+    table = Table(title="The paper's findings on these light fields", box=SIMPLE)
+    table.title_justify = "left"
+    table.add_column("finding")
+    table.add_column("verdict")
+    table.add_column("by: mean (range), dB", justify="right")
+    table.add_column("scenes", justify="right")
+    table.add_column("paper's numbers", justify="right")
+    for finding in findings:
+        judged = finding.judged
+        table.add_row(
+            f"{finding.claim.says} [dim]({METHOD_TITLES[finding.claim.judged_by]})[/]",
+            Text(finding.verdict, style=COLOURS[finding.verdict]),
+            "-" if judged is None else str(judged),
+            "-" if judged is None else f"{judged.holding}/{judged.scenes}",
+            "-" if finding.printed is None else str(finding.printed),
+        )
+    return table
