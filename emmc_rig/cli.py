@@ -29,6 +29,7 @@ from reconstruction.errors import ReconstructionError
 
 if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
+    from reconstruction.result import Progress as SolverProgress
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
@@ -79,6 +80,15 @@ class Bars:
         """Advance the current bar."""
         if self._task is not None:
             self._progress.update(self._task, advance=1, detail=detail)
+
+    def advance(self, progress: SolverProgress) -> None:
+        """Show how far a solver is."""
+        if self._task is not None:
+            change = progress.relative_change
+            detail = "" if change is None else f"change {change:.1e}"
+            self._progress.update(
+                self._task, completed=progress.step, total=progress.total, detail=detail
+            )
 
     def finish(self) -> None:
         """Fill the current bar: a solver may stop before its last step."""
@@ -241,6 +251,68 @@ def simulate(
         f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "
         f"efficiency {metrics['light_efficiency']:.1%}; in {out}"
     )
+
+
+@app.command()
+def reconstruct(
+    frames: Annotated[
+        Path | None, typer.Argument(help="a folder that `demo` or `simulate` wrote")
+    ] = None,
+    method: Annotated[str, typer.Option("--method", help="see --list")] = "tv",
+    list_methods: Annotated[
+        bool, typer.Option("--list", help="the methods: what each assumes, costs, is for")
+    ] = False,
+    psi: Annotated[
+        Path | None,
+        typer.Option("--psi", help="imaging matrix (default: psi.h5 beside the frames)"),
+    ] = None,
+    dictionary: Annotated[
+        str | None,
+        typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
+    ] = None,
+    settings: Annotated[
+        Path | None, typer.Option("--settings", help="YAML of method settings: tv, sparse")
+    ] = None,
+    truth: Annotated[
+        str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
+    ] = None,
+    out: OutOption = Path("emmc-reconstruction"),
+) -> None:
+    """Reconstruct the light field of a folder of frames, by any method."""
+    from emmc_rig.output import result_folder
+    from emmc_rig.reconstruct import load_settings, run_reconstruct
+    from reconstruction.methods import COSTS, METHODS
+
+    if list_methods:
+        for known in METHODS.values():
+            typer.echo(f"{known.name}: {known.title}")
+            typer.echo(f"    assumes  {known.assumes}")
+            typer.echo(f"    use it   {known.when}")
+            typer.echo(f"    costs    {known.cost}")
+        typer.echo(COSTS)
+        return
+    if frames is None:
+        raise typer.BadParameter("name a folder of frames, or --list the methods")
+    chosen = load_settings(settings)
+    with result_folder(out) as folder, _progress() as progress:
+        bars = Bars(progress)
+        bars.begin(method, None)
+        metrics = run_reconstruct(
+            frames, folder, method, psi, dictionary, chosen, truth, lambda step: bars.advance(step)
+        )
+        bars.finish()
+    compared = ""
+    if "psnr_db" in metrics:
+        gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
+        compared = (
+            f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied centre view, "
+            f"SSIM {metrics['ssim']:.3f}"
+        )
+    typer.echo(
+        f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
+        + (f" ({metrics['advice']})" if metrics["advice"] else "")
+    )
+    typer.echo(f"open {out / 'pictures'}")
 
 
 @app.command()

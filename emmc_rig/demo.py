@@ -183,7 +183,14 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": psnr})
         focus = focus_disparities(truth)
         export_pictures(folder / "pictures", estimate, focus)
-        save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s())
+        save_frames(
+            folder / "frames.h5",
+            frames_dn,
+            readings,
+            camera.exposures_s(),
+            deviation=np.sqrt(variance),
+            usable=usable,
+        )
         calibration.psi.save(folder / "psi.h5")
         metrics["seconds"] = dict(stages.seconds)
         write_report(

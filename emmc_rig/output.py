@@ -88,7 +88,7 @@ def save_frames(
     frames_dn: NDArray[np.uint16],
     readings: NDArray[np.floating],
     exposures_s: NDArray[np.floating],
-    **more: NDArray[np.floating],
+    **more: NDArray,
 ) -> None:
     """Write frames (shot, y, x) as HDF5: frames_dn, readings, exposures_s (shot,), and more."""
     arrays = {"frames_dn": frames_dn, "readings": readings, "exposures_s": exposures_s, **more}

@@ -25,7 +25,8 @@ def simulate(
 ) -> dict:
     """Write frames.h5, psi.h5 and metrics.json into an existing folder; return the metrics.
 
-    frames.h5 holds `frames_dn` (shot, y, x) uint16, `readings` and `noise_free`, float32.
+    frames.h5 holds `frames_dn` (shot, y, x) uint16, `readings`, their standard `deviation`, which
+    pixels are `usable`, and `noise_free` readings.
     sensor_psnr_db compares readings with noise to those without, peak 1, as the paper's Figure 5.
     """
     scene = open_scene(scene_spec, size=size, views=camera.views, seed=seed)
@@ -36,7 +37,16 @@ def simulate(
     clean = psi.forward(scene.light_field)
     frames_dn = noise.expose_dn(clean, exposures_s, light, np.random.default_rng(seed))
     readings = noise.normalise(frames_dn, exposures_s, light)
-    save_frames(folder / "frames.h5", frames_dn, readings, camera.exposures_s(), noise_free=clean)
+    usable = ~noise.saturated(frames_dn) & (light > 0)
+    save_frames(
+        folder / "frames.h5",
+        frames_dn,
+        readings,
+        camera.exposures_s(),
+        deviation=np.sqrt(noise.variance(readings, exposures_s, light)),
+        usable=usable,
+        noise_free=clean,
+    )
     psi.save(folder / "psi.h5")
     metrics = {
         "scene": scene_spec,
@@ -46,7 +56,7 @@ def simulate(
         "size": list(psi.size),
         "sensor_psnr_db": psnr_db(readings, clean),
         "electrons_per_s": noise.electrons_per_s,
-        "saturated_share": float(noise.saturated(frames_dn).mean()),
+        "saturated_share": float(1 - usable.mean()),
         "light_efficiency": psi.light_efficiency(),
         "seed": seed,
         "warnings": camera.warnings(),

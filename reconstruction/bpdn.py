@@ -40,7 +40,9 @@ class BPDNSettings(Settings):
     smallest_penalty: float = Field(
         default=1e-3, gt=0, lt=1, description="eta against the penalty above which the code is 0"
     )
-    rtol: float = Field(default=1e-3, gt=0, description="relative duality gap")
+    rtol: float = Field(
+        default=1e-3, gt=0, description="relative duality gap; float32 certifies about 1e-5"
+    )
     max_steps: int = Field(default=3000, ge=1)
     relaxation: float = Field(default=1.8, ge=1, lt=2, description="of ADMM")
     threshold: float = Field(
@@ -50,9 +52,9 @@ class BPDNSettings(Settings):
     tolerance_factor: float = Field(
         default=1.0, ge=0, description="of the noise's norm, at which omp and sl0 rest"
     )
-    sl0_shrink: float = Field(default=0.6, gt=0, lt=1, description="of the widths of sl0")
+    sl0_shrink: float = Field(default=0.7, gt=0, lt=1, description="of the widths of sl0")
     sl0_inner_steps: int = Field(default=3, ge=1)
-    sl0_narrowest: float = Field(default=0.01, gt=0, lt=1)
+    sl0_narrowest: float = Field(default=0.005, gt=0, lt=1)
 
 
 @dataclass(frozen=True, eq=False)

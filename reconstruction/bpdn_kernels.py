@@ -38,15 +38,33 @@ def gram(atoms, out):
         for i in range(length):
             ai, bi, ci, di = a[i], b[i], c[i], d[i]
             row = out[i]
-            for k in range(length):
+            for k in range(i + 1):
                 row[k] += ai * a[k] + bi * b[k] + ci * c[k] + di * d[k]
     for j in range(even, count):
         a = atoms[j]
         for i in range(length):
             ai = a[i]
             row = out[i]
-            for k in range(length):
+            for k in range(i + 1):
                 row[k] += ai * a[k]
+    for i in range(length):
+        for k in range(i):
+            out[k, i] = out[i, k]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _pairwise(atoms, out):
+    """Set out (atom, atom) to the atoms' inner products."""
+    count, length = atoms.shape
+    for i in range(count):
+        a = atoms[i]
+        for j in range(i + 1):
+            b = atoms[j]
+            total = np.float32(0)
+            for k in range(length):
+                total += a[k] * b[k]
+            out[i, j] = total
+            out[j, i] = total
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -91,12 +109,39 @@ def invert(matrix, ridge, out):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def factor(atoms, rho, out):
-    """Set out to (A A^T + rho 1)^-1, (measurement, measurement); return whether it exists."""
-    blocks = np.empty_like(out)
-    gram(atoms, blocks)
-    return invert(blocks, np.float64(rho), out)
+    """Set out to (A A^T + rho 1)^-1, (measurement, measurement); return whether it exists.
+
+    With fewer atoms than measurements by Woodbury, (1 - A (A^T A + rho 1)^-1 A^T) / rho.
+    """
+    count, length = atoms.shape
+    if count >= length:
+        gram(atoms, out)
+        return invert(out, np.float64(rho), out)
+    small = np.empty((count, count))
+    _pairwise(atoms, small)
+    if not invert(small, np.float64(rho), small):
+        return False
+    total = np.zeros((length, length))
+    part = np.empty(length)
+    for i in range(count):
+        part[:] = 0
+        for j in range(count):
+            weight = small[i, j]
+            a = atoms[j]
+            for k in range(length):
+                part[k] += weight * a[k]
+        a = atoms[i]
+        for k in range(length):
+            weight = np.float64(a[k])
+            row = total[k]
+            for p in range(length):
+                row[p] += weight * part[p]
+    for i in range(length):
+        for k in range(length):
+            out[i, k] = ((1.0 if i == k else 0.0) - total[i, k]) / rho
+    return True
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -666,7 +711,7 @@ def sl0(atoms, data, tolerance, shrink, inner_steps, narrowest, ridge, code):
     coefficient); after each the code is projected back onto the data, where it misses them by
     more than the tolerance. ridge: of A A^T, relative. Returns the passes and the residual.
     """
-    count, length = atoms.shape
+    length = data.size
     blocks = np.empty((length, length), np.float32)
     inverse = np.empty((length, length), np.float32)
     gram(atoms, blocks)

@@ -1,14 +1,20 @@
-"""A dictionary is a set of light-field patches of unit norm: check it, keep it in a file."""
+"""A dictionary is a set of light-field patches of unit norm: check it, keep it in a file.
+
+Two kinds need no training: `dct_dictionary`, and `lambertian_dictionary`, which fits any views,
+patch and disparities and codes real patches best of those (see there).
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from reconstruction.errors import DictionaryError
 
@@ -16,6 +22,12 @@ KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
 FORMAT = "emmc-rig dictionary 1"
 _NORM_TOLERANCE = 1e-3
 _CHUNK_BYTES = 1 << 20
+
+OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Luminance and two chrominances (opponent colour, RGB), orthonormal."""
+DISPARITIES = tuple(float(d) for d in np.arange(-2, 2.1, 0.5))
+_BLUR_PX, _CHROMA_BLUR_PX = 0.7, 1.0
+_SAME = 0.995
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,3 +179,198 @@ def _norms(atoms: NDArray[np.floating], kind: str) -> NDArray[np.float64]:
 
 def _one_line(fault: Exception) -> str:
     return " ".join(str(fault).split())
+
+
+Textures = NDArray[np.float32]
+"""Atoms of one colour: (atom, v, u, y, x)."""
+
+
+def dct_dictionary(
+    views: tuple[int, int],
+    patch: tuple[int, int],
+    frequencies: tuple[int, int, int, int] | None = None,
+    chroma_frequencies: tuple[int, int, int, int] | None = None,
+    colours: int = 3,
+) -> Dictionary:
+    """Return products of cosines along v, u, y and x, each in every opponent colour.
+
+    Frequency k of an axis of n samples is cos(pi (i + 1/2) k / max(n, frequencies)): the DCT's,
+    orthonormal together, or an overcomplete set when more frequencies than samples are asked for.
+
+    Args:
+        views: rows and columns of views.
+        patch: rows and columns of pixels.
+        frequencies: how many, from 0, along v, u, y, x for the luminance. The default, 3 along v
+            and u and all along y and x, codes real 9x9 patches to 0.1 dB as well as all 6,075.
+        chroma_frequencies: likewise for the chrominances; default 2 and half of the pixels'.
+        colours: 3, or 1 for the luminance alone.
+
+    Raises:
+        DictionaryError: an axis of no samples or frequencies; other colours than 1 or 3.
+    """
+    _check_patch(views, patch, colours)
+    sizes = *views, *patch
+    counts = frequencies or (*(min(3, n) for n in views), *patch)
+    chroma = chroma_frequencies or (
+        *(min(2, n) for n in views),
+        *(max(1, n // 2) for n in patch),
+    )
+    sets = [_cosines(sizes, counts), *[_cosines(sizes, chroma)] * (colours - 1)]
+    return Dictionary.normalised(_coloured(sets), "dct")
+
+
+def lambertian_dictionary(
+    views: tuple[int, int],
+    patch: tuple[int, int],
+    disparities: Sequence[float] = DISPARITIES,
+    colours: int = 3,
+) -> Dictionary:
+    """Return textures on planes: texture(y - d (v - V // 2), x - d (u - U // 2)), in one colour.
+
+    The textures are straight edges and lines (8 directions, every 1.5 pixels, as sharp as a
+    pixel allows) and spots, less their mean, which one flat atom per colour holds; for the
+    chrominances fewer and softer edges, at every other disparity. Disparities are in pixels per
+    view step, with the sign of `emmc_rig.model.lightfield`. Nearly equal atoms come once.
+
+    Args:
+        views: rows and columns of views.
+        patch: rows and columns of pixels.
+        disparities: of the planes; steps of half a pixel for 5x5 views.
+        colours: 3, or 1 for the luminance alone.
+
+    Raises:
+        DictionaryError: no disparity, one not finite or so large that the outer views of a patch
+            share nothing with the centre; other colours than 1 or 3; an axis of no samples.
+    """
+    _check_patch(views, patch, colours)
+    planes = np.unique(np.asarray(disparities, dtype=float))
+    reach = max(max(n // 2, 1) for n in views)
+    largest = max(patch) / reach
+    if planes.size == 0 or not np.isfinite(planes).all() or np.abs(planes).max() > largest:
+        raise DictionaryError(
+            f"disparities {tuple(disparities)}: needs one or more, finite, within "
+            f"+-{largest:.4g} pixels per view step for these views and patches"
+        )
+    edge, line = _edge(_BLUR_PX), _line(_BLUR_PX)
+    textures = [
+        *(_ridges(views, patch, d, 8, 1.5, (edge, line)) for d in planes),
+        *(_spots(views, patch, d, 1.5, 1.0) for d in planes),
+    ]
+    sets = [_distinct([_flat(views, patch), *textures])]
+    if colours == 3:
+        nearest = int(np.abs(planes).argmin())
+        soft = [
+            _ridges(views, patch, d, 6, 2.0, (_edge(_CHROMA_BLUR_PX),))
+            for d in planes[nearest % 2 :: 2]
+        ]
+        sets += [_distinct([_flat(views, patch), *soft])] * 2
+    return Dictionary.normalised(_coloured(sets), "lambertian")
+
+
+def _check_patch(views: tuple[int, int], patch: tuple[int, int], colours: int) -> None:
+    if min(*views, *patch) < 1:
+        raise DictionaryError(
+            f"{views[0]}x{views[1]} views of {patch[0]}x{patch[1]} pixels: needs 1x1 of 1x1 or more"
+        )
+    if colours not in (1, 3):
+        raise DictionaryError(f"{colours} colours: needs 1 or 3")
+
+
+def _coloured(sets: Sequence[Textures]) -> NDArray[np.float32]:
+    """Return atoms (atom, v, u, y, x, c): the n-th set in the n-th opponent colour."""
+    mixes = OPPONENT if len(sets) == 3 else np.ones((1, 1))
+    return np.concatenate(
+        [textures[..., None] * mix for textures, mix in zip(sets, mixes, strict=True)]
+    ).astype(np.float32)
+
+
+def _cosines(sizes: Sequence[int], counts: Sequence[int]) -> Textures:
+    if len(counts) != 4 or min(counts) < 1:
+        raise DictionaryError(f"frequencies {tuple(counts)}: needs 4 numbers (v, u, y, x), 1 or up")
+    axes = []
+    for n, count in zip(sizes, counts, strict=True):
+        angle = np.pi * (np.arange(n) + 0.5) / max(n, count)
+        axes.append(np.cos(np.arange(count)[:, None] * angle))
+    return np.einsum("av,bu,cy,dx->abcdvuyx", *axes).reshape(-1, *sizes)
+
+
+def _grid(
+    views: tuple[int, int], patch: tuple[int, int], disparity: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where in the texture every sample (v, u, y, x) looks, from the patch's middle."""
+    v, u, y, x = np.meshgrid(
+        np.arange(views[0]) - views[0] // 2,
+        np.arange(views[1]) - views[1] // 2,
+        np.arange(patch[0]) - (patch[0] - 1) / 2,
+        np.arange(patch[1]) - (patch[1] - 1) / 2,
+        indexing="ij",
+    )
+    return y - disparity * v, x - disparity * u
+
+
+def _edge(blur_px: float) -> Callable[[NDArray], NDArray]:
+    return lambda t: erf(t / (np.sqrt(2) * blur_px))
+
+
+def _line(blur_px: float) -> Callable[[NDArray], NDArray]:
+    return lambda t: np.exp(-0.5 * np.square(t / blur_px))
+
+
+def _offsets(reach_px: float, step_px: float) -> NDArray[np.float64]:
+    last = int(reach_px / step_px)
+    return step_px * np.arange(-last, last + 1)
+
+
+def _ridges(
+    views: tuple[int, int],
+    patch: tuple[int, int],
+    disparity: float,
+    directions: int,
+    step_px: float,
+    profiles: Sequence[Callable[[NDArray], NDArray]],
+) -> Textures:
+    """Return textures that vary along one direction only, with their middle wherever it shows."""
+    y, x = _grid(views, patch, disparity)
+    found = []
+    for angle in np.pi * np.arange(directions) / directions:
+        along = np.cos(angle) * x + np.sin(angle) * y
+        offsets = _offsets(0.9 * float(np.abs(along).max()), step_px)
+        found += [profile(along - o) for profile in profiles for o in offsets]
+    return np.array(found, dtype=np.float32)
+
+
+def _spots(
+    views: tuple[int, int], patch: tuple[int, int], disparity: float, step_px: float, blur_px: float
+) -> Textures:
+    y, x = _grid(views, patch, disparity)
+    down = _line(blur_px)(
+        y - _offsets(patch[0] / 2 + abs(disparity), step_px)[:, None, None, None, None]
+    )
+    right = _line(blur_px)(
+        x - _offsets(patch[1] / 2 + abs(disparity), step_px)[:, None, None, None, None]
+    )
+    return (down[:, None] * right).reshape(-1, *y.shape).astype(np.float32)
+
+
+def _flat(views: tuple[int, int], patch: tuple[int, int]) -> Textures:
+    return np.ones((1, *views, *patch), np.float32)
+
+
+def _distinct(sets: Sequence[Textures]) -> Textures:
+    """Return the first set as it is, then the others less their means, leaving out repetitions.
+
+    An atom goes that is hardly there, or nearly parallel to an earlier one.
+    """
+    shape = sets[0].shape[1:]
+    kept = np.concatenate(sets).reshape(-1, int(np.prod(shape)))
+    first = len(sets[0])
+    kept[first:] -= kept[first:].mean(axis=1, keepdims=True)
+    norms = np.linalg.norm(kept, axis=1)
+    kept = kept[norms > 1e-2 * np.sqrt(kept.shape[1])]
+    kept /= np.linalg.norm(kept, axis=1, keepdims=True)
+    near = np.abs(kept @ kept.T) > _SAME
+    stays = np.ones(len(kept), bool)
+    for i in range(len(kept)):
+        if stays[i]:
+            stays[i + 1 :] &= ~near[i, i + 1 :]
+    return kept[stays].reshape(-1, *shape)

@@ -35,9 +35,7 @@ class MethodSettings(Settings):
 
 @dataclass(frozen=True)
 class Method:
-    """One way to reconstruct. cost: with N samples of the light field, p patches of N_p samples,
-    n atoms, m measurements a patch, s shots.
-    """
+    """One way to reconstruct; `cost` in the letters of COSTS."""
 
     name: str
     title: str
@@ -47,7 +45,11 @@ class Method:
     needs_dictionary: bool = False
 
 
-_BUILDING = "p n N_p/3 x 2 to build Psi D, then "
+COSTS = (
+    "N values of the light field, s shots; p patches of q values and m readings, n atoms: "
+    "building Psi D takes 2/3 p n q operations where pixels see one colour, 2 p n q else"
+)
+_BUILDING = "Psi D, then "
 METHODS = {
     method.name: method
     for method in (
@@ -62,7 +64,7 @@ METHODS = {
             "dict-admm",
             "sparse patches by ADMM with working sets (the paper's Dict-ADMM)",
             "patches are a few atoms of the dictionary",
-            _BUILDING + "p (2 n m^2 + 4 n m x 30-200 passes)",
+            _BUILDING + "p (n m^2 + 4 n m x 30-100 passes) operations",
             "one shot with a dictionary of similar scenes",
             True,
         ),
@@ -70,7 +72,7 @@ METHODS = {
             "dict-lars",
             "sparse patches by the Lasso path (LARS)",
             "as dict-admm, and the same minimiser to rounding",
-            _BUILDING + "p 2 n m x steps, about one a joining atom",
+            _BUILDING + "p 2 n m operations a step, 1-3 steps an atom used",
             "exact minimiser wanted, or few atoms per patch",
             True,
         ),
@@ -78,7 +80,7 @@ METHODS = {
             "dict-omp",
             "sparse patches by orthogonal matching pursuit",
             "patches are at most `atoms` atoms",
-            _BUILDING + "p 2 n m x atoms",
+            _BUILDING + "p 2 n m operations an atom",
             "quickest; coarse previews",
             True,
         ),
@@ -86,7 +88,7 @@ METHODS = {
             "dict-ista",
             "sparse patches by proximal gradient",
             "as dict-admm",
-            _BUILDING + "p (2 n m^2 + 4 n m x thousands of steps)",
+            _BUILDING + "p (n m^2 + 4 n m x thousands of steps) operations",
             "only to compare",
             True,
         ),
@@ -94,7 +96,7 @@ METHODS = {
             "dict-fista",
             "sparse patches by accelerated proximal gradient with restart",
             "as dict-admm",
-            _BUILDING + "p (2 n m^2 + 4 n m x 500-5,000 steps)",
+            _BUILDING + "p (n m^2 + 4 n m x 500-5,000 steps) operations",
             "only to compare",
             True,
         ),
@@ -102,7 +104,7 @@ METHODS = {
             "dict-sl0",
             "sparse patches by smoothed l0 (as [18])",
             "patches are the fewest atoms that explain the frames",
-            _BUILDING + "p (2 n m^2 + 4 n m x 30 passes)",
+            _BUILDING + "p (n m^2 + 4 n m x 50 passes) operations",
             "little noise; to compare with [18]",
             True,
         ),

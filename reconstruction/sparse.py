@@ -6,7 +6,7 @@ patches where mask, colours and usable pixels repeat; the sparse solver runs on 
 patches are averaged with the weights of a window.
 
 Cost of a patch with n atoms, m measurements, N samples x views (and n_c stored colours):
-building 2 n N n_c operations, `admm` 2 n m^2 + 4 n m per pass, `lars` 4 n m per step, `omp` 2 n m
+building 2 n N n_c operations, `admm` n m^2 + 4 n m per pass, `lars` 4 n m per step, `omp` 2 n m
 per atom, `ista`, `fista` and `sl0` 4 n m per step; putting the patch together 2 N c per atom used.
 """
 

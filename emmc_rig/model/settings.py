@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from emmc_rig.model.errors import ModelError
-
 
 class Settings(BaseModel):
     """Base of every configuration object: frozen, no unknown keys, no coercion of NaN."""
@@ -86,7 +84,7 @@ def validated(cls: type[S], data: object, source: str, error: type[Exception]) -
         raise error(f"{source}: {explain(fault, cls)}") from fault
 
 
-def read_yaml(path: Path, error: type[ModelError]) -> object:
+def read_yaml(path: Path, error: type[Exception]) -> object:
     """Return the content of a YAML file; raise `error` with one line when it cannot be read."""
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -1,0 +1,144 @@
+"""Reconstruct a folder of frames by any method: frames.h5 and psi.h5 -> light_field.h5, pictures.
+
+The folder is what `demo` and `simulate` write: readings, their standard deviation, and which
+pixels are usable, with the imaging matrix beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.lightfield import (
+    export_pictures,
+    focus_disparities,
+    psnr_db,
+    replicate_centre,
+    save_hdf5,
+    ssim,
+)
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import read_yaml, validated
+from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.scene import open_scene
+from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
+from reconstruction.methods import MethodSettings, find_method, reconstruct
+from reconstruction.result import Progress
+
+FRAMES, PSI, LIGHT_FIELD = "frames.h5", "psi.h5", "light_field.h5"
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """readings: (shot, y, x). noise_sigma: their typical deviation. usable: (shot, y, x)."""
+
+    readings: NDArray[np.float32]
+    noise_sigma: float
+    usable: NDArray[np.bool_]
+
+
+def read_capture(folder: Path) -> Capture:
+    """Read frames.h5 of a folder; raises AppError when it is missing, damaged or incomplete."""
+    path = folder / FRAMES
+    if not path.is_file():
+        raise AppError(
+            f"{folder}: holds no {FRAMES}; name a folder that `emmc-rig demo` or "
+            "`emmc-rig simulate` wrote"
+        )
+    try:
+        with h5py.File(path, "r") as file:
+            readings, deviation, usable = (
+                np.asarray(file[name]) for name in ("readings", "deviation", "usable")
+            )
+    except (OSError, KeyError) as fault:
+        why = " ".join(str(fault).split())
+        raise AppError(f"{path}: cannot be read ({why}); make the frames again") from fault
+    usable = usable.astype(bool)
+    if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
+        raise AppError(f"{path}: readings, deviation and usable differ in shape")
+    judged = deviation[usable]
+    sigma = float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
+    return Capture(readings, sigma, usable)
+
+
+def open_dictionary(spec: str | None, psi: ImagingMatrix) -> Dictionary:
+    """Return a dictionary by file, or by the name of one that needs no training.
+
+    None takes `lambertian`. Those made here have patches of 9 x 9 samples, or the nearest
+    multiple of the pixels' k below.
+    """
+    if spec in (None, "lambertian", "dct"):
+        side = 9 // psi.binning * psi.binning or psi.binning
+        make = dct_dictionary if spec == "dct" else lambertian_dictionary
+        return make(psi.light_field_shape[:2], (side, side))
+    return Dictionary.load(spec)
+
+
+def load_settings(path: Path | None) -> MethodSettings:
+    """Read method settings from YAML; misspelt keys name the nearest valid one."""
+    if path is None:
+        return MethodSettings()
+    return validated(MethodSettings, read_yaml(path, AppError), str(path), AppError)
+
+
+def run_reconstruct(
+    folder: Path,
+    out: Path,
+    method: str,
+    psi_path: Path | None = None,
+    dictionary_spec: str | None = None,
+    settings: MethodSettings | None = None,
+    truth: str | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+) -> dict:
+    """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
+
+    dictionary_spec: see `open_dictionary`. truth: the scene that was captured, when known, to
+    compare with.
+    """
+    needs_dictionary = find_method(method).needs_dictionary
+    capture = read_capture(folder)
+    psi = ImagingMatrix.load(psi_path or folder / PSI)
+    dictionary = open_dictionary(dictionary_spec, psi) if needs_dictionary else None
+    result = reconstruct(
+        method,
+        psi,
+        capture.readings,
+        capture.noise_sigma,
+        dictionary,
+        settings,
+        capture.usable,
+        on_step,
+    )
+    metrics = {
+        "method": result.method,
+        "status": result.status,
+        "advice": result.advice,
+        "steps": result.steps,
+        "seconds": result.seconds,
+        "parameters": result.parameters,
+        "noise_sigma": capture.noise_sigma,
+        "usable_share": float(capture.usable.mean()),
+        "shots": psi.shots,
+        "size": list(psi.size),
+        "psi_sha256": psi.checksum(),
+        "dictionary": dictionary.kind if dictionary is not None else None,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    if truth is not None:
+        true = open_scene(truth, size=psi.size, views=psi.light_field_shape[:2]).light_field
+        metrics["truth"] = truth
+        metrics["psnr_db"] = psnr_db(result.light_field, true)
+        metrics["ssim"] = ssim(result.light_field, true)
+        metrics["replicate_psnr_db"] = psnr_db(replicate_centre(true), true)
+    save_hdf5(out / LIGHT_FIELD, result.light_field, {"method": result.method})
+    export_pictures(out / "pictures", result.light_field, focus_disparities(result.light_field))
+    write_metrics(out, metrics)
+    return metrics

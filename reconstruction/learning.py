@@ -1,0 +1,373 @@
+"""Learn a dictionary from patches by K-SVD: sparse coding and atom updates, one step at a time.
+
+Aharon, Elad, Bruckstein 2006, "K-SVD: an algorithm for designing overcomplete dictionaries for
+sparse representation", with the batch pursuit and the rank-1 updates by alternating projections
+of Rubinstein, Zibulevsky, Elad 2008. Patches keep their mean, as they must describe measurements;
+the first atoms may be flat ones, one per opponent colour, which stay as they are.
+
+Operations of one step for N patches of n samples, K atoms, k of them per code: 2 N K n + K^2 n +
+N K (k^2 + 3 k) for the pursuits, 4 N k n for the residuals, 4 (p + 1) N k n for the updates with p
+power iterations. For N = 30,000, n = 6,075, K = 5,120, k = 10, p = 2: 1.9 + 0.16 + 0.02, 0.007 and
+0.02 TFLOP, nearly all of it matrix products. Memory: patches and residuals 4 N n bytes each, two
+dictionaries 4 K n, the Gram matrix 4 K^2: 1.8 GB there. Bytes of the updates: 8 N k n (15 GB).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import get_num_threads, njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from emmc_rig.model.settings import Settings
+from reconstruction.batch_omp import NO_ATOM, Array, bands, batch_omp
+from reconstruction.dictionary import OPPONENT
+from reconstruction.errors import DictionaryError
+
+_ROWS_AT_ONCE = 2048
+
+
+class LearningSettings(Settings):
+    """Settings of a dictionary's training."""
+
+    atoms: int = Field(default=1024, ge=1)
+    sparsity: int = Field(default=8, ge=1, description="atoms per patch at most")
+    iterations: int = Field(default=15, ge=1)
+    flat_atoms: bool = Field(default=True, description="keep one flat atom per opponent colour")
+    power_iterations: int = Field(
+        default=2, ge=1, description="alternating projections of each atom's rank-1 update"
+    )
+    fewest_uses: int = Field(default=1, ge=0, description="atoms used less are replaced")
+    largest_coherence: float = Field(
+        default=0.99, gt=0, le=1, description="of two atoms nearer than this one is replaced"
+    )
+    seed: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step: root mean square errors per sample after coding and after the atoms' update."""
+
+    step: int
+    coded_rmse: float
+    updated_rmse: float
+    replaced: int
+
+
+@dataclass(frozen=True, eq=False)
+class LearningState:
+    """All that a step needs and changes: what a checkpoint holds.
+
+    atoms: (atom, sample). indices, coefficients: (patch, k), the codes; NO_ATOM where unused.
+    """
+
+    atoms: Array
+    indices: NDArray[np.int32]
+    coefficients: Array
+    history: tuple[Iteration, ...] = ()
+
+
+def flat_atoms(patch_shape: tuple[int, ...]) -> Array:
+    """Return constant atoms (colour, sample), one per opponent colour, of unit norm."""
+    colours = patch_shape[-1]
+    mixes = OPPONENT if colours == 3 else np.eye(colours)
+    atoms = np.broadcast_to(mixes[:, None], (colours, int(np.prod(patch_shape[:-1])), colours))
+    atoms = atoms.reshape(colours, -1)
+    return (atoms / np.linalg.norm(atoms, axis=1, keepdims=True)).astype(np.float32)
+
+
+def fixed_atoms(settings: LearningSettings, patch_shape: tuple[int, ...]) -> Array:
+    """Return the atoms that training leaves alone, none of them without `flat_atoms`."""
+    flat = flat_atoms(patch_shape)
+    return flat if settings.flat_atoms else flat[:0]
+
+
+def first_state(
+    patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]
+) -> LearningState:
+    """Return the fixed atoms and random patches less their share of them, and empty codes.
+
+    patches: (patch, sample). Raises DictionaryError for patches too few, of another size, not
+    finite, or with too few that differ from the fixed atoms.
+    """
+    _check(patches, settings, patch_shape)
+    fixed = fixed_atoms(settings, patch_shape)
+    wanted = settings.atoms - len(fixed)
+    order = np.random.default_rng(settings.seed).permutation(len(patches))
+    chosen = np.empty((wanted, patches.shape[1]), np.float32)
+    found = 0
+    for start in range(0, len(order), _ROWS_AT_ONCE):
+        rows = patches[order[start : start + _ROWS_AT_ONCE]]
+        left = rows - (rows @ fixed.T) @ fixed
+        norms = np.linalg.norm(left, axis=1)
+        good = np.flatnonzero(norms > 1e-3 * np.linalg.norm(rows, axis=1))[: wanted - found]
+        chosen[found : found + len(good)] = left[good] / norms[good, None]
+        found += len(good)
+        if found == wanted:
+            break
+    if found < wanted:
+        raise DictionaryError(
+            f"only {found} of {len(patches)} patches are not flat, too few to start "
+            f"{settings.atoms} atoms: give more patches or ask for fewer atoms"
+        )
+    codes = len(patches), settings.sparsity
+    return LearningState(
+        np.concatenate([fixed, chosen]), np.full(codes, NO_ATOM, np.int32), np.zeros(codes, "f4")
+    )
+
+
+def ksvd_step(
+    state: LearningState, patches: Array, settings: LearningSettings, fixed: int
+) -> LearningState:
+    """Return the state after sparse coding, the update of every atom and replacements.
+
+    fixed: how many of the first atoms stay. A patch keeps its old code where the new one is no
+    better, so that the error never rises in the coding; it never rises in the update either.
+    """
+    indices, coefficients = batch_omp(state.atoms, patches, settings.sparsity)
+    residuals = np.empty_like(patches)
+    errors = _keep_better(state, patches, indices, coefficients, residuals)
+    coded_rmse = float(np.sqrt(errors.sum() / patches.size))
+    atoms = state.atoms.copy()
+    _update_atoms(atoms, indices, coefficients, residuals, settings.power_iterations, fixed)
+    errors = _squares(residuals)
+    updated_rmse = float(np.sqrt(errors.sum() / patches.size))
+    replaced = _replace_atoms(atoms, indices, coefficients, residuals, errors, settings, fixed)
+    done = Iteration(len(state.history) + 1, coded_rmse, updated_rmse, replaced)
+    return LearningState(atoms, indices, coefficients, (*state.history, done))
+
+
+def learn_ksvd(
+    patches: Array,
+    patch_shape: tuple[int, ...],
+    settings: LearningSettings,
+    start: LearningState | None = None,
+    on_step: Callable[[LearningState], None] | None = None,
+) -> LearningState:
+    """Return the state after `settings.iterations` steps in all.
+
+    Args:
+        patches: (patch, sample) float32, samples in the order of `patch_shape`.
+        patch_shape: (v, u, y, x, c).
+        settings: what to learn.
+        start: where an earlier run of the same patches and settings stopped; the result is then
+            the one of an undisturbed run.
+        on_step: called with the state after every step.
+
+    Raises:
+        DictionaryError: as `first_state`; or a `start` of other patches or settings.
+    """
+    _check(patches, settings, patch_shape)
+    state = start or first_state(patches, settings, patch_shape)
+    shapes = (settings.atoms, patches.shape[1]), (len(patches), settings.sparsity)
+    if (state.atoms.shape, state.indices.shape) != shapes:
+        raise DictionaryError("the state to resume from is of other patches or settings")
+    fixed = len(fixed_atoms(settings, patch_shape))
+    while len(state.history) < settings.iterations:
+        state = ksvd_step(state, patches, settings, fixed)
+        if on_step is not None:
+            on_step(state)
+    return state
+
+
+def without_unused(state: LearningState, fixed: int) -> LearningState:
+    """Return the state with the atoms that no patch uses left out, the fixed ones apart."""
+    uses = np.bincount(state.indices[state.indices >= 0], minlength=len(state.atoms))
+    kept = (uses > 0) | (np.arange(len(uses)) < fixed)
+    place = np.where(kept, np.cumsum(kept) - 1, NO_ATOM).astype(np.int32)
+    indices = np.where(state.indices >= 0, place[state.indices], NO_ATOM).astype(np.int32)
+    return replace(state, atoms=state.atoms[kept], indices=indices)
+
+
+def _check(patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]) -> None:
+    if patches.ndim != 2 or patches.shape[1] != np.prod(patch_shape):
+        raise DictionaryError(
+            f"training patches of shape {patches.shape}: needs (patch, {np.prod(patch_shape)})"
+        )
+    if patches.dtype != np.float32:
+        raise DictionaryError(f"training patches are {patches.dtype}: needs float32")
+    if len(patches) < settings.atoms:
+        raise DictionaryError(
+            f"{len(patches)} patches for {settings.atoms} atoms: give at least as many patches"
+        )
+    if settings.sparsity > settings.atoms:
+        raise DictionaryError(f"a sparsity of {settings.sparsity}, but {settings.atoms} atoms")
+    if settings.flat_atoms and settings.atoms <= patch_shape[-1]:
+        raise DictionaryError(f"{settings.atoms} atoms: more than the {patch_shape[-1]} flat ones")
+    if not np.isfinite(_squares(patches)).all():
+        raise DictionaryError("training patches hold values that are not finite: leave them out")
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _residual(atoms, patch, indices, coefficients, out):
+    """Set out (sample,) to the patch less its code, and return its squared norm."""
+    out[:] = patch
+    for k in range(indices.size):
+        if indices[k] >= 0:
+            atom, weight = atoms[indices[k]], coefficients[k]
+            for i in range(out.size):
+                out[i] -= weight * atom[i]
+    total = 0.0
+    for i in range(out.size):
+        total += np.float64(out[i]) * out[i]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _keep_better_rows(
+    atoms, patches, old_indices, old_coefficients, indices, coefficients, residuals, errors
+):
+    spare = np.empty(patches.shape[1], patches.dtype)
+    for row in range(len(patches)):
+        new, old = residuals[row], spare
+        errors[row] = _residual(atoms, patches[row], indices[row], coefficients[row], new)
+        before = _residual(atoms, patches[row], old_indices[row], old_coefficients[row], old)
+        if before <= errors[row]:
+            errors[row] = before
+            new[:] = old
+            indices[row] = old_indices[row]
+            coefficients[row] = old_coefficients[row]
+
+
+def _keep_better(
+    state: LearningState,
+    patches: Array,
+    indices: NDArray[np.int32],
+    coefficients: Array,
+    residuals: Array,
+) -> NDArray[np.float64]:
+    """Put a patch's old code back where the new one is no better; set residuals, return squares."""
+    errors = np.empty(len(patches))
+
+    def rows(band: tuple[int, int]) -> None:
+        part = slice(*band)
+        _keep_better_rows(
+            state.atoms,
+            patches[part],
+            state.indices[part],
+            state.coefficients[part],
+            indices[part],
+            coefficients[part],
+            residuals[part],
+            errors[part],
+        )
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        list(pool.map(rows, bands(len(patches))))
+    return errors
+
+
+def _squares(rows: Array) -> NDArray[np.float64]:
+    """Return the squared norm of every row, summed in float64 in small parts."""
+    parts = [
+        np.einsum("ij,ij->i", part, part, dtype=np.float64)
+        for part in np.array_split(rows, max(1, len(rows) // _ROWS_AT_ONCE))
+    ]
+    return np.concatenate(parts)
+
+
+def uses_of_atoms(
+    indices: NDArray[np.int32], atoms: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the places (flat, in `indices`) of every atom's uses, and where each atom's begin."""
+    flat = indices.ravel()
+    order = np.argsort(flat, kind="stable")
+    return order, np.searchsorted(flat[order], np.arange(atoms + 1))
+
+
+def _update_atoms(
+    atoms: Array,
+    indices: NDArray[np.int32],
+    coefficients: Array,
+    residuals: Array,
+    power_iterations: int,
+    fixed: int,
+) -> None:
+    """Fit every atom and its coefficients to what the others leave of its patches, in place.
+
+    With residuals E of an atom's patches (others' and its own share removed), the best atom is
+    the leading right singular vector of E + g d^T. It is found by alternating projections from
+    the present atom, each the best for the other's value, so the error cannot rise.
+    """
+    order, begins = uses_of_atoms(indices, len(atoms))
+    weights = coefficients.reshape(-1)
+    for atom in range(fixed, len(atoms)):
+        places = order[begins[atom] : begins[atom + 1]]
+        if not places.size:
+            continue
+        old_atom, old_weights = atoms[atom].copy(), weights[places]
+        parts = np.array_split(places // indices.shape[1], -(-len(places) // _ROWS_AT_ONCE))
+        cuts = np.cumsum([0, *map(len, parts)])
+        gathered = [residuals[part] for part in parts] if len(parts) == 1 else None
+        new_weights = old_weights
+        new_atom = old_atom
+        for _ in range(power_iterations):
+            total = (new_weights @ old_weights) * old_atom
+            for i, part in enumerate(parts):
+                rows = gathered[i] if gathered else residuals[part]
+                total += new_weights[cuts[i] : cuts[i + 1]] @ rows
+            length = np.linalg.norm(total)
+            if length == 0:
+                break
+            new_atom = total / length
+            new_weights = (old_atom @ new_atom) * old_weights
+            for i, part in enumerate(parts):
+                rows = gathered[i] if gathered else residuals[part]
+                new_weights[cuts[i] : cuts[i + 1]] += rows @ new_atom
+        change = np.stack([old_atom, -new_atom])
+        for i, part in enumerate(parts):
+            rows = gathered[i] if gathered else residuals[part]
+            both = np.stack([old_weights, new_weights])[:, cuts[i] : cuts[i + 1]]
+            rows += both.T @ change
+            residuals[part] = rows
+        atoms[atom] = new_atom
+        weights[places] = new_weights
+
+
+def _replace_atoms(
+    atoms: Array,
+    indices: NDArray[np.int32],
+    coefficients: Array,
+    residuals: Array,
+    errors: NDArray[np.float64],
+    settings: LearningSettings,
+    fixed: int,
+) -> int:
+    """Put residuals of the worst patches in place of atoms little used or doubled; return count.
+
+    A replaced atom leaves the codes that used it, which are then a little worse until the next
+    coding.
+    """
+    uses = np.bincount(indices[indices >= 0], minlength=len(atoms))
+    poor = uses < settings.fewest_uses
+    poor |= _doubled(atoms, uses, settings.largest_coherence)
+    poor[:fixed] = False
+    places = np.flatnonzero(poor)
+    if not places.size:
+        return 0
+    worst = np.argsort(errors, kind="stable")[::-1][: len(places)]
+    places = places[: len(worst)]
+    spoilt = np.isin(indices, places)
+    indices[spoilt] = NO_ATOM
+    coefficients[spoilt] = 0
+    norms = np.sqrt(errors[worst])
+    for place, row, norm in zip(places, worst, norms, strict=True):
+        if norm > 0:
+            atoms[place] = residuals[row] / norm
+    return len(places)
+
+
+def _doubled(atoms: Array, uses: NDArray[np.int64], largest_coherence: float) -> NDArray[np.bool_]:
+    """Say of every atom whether a more used one (of equals the earlier) is nearly the same."""
+    rank = np.empty(len(atoms), np.int64)
+    rank[np.argsort(-uses, kind="stable")] = np.arange(len(atoms))
+    doubled = np.zeros(len(atoms), bool)
+    for start in range(0, len(atoms), _ROWS_AT_ONCE):
+        part = slice(start, start + _ROWS_AT_ONCE)
+        near = np.abs(atoms[part] @ atoms.T) > largest_coherence
+        doubled[part] = (near & (rank[None, :] < rank[part, None])).any(axis=1)
+    return doubled

@@ -1,0 +1,223 @@
+"""Sparse solvers: each finds the minimiser that slow, independent code finds."""
+
+import numpy as np
+import pytest
+
+from reconstruction import bpdn_kernels as kernels
+from reconstruction.bpdn import BPDNSettings, solve_bpdn
+from reconstruction.errors import ReconstructionError
+
+SIZES = [(60, 20), (33, 16), (300, 45), (12, 30)]
+
+
+def problem(count, length, sparsity=4, noise=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    atoms = rng.normal(size=(count, length)) * rng.uniform(0.3, 2, (count, 1))
+    code = np.zeros(count)
+    code[rng.choice(count, sparsity, replace=False)] = rng.normal(size=sparsity) + 2
+    return atoms, code @ atoms + noise * rng.normal(size=length), code
+
+
+def objective(atoms, data, eta, code):
+    code = np.asarray(code, dtype=np.float64)
+    return 0.5 * np.sum((data - code @ atoms) ** 2) + eta * np.abs(code).sum()
+
+
+def coordinate_descent(atoms, data, eta, sweeps=5000):
+    """The minimiser of eq. 8, one coefficient at a time in float64."""
+    code = np.zeros(len(atoms))
+    residual = data.copy()
+    power = (atoms**2).sum(axis=1)
+    for _ in range(sweeps):
+        largest = 0.0
+        for j, atom in enumerate(atoms):
+            old = code[j]
+            pull = atom @ residual + power[j] * old
+            code[j] = np.sign(pull) * max(abs(pull) - eta, 0) / power[j]
+            residual -= (code[j] - old) * atom
+            largest = max(largest, abs(code[j] - old))
+        if largest < 1e-13:
+            break
+    return code
+
+
+@pytest.mark.parametrize("method", ["admm", "lars", "fista", "ista"])
+@pytest.mark.parametrize(("count", "length"), SIZES)
+@pytest.mark.parametrize("share", [0.02, 0.3])
+def test_the_objective_is_the_least_to_a_millionth(method, count, length, share):
+    atoms, data, _ = problem(count, length, noise=0.1)
+    eta = share * np.abs(atoms @ data).max()
+    least = objective(atoms, data, eta, coordinate_descent(atoms, data, eta))
+    settings = BPDNSettings(method=method, penalty=eta, rtol=1e-7, max_steps=3000)
+    code = solve_bpdn(atoms, data, settings=settings)
+    assert objective(atoms, data, eta, code.weights) <= least * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("method", ["admm", "ista", "fista"])
+def test_the_gap_bounds_the_distance_from_the_least_objective(method):
+    atoms, data, _ = problem(300, 45, noise=0.1)
+    eta = 0.05 * np.abs(atoms @ data).max()
+    least = objective(atoms, data, eta, coordinate_descent(atoms, data, eta))
+    for rtol in (0.3, 0.03, 0.003):
+        code = solve_bpdn(atoms, data, settings=BPDNSettings(method=method, penalty=eta, rtol=rtol))
+        value = objective(atoms, data, eta, code.weights)
+        assert code.gap <= rtol
+        assert value - least <= (code.gap + 1e-6) * value
+
+
+def test_lars_ends_where_every_used_atom_correlates_with_the_residual_by_the_penalty():
+    atoms, data, _ = problem(300, 45, noise=0.3)
+    eta = 0.1 * np.abs(atoms @ data).max()
+    weights = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta)).weights
+    pull = atoms @ (data - weights.astype(float) @ atoms)
+    used = weights != 0
+    assert 1 < used.sum() <= 45
+    np.testing.assert_allclose(pull[used], eta * np.sign(weights[used]), rtol=1e-4)
+    assert np.abs(pull[~used]).max() <= eta * (1 + 1e-5)
+
+
+def test_atoms_leave_the_lasso_path_again():
+    """Correlated atoms change sign along the path; the end must be the minimiser all the same."""
+    rng = np.random.default_rng(3)
+    base = rng.normal(size=(4, 12))
+    atoms = rng.normal(size=(40, 4)) @ base + 0.05 * rng.normal(size=(40, 12))
+    data = rng.normal(size=12)
+    eta = 1e-3 * np.abs(atoms @ data).max()
+    code = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta))
+    assert code.steps > np.count_nonzero(code.weights)
+    least = objective(atoms, data, eta, coordinate_descent(atoms, data, eta, 100_000))
+    assert objective(atoms, data, eta, code.weights) <= least * (1 + 1e-5)
+
+
+def test_equal_atoms_and_dark_atoms_do_no_harm():
+    atoms, data, _ = problem(60, 20, noise=0.1)
+    atoms[10] = atoms[3]
+    atoms[20] = 0
+    eta = 0.05 * np.abs(atoms @ data).max()
+    lit = np.delete(atoms, 20, axis=0)
+    least = objective(lit, data, eta, coordinate_descent(lit, data, eta))
+    for method in ("admm", "lars", "fista"):
+        settings = BPDNSettings(method=method, penalty=eta, rtol=1e-5, max_steps=50_000)
+        weights = solve_bpdn(atoms, data, settings=settings).weights
+        assert weights[20] == 0
+        assert objective(atoms, data, eta, weights) <= least * (1 + 1e-4)
+    greedy = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=20)).weights
+    assert greedy[20] == 0
+    assert greedy[3] == 0 or greedy[10] == 0
+
+
+def plain_omp(atoms, data, most):
+    """Orthogonal matching pursuit by least squares on the chosen atoms."""
+    chosen, residual = [], data
+    size = np.linalg.norm(atoms, axis=1)
+    for _ in range(most):
+        chosen.append(int(np.argmax(np.abs(atoms @ residual) / size)))
+        weights, *_ = np.linalg.lstsq(atoms[chosen].T, data, rcond=None)
+        residual = data - weights @ atoms[chosen]
+    code = np.zeros(len(atoms))
+    code[chosen] = weights
+    return code
+
+
+@pytest.mark.parametrize("most", [1, 3, 8])
+def test_matching_pursuit_agrees_with_least_squares_on_the_chosen_atoms(most):
+    atoms, data, _ = problem(300, 45, sparsity=12)
+    code = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=most))
+    np.testing.assert_allclose(code.weights, plain_omp(atoms, data, most), atol=2e-5)
+
+
+@pytest.mark.parametrize("method", ["omp", "sl0", "lars"])
+def test_a_planted_sparse_code_is_found(method):
+    atoms, data, planted = problem(300, 80, sparsity=5)
+    penalty = 1e-4 * np.abs(atoms @ data).max()
+    settings = BPDNSettings(
+        method=method, penalty=penalty, atoms=5, sl0_shrink=0.8, sl0_narrowest=0.002
+    )
+    found = solve_bpdn(atoms, data, settings=settings).weights
+    np.testing.assert_allclose(found, planted, atol=0.02)
+
+
+def test_matching_pursuit_rests_at_the_noise():
+    atoms, data, _ = problem(300, 80, sparsity=5, noise=0.05)
+    code = solve_bpdn(atoms, data, 0.05, BPDNSettings(method="omp", atoms=60))
+    assert 5 <= np.count_nonzero(code.weights) <= 10
+    assert code.residual <= 0.05 * np.sqrt(80)
+
+
+def test_the_penalty_follows_the_noise_and_the_size_of_the_sensed_atoms():
+    atoms, data, _ = problem(300, 45)
+    small, large = (solve_bpdn(atoms, data, sigma).penalty for sigma in (0.3, 0.6))
+    assert large == pytest.approx(2 * small)
+    expected = 0.5 * 0.3 * np.sqrt((atoms**2).sum(axis=1).mean() * 2 * np.log(300))
+    assert small == pytest.approx(expected, rel=1e-5)
+    scaled = solve_bpdn(3 * atoms, 3 * data, 0.3).penalty
+    assert scaled == pytest.approx(3 * small)
+
+
+def test_without_noise_the_penalty_is_a_small_share_of_the_largest_useful_one():
+    atoms, data, _ = problem(300, 45)
+    largest = np.abs(atoms @ data).max()
+    assert solve_bpdn(atoms, data).penalty == pytest.approx(1e-3 * largest, rel=1e-5)
+    zero = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=1.01 * largest))
+    assert not zero.weights.any()
+
+
+@pytest.mark.parametrize("method", ["admm", "ista", "lars"])
+def test_a_step_limit_is_a_status(method):
+    atoms, data, _ = problem(300, 45, noise=0.3)
+    settings = BPDNSettings(method=method, penalty=1e-3, max_steps=2)
+    code = solve_bpdn(atoms, data, settings=settings)
+    assert not code.converged
+    assert np.isfinite(code.weights).all()
+
+
+@pytest.mark.parametrize("method", ["admm", "omp", "lars", "ista", "fista", "sl0"])
+def test_no_data_gives_no_atoms(method):
+    atoms, _, _ = problem(60, 20)
+    code = solve_bpdn(atoms, np.zeros(20), settings=BPDNSettings(method=method))
+    assert not code.weights.any()
+    assert code.converged
+
+
+def test_what_cannot_be_coded_is_refused():
+    atoms, data, _ = problem(60, 20)
+    broken = data.copy()
+    broken[3] = np.nan
+    for bad_atoms, bad_data, sigma, line in (
+        (atoms, data[:-1], 0.0, "shape"),
+        (atoms, broken, 0.0, "not finite"),
+        (np.full_like(atoms, np.inf), data, 0.0, "not finite"),
+        (atoms, data, -1.0, "noise level"),
+        (atoms[:0], data, 0.0, "shape"),
+    ):
+        with pytest.raises(ReconstructionError, match=line):
+            solve_bpdn(bad_atoms, bad_data, sigma)
+
+
+@pytest.mark.parametrize("count", [50, 13])
+def test_the_inverse_is_that_of_the_gram_matrix_with_its_ridge(count):
+    atoms = problem(count, 20)[0].astype(np.float32)
+    inverse = np.empty((20, 20), np.float32)
+    assert kernels.factor(atoms, np.float32(0.7), inverse)
+    expected = np.linalg.inv(atoms.T.astype(float) @ atoms + 0.7 * np.eye(20))
+    np.testing.assert_allclose(inverse, expected, atol=1e-5)
+    assert not kernels.factor(np.zeros((5, 20), np.float32), np.float32(0), inverse)
+
+
+def test_matching_pursuit_agrees_with_scikit_learn():
+    linear_model = pytest.importorskip("sklearn.linear_model", exc_type=ImportError)
+    atoms, data, _ = problem(300, 45, sparsity=12)
+    atoms /= np.linalg.norm(atoms, axis=1, keepdims=True)
+    theirs = linear_model.orthogonal_mp(atoms.T, data, n_nonzero_coefs=8)
+    ours = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=8)).weights
+    np.testing.assert_allclose(ours, theirs, atol=2e-5)
+
+
+def test_lars_agrees_with_scikit_learn():
+    linear_model = pytest.importorskip("sklearn.linear_model", exc_type=ImportError)
+    atoms, data, _ = problem(300, 45, noise=0.3)
+    eta = 0.05 * np.abs(atoms @ data).max()
+    model = linear_model.LassoLars(alpha=eta / data.size, fit_intercept=False)
+    theirs = model.fit(atoms.T, data).coef_
+    ours = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta)).weights
+    np.testing.assert_allclose(ours, theirs, atol=2e-4)
