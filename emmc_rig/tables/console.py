@@ -10,13 +10,21 @@ from rich.text import Text
 
 from emmc_rig.tables.findings import Finding
 from emmc_rig.tables.grids import Grid, Pair
+from emmc_rig.tables.page import CAVEAT
 from emmc_rig.tables.plan import METHOD_TITLES
 
-COLOURS = {"holds": "green", "does not hold": "red", "not measured": "dim"}
+COLOURS = {"holds": "green", "does not hold": "red"}
 WIDE = 4
 
 
-def tables_of(grids: Sequence[Grid]) -> Iterator[Table]:
+def shown(grids: Sequence[Grid], findings: Sequence[Finding]) -> Iterator[Table | Text]:
+    """Yield everything to print, the caveat last."""
+    yield from _tables(grids)
+    yield _findings_table(findings)
+    yield Text(CAVEAT, style="yellow")
+
+
+def _tables(grids: Sequence[Grid]) -> Iterator[Table]:
     """Yield one table per grid: ours, and the paper's behind a bar or, in wide ones, below."""
     for grid in grids:
         table = Table(title=grid.title, box=SIMPLE, title_justify="left", caption_justify="left")
@@ -54,22 +62,26 @@ def _db(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def findings_table(findings: Sequence[Finding]) -> Table:
-    """Return the findings: verdict, by how much, in how many scenes, and in the paper."""
+def _findings_table(findings: Sequence[Finding]) -> Table:
+    """Return the findings: verdict, by how much and in how many scenes, and in the paper."""
     table = Table(title="The paper's findings on these light fields", box=SIMPLE)
-    table.title_justify = "left"
+    table.title_justify = table.caption_justify = "left"
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("dB: mean (range), scenes", no_wrap=True)
+    table.add_column("paper", justify="right", no_wrap=True)
     table.add_column("finding")
-    table.add_column("verdict")
-    table.add_column("by: mean (range), dB", justify="right")
-    table.add_column("scenes", justify="right")
-    table.add_column("paper's numbers", justify="right")
+    missing = 0
     for finding in findings:
-        judged = finding.judged
+        judged, printed = finding.judged, finding.printed
+        if judged is None:
+            missing += 1
+            continue
         table.add_row(
-            f"{finding.claim.says} [dim]({METHOD_TITLES[finding.claim.judged_by]})[/]",
             Text(finding.verdict, style=COLOURS[finding.verdict]),
-            "-" if judged is None else str(judged),
-            "-" if judged is None else f"{judged.holding}/{judged.scenes}",
-            "-" if finding.printed is None else str(finding.printed),
+            f"{judged}, {judged.holding}/{judged.scenes}",
+            "-" if printed is None else f"{printed.mean_db:+.2f}",
+            f"{finding.claim.says} [dim]({METHOD_TITLES[finding.claim.judged_by]})[/]",
         )
+    if missing:
+        table.caption = f"{missing} findings need tables that were not asked for"
     return table

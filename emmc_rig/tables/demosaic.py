@@ -29,7 +29,8 @@ def demosaiced_rggb(frame: NDArray[np.floating]) -> NDArray[np.float32]:
     def filtered(kernel: NDArray[np.int_]) -> NDArray[np.float32]:
         weights = (kernel / 16).astype(np.float32)
         # Reflection about the edge pixel keeps the phase of the Bayer tile.
-        return np.asarray(cv2.filter2D(frame, -1, weights, borderType=cv2.BORDER_REFLECT_101))
+        found = cv2.filter2D(frame, -1, weights, borderType=cv2.BORDER_REFLECT_101)
+        return found.astype(np.float32, copy=False)
 
     green, row, column, across = (
         filtered(kernel) for kernel in (_GREEN, _ALONG_ROW, _ALONG_ROW.T, _ACROSS)

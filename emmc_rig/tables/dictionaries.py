@@ -1,7 +1,7 @@
 """The dictionary for each scored scene: never one that was trained on it.
 
 Leave-one-out training on the other given scenes, kept in the output folder with its provenance;
-or a given file, whose training scenes are looked up; or the training-free Lambertian one.
+or a given file, whose training scenes are looked up; or one that needs no training.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.settings import Settings
 from emmc_rig.tables import paper
 from emmc_rig.tables.journal import digest_of
-from emmc_rig.tables.library import Cut, Library
-from reconstruction.dictionary import Dictionary
+from emmc_rig.tables.library import VIEWS, Cut, Library
+from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
 from reconstruction.learning import LearningSettings, fixed_atoms, learn_ksvd, without_unused
 from reconstruction.training_patches import PatchSettings, training_patches
 
-LAMBERTIAN = "lambertian"
 TRAINING_FREE = ("dct", "lambertian")
 
 
@@ -140,43 +139,59 @@ class LeaveOneOut:
 
 
 @dataclass
-class Files:
-    """Dictionaries from files: for each pixel size that is asked for, the first that fits."""
+class Given:
+    """Dictionaries that the user names: files, or those that need no training.
 
-    by_binning: dict[int, tuple[Path, Dictionary]]
+    by_binning: for each pixel size that is asked for, the name and the first that fits.
+    """
+
+    by_binning: dict[int, tuple[str, Dictionary]]
 
     @classmethod
-    def opened(cls, paths: Sequence[Path], binnings: Sequence[int], scenes: Sequence[str]) -> Files:
-        """Load the files; raises AppError when none fits a pixel size, or one saw a scene."""
-        loaded = [(path, Dictionary.load(path)) for path in paths]
-        for path, dictionary in loaded:
-            check_not_trained_on(dictionary, path, scenes)
+    def opened(cls, specs: Sequence[str], binnings: Sequence[int], scenes: Sequence[str]) -> Given:
+        """Open them; raises AppError when none fits a pixel size, or one saw a scored scene."""
+        files = {spec: Dictionary.load(spec) for spec in specs if spec not in TRAINING_FREE}
+        for spec, dictionary in files.items():
+            check_not_trained_on(dictionary, spec, scenes)
         chosen = {}
         for k in binnings:
-            fitting = [item for item in loaded if not any(n % k for n in item[1].patch_shape[2:4])]
-            if not fitting:
+            fitting = (
+                (Path(spec).name, found)
+                for spec in specs
+                if (found := files.get(spec) or _made(spec, k)) is not None
+                and not any(n % k for n in found.patch_shape[2:4])
+            )
+            first = next(fitting, None)
+            if first is None:
                 raise AppError(
                     f"--dictionary: pixels of {k}x{k} samples (r = 1/{k * k}) need patches that "
                     f"are a multiple of {k}; give another file as well, or leave those tables out "
                     "with --only"
                 )
-            chosen[k] = fitting[0]
+            chosen[k] = first
         return cls(chosen)
 
     def recipe(self, scene: str, binning: int) -> dict:
-        """Return the digest of the file's atoms."""
+        """Return the digest of the atoms."""
         atoms = self.by_binning[binning][1].atoms
-        return {"kind": "file", "atoms": hashlib.blake2b(atoms.data, digest_size=12).hexdigest()}
+        return {"kind": "given", "atoms": hashlib.blake2b(atoms.data, digest_size=12).hexdigest()}
 
     def label(self, scene: str, binning: int) -> str:
-        """Return the file's name, and what is in it."""
-        path, dictionary = self.by_binning[binning]
+        """Return the name, and what is in it."""
+        name, dictionary = self.by_binning[binning]
         rows, columns = dictionary.patch_shape[2:4]
-        return f"{path.name}: {dictionary.kind}, {dictionary.size} atoms, {rows}x{columns}"
+        return f"{name}: {dictionary.kind}, {dictionary.size} atoms, {rows}x{columns}"
 
     def dictionary(self, scene: str, binning: int, watcher: Watcher) -> Dictionary:
-        """Return the file's dictionary."""
+        """Return the dictionary."""
         return self.by_binning[binning][1]
+
+
+def _made(spec: str, binning: int) -> Dictionary:
+    """Return one that needs no training: 9x9, or the nearest multiple of k below."""
+    side = 9 // binning * binning
+    make = dct_dictionary if spec == "dct" else lambertian_dictionary
+    return make(VIEWS, (side, side))
 
 
 def trained_on(dictionary: Dictionary) -> list[str] | None:
@@ -191,17 +206,17 @@ def trained_on(dictionary: Dictionary) -> list[str] | None:
         return None
 
 
-def check_not_trained_on(dictionary: Dictionary, path: Path, scenes: Sequence[str]) -> None:
+def check_not_trained_on(dictionary: Dictionary, spec: str, scenes: Sequence[str]) -> None:
     """Raise AppError when a dictionary has seen one of the scenes, or does not say what it saw."""
     names = trained_on(dictionary)
     if names is None:
         raise AppError(
-            f"--dictionary {path}: does not say which scenes it was trained on, so nothing can be "
+            f"--dictionary {spec}: does not say which scenes it was trained on, so nothing can be "
             "scored with it; train it with `emmc-rig train`"
         )
     leaked = [scene for scene in scenes if one_of(scene, names)]
     if leaked:
         raise AppError(
-            f"--dictionary {path}: was trained on '{leaked[0]}', which is to be scored; train "
+            f"--dictionary {spec}: was trained on '{leaked[0]}', which is to be scored; train "
             "without it, or leave --dictionary out (leave-one-out training)"
         )

@@ -14,13 +14,12 @@ from emmc_rig.report import DisplayCurve
 from emmc_rig.tables import paper
 from emmc_rig.tables.demosaic import demosaiced_rggb
 from emmc_rig.tables.journal import digest_of
-from emmc_rig.tables.mosaic import Piece, Tile, screen, telling_pieces, write_mosaic
+from emmc_rig.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
 from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import (
     MASK_TITLES,
     MASKS,
     METHOD_TITLES,
-    METHODS,
     SCENARIOS,
     Capture,
     Cell,
@@ -33,7 +32,7 @@ from emmc_rig.tables.shots import Sensors, Shots
 
 Array = NDArray[np.floating]
 PIECE_SHARE, LEAST_PIECE_PX = 0.16, 28
-EPI_PX, EPI_ROW_PX = 120, 4
+EPI_PX, EPI_ROW_PX = 80, 3
 MASK_CELLS = 24
 
 
@@ -171,33 +170,43 @@ def _figure_7(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) ->
     y, x = telling_lines(truth)
     true = pictures_of(truth, (y, x))
     curve = DisplayCurve.fitted_to(true.centre)
-    left, top = (_busiest(epi, EPI_PX) for epi in (true.across, true.down))
+    length = min(EPI_PX, *true.centre.shape[:2])
+    left, top = (_busiest(epi, length) for epi in (true.across, true.down))
 
     def strips(pictures: Pictures, name: str) -> list[Tile | None]:
         return [
             Tile(
-                f"{name}\n{told}",
-                np.repeat(screen(epi[:, start : start + EPI_PX], curve), EPI_ROW_PX, axis=0),
+                f"{name}\n{line}",
+                np.repeat(screen(epi[:, start : start + length], curve), EPI_ROW_PX, axis=0),
             )
-            for epi, start, told in (
-                (pictures.across, left, f"row {y}, from column {left}; views downwards"),
-                (pictures.down, top, f"column {x}, from row {top}; views downwards"),
+            for epi, start, line in (
+                (pictures.across, left, f"row {y} (orange), all u downwards"),
+                (pictures.down, top, f"column {x} (blue), all v downwards"),
             )
         ]
 
-    marked = screen(true.centre, curve).copy()
-    thick = max(1, marked.shape[1] // 300)
-    cv2.line(marked, (left, y), (left + EPI_PX, y), (255, 176, 0), thick)
-    cv2.line(marked, (x, top), (x, top + EPI_PX), (0, 190, 255), thick)
-    rows: list[tuple[str, list[Tile | None]]] = [
-        ("", [Tile("true centre view\nwith the two lines", marked)]),
-        ("", strips(true, "true")),
-    ]
+    def marked(pictures: Pictures, name: str) -> Tile:
+        view = screen(pictures.centre, curve).copy()
+        thick = max(1, view.shape[1] // 300)
+        cv2.line(view, (left, y), (left + length - 1, y), FRAMES[0], thick)
+        cv2.line(view, (x, top), (x, top + length - 1), FRAMES[1], thick)
+        return Tile(f"{name}\ncentre view with the two lines", view)
+
+    shown = {"true": true}
     for method in part.methods:
         cell = Cell(scene, capture, method)
-        name = f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"
-        rows.append(("", strips(_kept(run, cell), name)))
-    write_mosaic(path, f"{part.title}: {scene}", rows, "A slope is a disparity.", tile_px=560)
+        shown[f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"] = _kept(run, cell)
+    named = list(shown.items())
+    write_mosaic(
+        path,
+        f"{part.title}: {scene}",
+        [
+            ("", [marked(pictures, name) for name, pictures in (named[0], named[2])]),
+            *(("", strips(pictures, name)) for name, pictures in named),
+        ],
+        "A point's slope is its disparity.",
+        tile_px=480,
+    )
 
 
 def _busiest(epi: Array, width: int) -> int:
@@ -209,26 +218,31 @@ def _busiest(epi: Array, width: int) -> int:
 
 
 def _figure_8(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
-    scenes = scenes_of(part, run.library.names)
-    tiles: list[Tile | None] = []
+    scene = scenes_of(part, run.library.names)[0]
+    (method,) = part.pictured
+    truth = run.library.light_field(scene, run.settings.cut)
+    true = truth[0, 0]
+    curve = DisplayCurve.fitted_to(true)
+    (piece,) = telling_pieces(true, _piece_side(true))
+    codes = screen(true, curve)
+    tiles: list[Tile | None] = [Tile("true\n", codes, (piece.of(codes),), (piece,))]
     for capture in part.captures:
+        cell = Cell(scene, capture, method)
+        found = screen(_kept(run, cell).corner, curve)
         cells = MASKS[capture.mask].draw(1, MASK_CELLS, MASK_CELLS, 1.0)[0]
-        means = [
-            f"{METHOD_TITLES[method]} "
-            f"{np.mean([results[Cell(s, capture, method)]['psnr_db'] for s in scenes]):.2f}"
-            for method in METHODS
-        ]
-        codes = (cells * 255 + 0.5).astype(np.uint8)
-        tiles.append(Tile(f"{MASK_TITLES[capture.mask]}\n{', '.join(means)} dB", codes))
+        pattern = (cells * 255 + 0.5).astype(np.uint8)
+        title = f"{MASK_TITLES[capture.mask]}\n{results[cell]['psnr_db']:.2f} dB"
+        tiles.append(Tile(title, found, (pattern, piece.of(found)), (piece,)))
     write_mosaic(
-        path, part.title, [("", tiles)], f"{MASK_CELLS} x {MASK_CELLS} cells of each; mean PSNR "
-        f"over {', '.join(scenes)}.", tile_px=320,
-    )  # fmt: skip
+        path,
+        f"{part.title}: {scene}, {METHOD_TITLES[method]}",
+        [("", tiles)],
+        f"Top-left view; below, {MASK_CELLS}x{MASK_CELLS} cells of the mask, and the framed piece.",
+        tile_px=320,
+    )
 
 
-def _centre_tile(
-    title: str, picture: Array, pieces: Sequence[Piece], curve: DisplayCurve
-) -> Tile:
+def _centre_tile(title: str, picture: Array, pieces: Sequence[Piece], curve: DisplayCurve) -> Tile:
     codes = screen(picture, curve)
     return Tile(title, codes, tuple(piece.of(codes) for piece in pieces), tuple(pieces))
 

@@ -23,7 +23,7 @@ CHROMA = "chroma_psnr_db"
 
 @dataclass(frozen=True)
 class Spread:
-    """A difference in dB: its mean and range over scenes, and in how many it is above zero."""
+    """A difference in dB over scenes: mean, range, and in how many it is above zero."""
 
     mean_db: float
     low_db: float
@@ -37,7 +37,7 @@ class Spread:
         return self.mean_db > 0
 
     def __str__(self) -> str:
-        return f"{self.mean_db:+.2f} dB ({self.low_db:+.2f} to {self.high_db:+.2f})"
+        return f"{self.mean_db:+.2f} ({self.low_db:+.2f} to {self.high_db:+.2f})"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from emmc_rig.tables import paper
-from emmc_rig.tables.findings import printed_figures
 from emmc_rig.tables.plan import (
     MASK_TITLES,
     METHOD_TITLES,
@@ -106,16 +105,16 @@ def _papers_means(
     part: Part, rows: Sequence[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]]
 ) -> list[Line]:
     """Return the paper's means over all its scenes of a part."""
-    printed = printed_figures()
     scenes = scenes_of(part, list(paper.TITLES))
     lines = []
     for heads, captures, methods in rows:
         for method in methods:
             pairs = []
             for capture in captures:
-                known = [printed.get(Cell(scene, capture, method)) for scene in scenes]
-                values = [cell["psnr_db"] for cell in known if cell is not None]
-                pairs.append(Pair(None, float(np.mean(values)) if values else None))
+                cells = [Cell(scene, capture, method) for scene in scenes]
+                values = [cell.paper_psnr_db for cell in cells]
+                known = [value for value in values if value is not None]
+                pairs.append(Pair(None, float(np.mean(known)) if known else None))
             if any(pair.paper is not None for pair in pairs):
                 heading = (f"paper's {len(scenes)}", *heads, METHOD_TITLES[method])
                 lines.append(Line(heading, tuple(pairs), True))

@@ -49,8 +49,7 @@ class Tile:
 
 def screen(picture: Array, curve: DisplayCurve) -> Codes:
     """Return screen codes (y, x, 3) of a linear picture (y, x, 3) or (y, x)."""
-    codes = curve.encode(picture)
-    return np.repeat(codes[..., None], 3, axis=-1) if codes.ndim == 2 else codes
+    return curve.encode(picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=-1))
 
 
 def telling_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
@@ -82,7 +81,7 @@ def composed(tile: Tile, width_px: int = TILE_PX) -> Codes:
     """Return the tile as one picture of a width: the whole, the pieces in a row below."""
     height, width = tile.whole.shape[:2]
     scale = width_px / width
-    whole = _resized(tile.whole, width_px, round(height * scale))
+    whole: NDArray = _resized(tile.whole, width_px, round(height * scale))
     for piece, colour in zip(tile.boxed, FRAMES, strict=False):
         corner = round(piece.x * scale), round(piece.y * scale)
         other = round((piece.x + piece.side) * scale), round((piece.y + piece.side) * scale)
@@ -98,13 +97,13 @@ def composed(tile: Tile, width_px: int = TILE_PX) -> Codes:
             piece, (each, each), interpolation=cv2.INTER_NEAREST_EXACT
         )
     gap = np.full((GAP_PX, width_px, 3), 255, np.uint8)
-    return np.concatenate([whole, gap, row])
+    return np.concatenate([whole, gap, row]).astype(np.uint8)
 
 
 def _resized(picture: Codes, width: int, height: int) -> Codes:
     smaller = width < picture.shape[1]
     how = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST_EXACT
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=how), np.uint8)
+    return cv2.resize(picture, (width, height), interpolation=how).astype(np.uint8)
 
 
 def write_mosaic(

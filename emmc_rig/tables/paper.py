@@ -102,18 +102,31 @@ tulip      40.14 43.41 44.99 45.99  37.25 38.32 39.00 39.45  31.64 38.80 40.91 4
 buttercup  28.94 31.71 33.46 34.75  26.44 28.00 28.90 29.66  24.29 28.22 29.61 30.53
 """
 
-_SHOTS_2 = [("i", 3), ("ii", 1), ("iii", 3)]
-_SHOTS_3 = [("i", 3), *(("ii", n) for n in (1, 2, 3)), *(("iii", n) for n in (1, 2, 3))]
-_SHOTS_4 = [("i", n) for n in (3, 6, 9, 12)] + [(s, n) for s in ("ii", "iii") for n in (1, 2, 3, 4)]
-_BOTH = [(*shots, method) for shots in _SHOTS_2 for method in ("dict-admm", "tv-dict")]
-_BLOCKS = (
-    (_TABLE_2_NOISE_FREE, _BOTH, 1, False),
-    (_TABLE_2_NOISY, _BOTH, 1, True),
-    (_TABLE_3_DICT_ADMM, [(*shots, "dict-admm") for shots in _SHOTS_3], 1, False),
-    (_TABLE_3_TV_DICT, [(*shots, "tv-dict") for shots in _SHOTS_3], 1, False),
+_Shots = list[tuple[Scenario, int]]
+_SHOTS_2: _Shots = [("i", 3), ("ii", 1), ("iii", 3)]
+_SHOTS_3: _Shots = [
+    ("i", 3), ("ii", 1), ("ii", 2), ("ii", 3), ("iii", 1), ("iii", 2), ("iii", 3),
+]  # fmt: skip
+_SHOTS_4: _Shots = [
+    ("i", 3), ("i", 6), ("i", 9), ("i", 12),
+    ("ii", 1), ("ii", 2), ("ii", 3), ("ii", 4),
+    ("iii", 1), ("iii", 2), ("iii", 3), ("iii", 4),
+]  # fmt: skip
+_Column = tuple[Scenario, int, str]
+
+
+def _columns(shots: _Shots, *methods: str) -> list[_Column]:
+    return [(scenario, count, method) for scenario, count in shots for method in methods]
+
+
+_BLOCKS: tuple[tuple[str, list[_Column], int, bool], ...] = (
+    (_TABLE_2_NOISE_FREE, _columns(_SHOTS_2, "dict-admm", "tv-dict"), 1, False),
+    (_TABLE_2_NOISY, _columns(_SHOTS_2, "dict-admm", "tv-dict"), 1, True),
+    (_TABLE_3_DICT_ADMM, _columns(_SHOTS_3, "dict-admm"), 1, False),
+    (_TABLE_3_TV_DICT, _columns(_SHOTS_3, "tv-dict"), 1, False),
     (_TABLE_3_LEARNED, [("iii", 1, LEARNED)], 1, False),
-    (_TABLE_4_DICT_ADMM, [(*shots, "dict-admm") for shots in _SHOTS_4], 2, False),
-    (_TABLE_4_TV_DICT, [(*shots, "tv-dict") for shots in _SHOTS_4], 2, False),
+    (_TABLE_4_DICT_ADMM, _columns(_SHOTS_4, "dict-admm"), 2, False),
+    (_TABLE_4_TV_DICT, _columns(_SHOTS_4, "tv-dict"), 2, False),
 )
 
 

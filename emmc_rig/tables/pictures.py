@@ -42,7 +42,7 @@ class Pictures:
     def load(cls, path: Path) -> Pictures | None:
         """Read what `save` wrote; None where there is nothing whole."""
         try:
-            with np.load(path) as file:
+            with open(path, "rb") as stream, np.load(stream) as file:
                 return cls(*(file[f.name].astype(np.float32) for f in fields(cls)))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -114,14 +114,17 @@ class Cell:
 
 @dataclass(frozen=True)
 class Part:
-    """A table or figure. scenes: which of those given; "shown" means one of them only."""
+    """A table or figure. scenes: which of those given; "shown" means one of them only.
+
+    pictured: the methods whose pictures it shows, of its first scene.
+    """
 
     name: str
     title: str
     scenes: Literal["synthetic", "other", "shown synthetic", "shown other"]
     captures: tuple[Capture, ...]
     methods: tuple[str, ...] = METHODS
-    pictured: bool = field(default=False, kw_only=True)
+    pictured: tuple[str, ...] = ()
 
 
 _SCENARIOS_OF_TABLE_2 = (Capture("i", 3), Capture("ii", 1), Capture("iii", 3))
@@ -170,42 +173,43 @@ PARTS = {
                 *_SCENARIOS_OF_TABLE_2,
                 Capture("ii", 1, demosaiced=True),
                 *_NOISY,
-                Capture("ii", 1, demosaiced=True, noisy=True),
+                Capture("ii", 1, noisy=True, demosaiced=True),
             ),
             ("tv-dict",),
-            pictured=True,
+            pictured=("tv-dict",),
         ),
         Part(
             "figure7",
             "Figure 7: epipolar images, CFA sensor, one shot",
             "shown synthetic",
             (Capture("ii", 1),),
-            pictured=True,
+            pictured=METHODS,
         ),
         Part(
             "figure8",
             "Figure 8: mask patterns before a CFA sensor, with noise",
             "synthetic",
             tuple(Capture("ii", 1, noisy=True, mask=mask) for mask in MASKS),
+            pictured=("dict-admm",),
         ),
         Part(
             "figure9",
             "Figure 9: methods and scenarios side by side",
             "shown other",
             (Capture("i", 3), Capture("ii", 1), Capture("iii", 1), Capture("iii", 2)),
-            pictured=True,
+            pictured=METHODS,
         ),
         Part(
             "figure10",
             "Figure 10: super-resolution, r = 1/4, by TV-Dict",
             "shown other",
-            tuple(
-                Capture(scenario, shots, 2)
-                for scenario, several in (("i", (3, 12)), ("ii", (1, 4)), ("iii", (1, 4)))
-                for shots in several
+            (
+                *(Capture("i", shots, 2) for shots in (3, 12)),
+                *(Capture("ii", shots, 2) for shots in (1, 4)),
+                *(Capture("iii", shots, 2) for shots in (1, 4)),
             ),
             ("tv-dict",),
-            pictured=True,
+            pictured=("tv-dict",),
         ),
     )
 }

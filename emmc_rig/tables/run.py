@@ -20,7 +20,7 @@ from emmc_rig.tables.dictionaries import Source, TrainingSettings
 from emmc_rig.tables.journal import Journal, digest_of
 from emmc_rig.tables.library import Array, Cut, Library
 from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
-from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct
+from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors
 from reconstruction.bpdn import BPDNSettings
@@ -142,8 +142,13 @@ class Run:
     @property
     def pictured(self) -> set[Cell]:
         """The cells that some figure shows, asked for now or not."""
-        parts = [part for part in PARTS.values() if part.pictured]
-        return {cell for part in parts for cell in cells_of(part, self.library.names)}
+        names = self.library.names
+        return {
+            cell
+            for part in PARTS.values()
+            for cell in cells_of(part, names)
+            if cell.method in part.pictured and cell.scene == scenes_of(part, names)[0]
+        }
 
     def truth(self, cell: Cell) -> Array:
         """Return the light field that a cell reconstructs."""
