@@ -25,7 +25,8 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
 from emmc_rig.scene import open_scene
 from reconstruction import kernels as tv_kernels
-from reconstruction.tv import colour_metric, reconstruct_tv, row_bands
+from reconstruction.problem import colour_metric
+from reconstruction.tv import reconstruct_tv, row_bands
 
 TRIAD_VALUES = 40_000_000
 

@@ -60,6 +60,11 @@ SizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+MethodOption = Annotated[str, typer.Option("--method", help="see `emmc-rig reconstruct --list`")]
+DictionaryOption = Annotated[
+    str | None,
+    typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
+]
 
 
 class Bars:
@@ -154,18 +159,29 @@ def demo(
     chroma_weight: Annotated[
         float, typer.Option("--chroma-weight", help="of chrominance differences; 1: DV_1")
     ] = 2.0,
+    method: MethodOption = "tv",
+    dictionary: DictionaryOption = None,
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.model.settings import validated
     from emmc_rig.output import result_folder
-    from reconstruction.tv import TVSettings
+    from reconstruction.methods import MethodSettings
 
     described = _camera(camera, shots)
-    chosen = {"mu": mu, "chroma_weight": chroma_weight}
-    solver = validated(TVSettings, chosen, "solver settings", AppError)
-    settings = DemoSettings(scene, camera, described, _size(size), seed, solver=solver)
+    chosen = {"tv": {"mu": mu, "chroma_weight": chroma_weight}}
+    solver = validated(MethodSettings, chosen, "solver settings", AppError)
+    settings = DemoSettings(
+        scene,
+        camera,
+        described,
+        _size(size),
+        seed,
+        method=method,
+        dictionary=dictionary,
+        solver=solver,
+    )
     for warning in described.warnings():
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
     with result_folder(out) as folder, _progress() as progress:
@@ -258,7 +274,7 @@ def reconstruct(
     frames: Annotated[
         Path | None, typer.Argument(help="a folder that `demo` or `simulate` wrote")
     ] = None,
-    method: Annotated[str, typer.Option("--method", help="see --list")] = "tv",
+    method: MethodOption = "tv",
     list_methods: Annotated[
         bool, typer.Option("--list", help="the methods: what each assumes, costs, is for")
     ] = False,
@@ -266,10 +282,7 @@ def reconstruct(
         Path | None,
         typer.Option("--psi", help="imaging matrix (default: psi.h5 beside the frames)"),
     ] = None,
-    dictionary: Annotated[
-        str | None,
-        typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
-    ] = None,
+    dictionary: DictionaryOption = None,
     settings: Annotated[
         Path | None, typer.Option("--settings", help="YAML of method settings: tv, sparse")
     ] = None,

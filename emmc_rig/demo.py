@@ -33,10 +33,11 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, save_frames, versions, write_metrics
+from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.report import ReportContent, write_report
 from emmc_rig.scene import fine_scene
+from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.tv import TVSettings, reconstruct_tv
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 Array = NDArray[np.floating]
@@ -66,7 +67,10 @@ class Silent:
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """What to run: scene and camera with their names, size (rows, columns) or None, seed."""
+    """What to run: scene and camera with their names, size (rows, columns) or None, seed.
+
+    method: see `reconstruction.methods`; dictionary: see `emmc_rig.reconstruct.open_dictionary`.
+    """
 
     scene: str
     camera_name: str
@@ -74,7 +78,9 @@ class DemoSettings:
     size: tuple[int, int] | None = None
     seed: int = 0
     whiteboard_repeats: int = 2
-    solver: TVSettings = field(default_factory=TVSettings)
+    method: str = "tv"
+    dictionary: str | None = None
+    solver: MethodSettings = field(default_factory=MethodSettings)
 
 
 @dataclass
@@ -100,6 +106,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     errors of the layers below, each one line.
     """
     watcher = watcher or Silent()
+    find_method(settings.method)
     stages = _Stages(watcher)
     camera = settings.camera
     with stages("scene"):
@@ -115,6 +122,9 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         size = (truth.shape[2], truth.shape[3])
     with stages("design"):
         design = build_imaging_matrix(camera, size)
+        dictionary = None
+        if find_method(settings.method).needs_dictionary:
+            dictionary = open_dictionary(settings.dictionary, design)
         rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
     lamps = lamps_needed(design)
     seen: dict[tuple[int, int, int, str], Array] = {}
@@ -135,20 +145,27 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         design_error = design.relative_difference(exact)
     with stages("capture", design.shots):
         frames_dn = capture_shots(rig, camera, watcher.step)
-    with stages("reconstruct", settings.solver.max_steps):
+    with stages("reconstruct"):
         readings = calibration.readings(frames_dn, camera.exposures_s())
         usable = frames_dn < camera.sensor.noise.white_level_dn
         variance = calibration.reading_variance(frames_dn, camera.exposures_s())
         sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
 
-        def reconstruct(psi: ImagingMatrix) -> Reconstruction:
-            return reconstruct_tv(
-                psi, readings, sigma, settings.solver, usable, lambda p: watcher.step(_told(p))
+        def light_field(psi: ImagingMatrix) -> Reconstruction:
+            return reconstruct(
+                settings.method,
+                psi,
+                readings,
+                sigma,
+                dictionary,
+                settings.solver,
+                usable,
+                lambda p: watcher.step(_told(p)),
             )
 
-        result = reconstruct(calibration.psi)
-    with stages("exact Psi, for comparison", settings.solver.max_steps):
-        compared = reconstruct(exact)
+        result = light_field(calibration.psi)
+    with stages("exact Psi, for comparison"):
+        compared = light_field(exact)
     with stages("evaluate"):
         estimate = result.light_field
         psnr, exact_psnr = psnr_db(estimate, truth), psnr_db(compared.light_field, truth)
@@ -205,6 +222,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
 
 
 def _told(progress: Progress) -> str:
+    if progress.relative_change is None:
+        return f"{progress.step} of {progress.total} patches"
     return f"change {progress.relative_change:.1e}"
 
 

@@ -223,7 +223,13 @@ def peer_timings(
     greedy = bpdn.BPDNSettings(method="omp", atoms=20, tolerance_factor=0)
     path = bpdn.BPDNSettings(method="lars")
     etas = [
-        bpdn.penalty_of(problem.sensed[i], problem.data[i], noise_sigma, path)
+        bpdn.penalty_of(
+            bpdn.median_norm(problem.sensed[i]),
+            problem.sensed.shape[1],
+            problem.data[i],
+            noise_sigma,
+            path,
+        )
         for i in range(patches)
     ]
 

@@ -35,10 +35,10 @@ class BPDNSettings(Settings):
         default=None, gt=0, description="eta, in units of readings times a sensed atom's norm"
     )
     penalty_factor: float = Field(
-        default=0.5, gt=0, description="of sigma |a| sqrt(2 log atoms), which sets eta"
+        default=0.2, gt=0, description="of sigma |a| sqrt(2 log atoms), which sets eta"
     )
     smallest_penalty: float = Field(
-        default=1e-3, gt=0, lt=1, description="eta against the penalty above which the code is 0"
+        default=5e-4, gt=0, lt=1, description="eta against |data| |a|, where noise says less"
     )
     rtol: float = Field(
         default=1e-3, gt=0, description="relative duality gap; float32 certifies about 1e-5"
@@ -82,19 +82,26 @@ def assemble(atoms, weights, out):
     kernels.combine(atoms, weights, out)
 
 
-def penalty_of(atoms: Array32, data: Array32, noise_sigma: float, settings: BPDNSettings) -> float:
+def median_norm(atoms: Array32) -> float:
+    """Return the median norm of atoms (atom, measurement)."""
+    sizes = np.empty(len(atoms), dtype=np.float32)
+    kernels.norms(atoms, sizes)
+    return float(np.median(sizes))
+
+
+def penalty_of(
+    size: float, count: int, data: Array32, noise_sigma: float, settings: BPDNSettings
+) -> float:
     """Return eta: as set, or c sigma |a| sqrt(2 log n), the largest that noise alone reaches.
 
-    |a| is the root mean square norm of the sensed atoms (Donoho and Johnstone 1994 for the
-    form). Never below a small share of the penalty above which the code is all zeros.
+    size: |a|, the median norm of the sensed atoms; count: how many there are (Donoho and
+    Johnstone 1994 for the form). Never below a small share of |data| |a|.
     """
     if settings.penalty is not None:
         return settings.penalty
-    correlation = np.empty(len(atoms), dtype=np.float32)
-    largest = float(kernels.correlate(atoms, data, correlation))
-    size = np.sqrt(np.einsum("nm,nm->", atoms, atoms, dtype=np.float64) / len(atoms))
-    universal = noise_sigma * size * np.sqrt(2 * np.log(max(len(atoms), 2)))
-    return max(settings.penalty_factor * universal, settings.smallest_penalty * largest)
+    universal = noise_sigma * size * np.sqrt(2 * np.log(max(count, 2)))
+    smallest = settings.smallest_penalty * size * float(np.linalg.norm(data))
+    return max(settings.penalty_factor * universal, smallest)
 
 
 def prepared(
@@ -106,7 +113,7 @@ def prepared(
     will be coded, for the scale of ADMM's rho. The returned function takes one patch's data and
     how many of its measurements are usable.
     """
-    size = float(np.sqrt(np.einsum("nm,nm->", atoms, atoms, dtype=np.float64) / len(atoms)))
+    size = median_norm(atoms)
     scale = float(np.sqrt(np.mean(np.sum(np.square(data, dtype=np.float64), axis=1))))
     count, length = atoms.shape
 
@@ -137,7 +144,7 @@ def prepared(
     rho = inverse = None
     if settings.method == "admm":
         # One factor serves all patches of a class, so their penalties share one rho.
-        eta = np.median([penalty_of(atoms, one, noise_sigma, settings) for one in data])
+        eta = np.median([penalty_of(size, count, one, noise_sigma, settings) for one in data])
         rho = np.float32(eta / (settings.threshold * scale / size))
         inverse = np.empty((length, length), dtype=np.float32)
         if not kernels.factor(atoms, rho, inverse):
@@ -145,7 +152,7 @@ def prepared(
 
     def minimise(one: Array32, measured: int) -> Code:
         weights = np.empty(count, dtype=np.float32)
-        eta = penalty_of(atoms, one, noise_sigma, settings)
+        eta = penalty_of(size, count, one, noise_sigma, settings)
         if settings.method == "admm":
             steps, gap = kernels.admm(
                 atoms,

@@ -1,5 +1,7 @@
 """Fused loops of primal-dual total variation on the kernels' axes (v, u, y, colour, x).
 
+The primal step is the exact proximal point of the misfit and of a quadratic pull to a target.
+
 The dual variable has axes (v, u, y, direction, colour, x), directions x, y, u, v: forward
 differences, 0 across the far border, of the colours after multiplication by a 3 x 3 metric.
 
@@ -20,15 +22,24 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
+NO_SHARE = np.zeros((0, 0), dtype=np.float32)
+NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
+
 
 class Data(NamedTuple):
-    """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k."""
+    """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k.
+
+    share, pulled: a sample q descended to becomes share q + pulled before the frames correct it;
+    (y, x) and (v, u, y, colour, x), both empty without a target.
+    """
 
     weights: Any
     colour: Any
     inverse: Any
     frames: Any
     binning: int
+    share: Any = NO_SHARE
+    pulled: Any = NO_PULL
 
 
 class Steps(NamedTuple):
@@ -45,7 +56,7 @@ class Steps(NamedTuple):
 
 
 @njit(cache=True, fastmath=True)
-def _mix(metric, lines):
+def mix(metric, lines):
     """Replace lines (colour, x) by metric @ lines."""
     red, green, blue = lines[0], lines[1], lines[2]
     for x in range(red.size):
@@ -82,7 +93,7 @@ def _descend(light_field, dual, step, back, v, u, y, out):
             gv = dual[v - 1, u, y, 3, c]
             for x in range(width):
                 line[x] -= gv[x]
-    _mix(back, out)
+    mix(back, out)
     for c in range(3):
         row, line = light_field[v, u, y, c], out[c]
         for x in range(width):
@@ -90,22 +101,29 @@ def _descend(light_field, dual, step, back, v, u, y, out):
 
 
 @njit(cache=True, fastmath=True)
-def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
-    """Do the primal step of a row of pixels; set ahead, for _dual_rows, to metric (2 new - old)."""
-    weights, colour, inverse, frames, binning = data
+def pull_row(data, v, u, y, lines):
+    """Draw lines (colour, x), row y of view (v, u), towards the target, if there is one."""
+    if data.pulled.size > 0:
+        share = data.share[y]
+        for c in range(3):
+            line, pulled = lines[c], data.pulled[v, u, y, c]
+            for x in range(line.size):
+                line[x] = share[x] * line[x] + pulled[x]
+
+
+@njit(cache=True, fastmath=True)
+def fit_rows(data, steps, light_field, row, ahead, first, moved):
+    """Finish the primal step of a row of pixels, descended to in `ahead` from its row `first` on.
+
+    Corrects by the frames, moves light_field, and sets ahead to metric (2 new - old).
+    """
+    weights, colour, inverse, frames, binning = data[:5]
     shots, views_v, views_u, _, _, width = weights.shape
     base = row * binning
-    back = steps.metric.T.copy()
-    for v in range(views_v):
-        for u in range(views_u):
-            for part in range(binning):
-                _descend(
-                    light_field, dual, steps.primal, back, v, u, base + part, ahead[v, u, part]
-                )
     seen = np.zeros((shots, width), frames.dtype)
     for shot in range(shots):
         for part in range(binning):
-            gather_row(weights, colour, ahead, part, shot, base + part, seen[shot])
+            gather_row(weights, colour, ahead, first + part, shot, base + part, seen[shot])
     correct_row(inverse, frames, binning, row, seen)
     change = 0.0
     power = 0.0
@@ -113,11 +131,12 @@ def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
         for u in range(views_u):
             for part in range(binning):
                 y = base + part
+                lines = ahead[v, u, first + part]
                 for shot in range(shots):
-                    spread_row(weights, colour, seen[shot], shot, y, v, u, ahead[v, u, part])
+                    spread_row(weights, colour, seen[shot], shot, y, v, u, lines)
                 for c in range(3):
                     old = light_field[v, u, y, c]
-                    line = ahead[v, u, part, c]
+                    line = lines[c]
                     row_change = np.float32(0)
                     row_power = np.float32(0)
                     for x in range(width):
@@ -128,9 +147,23 @@ def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
                         row_power += old[x] * old[x]
                     change += row_change
                     power += row_power
-                _mix(steps.metric, ahead[v, u, part])
+                mix(steps.metric, lines)
     moved[row, 0] = change
     moved[row, 1] = power
+
+
+@njit(cache=True, fastmath=True)
+def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
+    """Do the primal step of a row of pixels; set ahead, for _dual_rows, to metric (2 new - old)."""
+    back = steps.metric.T.copy()
+    for v in range(light_field.shape[0]):
+        for u in range(light_field.shape[1]):
+            for part in range(data.binning):
+                y = row * data.binning + part
+                lines = ahead[v, u, part]
+                _descend(light_field, dual, steps.primal, back, v, u, y, lines)
+                pull_row(data, v, u, y, lines)
+    fit_rows(data, steps, light_field, row, ahead, 0, moved)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -270,7 +303,7 @@ def total_variation_rows(light_field, metric, totals):
                         step[c, width - 1] = 0
                         for x in range(width - along):
                             step[c, x] = there[x + along] - here[x]
-                    _mix(metric, step)
+                    mix(metric, step)
                     for c in range(3):
                         for x in range(width):
                             square[x] += step[c, x] ** 2

@@ -16,9 +16,11 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction import bpdn
+from reconstruction.choices import choose_mu
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs
+from reconstruction.patch_term import PatchTerm
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.sparse import SparseSettings, estimate_patches, reconstruct_sparse
 from reconstruction.tv import TVSettings, reconstruct_tv
@@ -31,6 +33,9 @@ class MethodSettings(Settings):
 
     tv: TVSettings = Field(default_factory=TVSettings)
     sparse: SparseSettings = Field(default_factory=SparseSettings)
+
+
+PATCHED_MU, PATCHED_RHO = 3.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -163,6 +168,24 @@ def reconstruct(
     return reconstruct_sparse(psi, frames, noise_sigma, dictionary, sparse, usable, on_step, clock)
 
 
+def chosen_weights(
+    settings: TVSettings, psi: ImagingMatrix, readings: Array, noise_sigma: float, cover: float
+) -> TVSettings:
+    """Return the settings with mu and rho chosen for a patch term, where they are not set.
+
+    readings: the usable ones. cover: the mean weight of the patches on a sample.
+    mu is 3 times that of total variation alone, rho 6 mu / (brightness cover). The factors were
+    fitted to 28 pairs each on crops of a real light field (Bayer, one and three shots, and RGB,
+    with and without noise): the loss against the best pair was 0.15 dB at most.
+    """
+    mu = settings.mu or PATCHED_MU * choose_mu(psi, readings, noise_sigma, settings.order)
+    brightness = max(float(np.mean(readings)) / max(psi.light_efficiency(), 1e-12), 1e-12)
+    rho = PATCHED_RHO * mu / (brightness * max(cover, 1e-12))
+    if "rho" in settings.model_fields_set:
+        rho = settings.rho
+    return settings.model_copy(update={"mu": mu, "rho": rho})
+
+
 def _tv_dict(
     psi: ImagingMatrix,
     frames: Array,
@@ -173,15 +196,14 @@ def _tv_dict(
     on_step: Callable[[Progress], None] | None,
     clock: Callable[[], float],
 ) -> Reconstruction:
-    from reconstruction.patch_term import PatchTerm
-
     started = clock()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
     found = estimate_patches(psi, frames, noise_sigma, dictionary, settings.sparse, usable, on_step)
     first_s = clock() - started
     term = PatchTerm(found.light_field, found.weight)
+    tv = chosen_weights(settings.tv, psi, frames[usable], noise_sigma, float(found.weight.mean()))
     result = reconstruct_tv(
-        psi, frames, noise_sigma, settings.tv, usable, on_step, patch_term=term, clock=clock
+        psi, frames, noise_sigma, tv, usable, on_step, patch_term=term, clock=clock
     )
     return dataclasses.replace(
         result,

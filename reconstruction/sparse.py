@@ -44,6 +44,7 @@ from reconstruction.patches import (
 from reconstruction.result import Progress, Reconstruction
 
 Array = NDArray[np.floating]
+FLAT = 1e-3
 BATCH_BYTES = 48 * 2**20
 """Of sensed dictionaries that a thread holds at a time."""
 
@@ -52,8 +53,25 @@ class SparseSettings(Settings):
     """Patches and their aggregation; `solver` says how each is coded."""
 
     stride: int = Field(default=5, ge=1, description="samples between patches")
+    flat_favour: float = Field(
+        default=30.0, ge=1, description="flat atoms cost this many times less than others"
+    )
     aggregation: Literal["flat", "hann"] = "flat"
     solver: bpdn.BPDNSettings = Field(default_factory=bpdn.BPDNSettings)
+
+
+def favoured(atoms: NDArray[np.float32], favour: float) -> NDArray[np.float32]:
+    """Return atoms (atom, v, u, y, x, c) with those of even colour scaled by `favour`.
+
+    A longer atom needs a smaller coefficient, so |beta|_1 hardly counts it. Every patch has a
+    mean colour; to penalise it as if it were rare draws all patches towards grey and black, most
+    where the frames tell colours apart but weakly (monochrome sensors).
+    """
+    spread = np.ptp(atoms.reshape(len(atoms), -1, atoms.shape[-1]), axis=1).max(axis=1)
+    flat = spread < FLAT * np.abs(atoms).max(axis=(1, 2, 3, 4, 5))
+    if favour == 1 or not flat.any():
+        return atoms
+    return atoms * np.where(flat, np.float32(favour), np.float32(1)).reshape(-1, 1, 1, 1, 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +151,9 @@ class _Coder:
         rows, columns = dictionary.patch_shape[2:4]
         dictionary.checked(psi.light_field_shape[:2], (rows, columns))
         self.psi, self.frames, self.usable = psi, frames, usable
-        self.noise_sigma, self.dictionary, self.settings = noise_sigma, dictionary, settings
+        self.noise_sigma, self.settings = noise_sigma, settings
+        self.atoms = favoured(dictionary.atoms, settings.flat_favour)
+        self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
         self.window = window((rows, columns), settings.aggregation)
         self.pixel = pixel_of_sample((rows, columns), psi.binning)
@@ -142,7 +162,7 @@ class _Coder:
 
     def batches(self) -> Iterator[tuple[list[NDArray[np.float32]], list[int], _Work]]:
         """Yield the atoms as the shots meet them, which of them each shot takes, and patches."""
-        atoms = self.dictionary.atoms
+        atoms = self.atoms
         for colours, indices in _same_colours(self.psi, self.grid):
             if colours is None:
                 distinct, which = [selected_atoms(atoms, None)], [0] * self.psi.shots
@@ -154,7 +174,7 @@ class _Coder:
             classes = _classes(self.psi, self.usable, self.grid, indices)
             self.classes += len(classes)
             length = self.psi.shots * self.pixels
-            at_once = max(1, int(BATCH_BYTES // (4 * self.dictionary.size * (length + 8))))
+            at_once = max(1, int(BATCH_BYTES // (4 * len(atoms) * (length + 8))))
             at_once = min(at_once, max(1, len(classes) // (4 * get_num_threads())))
             for start in range(0, len(classes), at_once):
                 members = classes[start : start + at_once]
@@ -171,12 +191,12 @@ class _Coder:
         distinct, which, work = batch
         sensing = work.sensing
         firsts = np.cumsum([0, *(len(group) for group in work.members)])
-        size, length = self.dictionary.size, sensing.data.shape[1]
+        size, length = len(self.atoms), sensing.data.shape[1]
         sensed = np.zeros((len(work.members), size, length), dtype=np.float32)
         for shot, selection in enumerate(which):
             weights = np.ascontiguousarray(sensing.weights[firsts[:-1], shot])
             sense_atoms(distinct[selection], weights, self.pixel, self.pixels, shot, sensed)
-        patches = np.zeros((firsts[-1], self.dictionary.matrix.shape[1]), dtype=np.float32)
+        patches = np.zeros((firsts[-1], self.matrix.shape[1]), dtype=np.float32)
         codes = []
         for group, atoms in enumerate(sensed):
             members = range(firsts[group], firsts[group + 1])
@@ -189,7 +209,7 @@ class _Coder:
             for i in members:
                 code = solver(sensing.data[i], int(sensing.measured[i]))
                 codes.append(code)
-                bpdn.assemble(self.dictionary.matrix, code.weights, patches[i])
+                bpdn.assemble(self.matrix, code.weights, patches[i])
         return np.concatenate(work.members), patches, sensing.measured, codes
 
 

@@ -18,8 +18,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
-import cv2
 import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
@@ -27,25 +27,33 @@ from pydantic import Field
 
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
-from reconstruction import kernels
-from reconstruction.errors import ReconstructionError
+from reconstruction import difference_kernels, kernels
+from reconstruction.choices import (
+    choose_mu,
+    choose_primal_step,
+    contrast,
+    first_light_field,
+    smooth_guess,
+)
+from reconstruction.differences import norm_squared as norm_squared_of
+from reconstruction.differences import stencils
+from reconstruction.patch_term import PatchTerm
+from reconstruction.problem import Problem, check, colour_metric
 from reconstruction.result import Progress, Reconstruction
 
 Array = NDArray[np.floating]
-METHOD = "tv"
-DIFFERENCE_NORM_SQUARED = 16.0
-OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-SMALLEST_RELATIVE_MU = 2e-5
 
 
 class TVSettings(Settings):
     """Settings of the solver; None lets the noise and the data choose."""
 
     mu: float | None = Field(
-        default=None, gt=0, description="weight of DV_1, in units of the readings"
+        default=None, gt=0, description="weight of DV_K, in units of the readings"
     )
+    order: int = Field(default=1, ge=1, description="K of DV_K; 1: total variation")
+    rho: float = Field(default=1e-2, ge=0, description="weight of the patch term, if one is given")
     chroma_weight: float = Field(
-        default=2.0, gt=0, description="of chrominance against luminance differences; 1: DV_1"
+        default=2.0, gt=0, description="of chrominance against luminance differences; 1: DV_K"
     )
     primal_step: float | None = Field(
         default=None, gt=0, description="gamma; the dual step follows"
@@ -58,67 +66,15 @@ class TVSettings(Settings):
     objective_every: int = Field(default=10, ge=1)
 
 
-def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float) -> float:
-    """Return mu = 0.68 sqrt(shots) / (views binning) sigma^1.5 / brightness^0.5, never quite 0.
-
-    Scaling readings and noise together scales mu with them, and so the light field. Every view
-    adds its own variation to DV_1 for one reading, hence 1 / views. The other exponents and the
-    factor were fitted to the best mu of 191 runs on the built-in scenes (2x2 to 7x7 views, Bayer
-    and monochrome, one to three shots, k = 1 and 2, noise of 1-9 % of the mean brightness): the
-    loss against the best was 0.05 dB on average and 0.4 dB at most, and the same in 94 runs with
-    a chrominance weight of 2. Without noise the minimiser tends to the least variation that
-    explains the frames, reached at a small mu.
-    """
-    brightness = max(float(np.mean(frames)) / max(psi.light_efficiency(), 1e-12), 1e-12)
-    views_v, views_u = psi.light_field_shape[:2]
-    factor = 0.68 * np.sqrt(psi.shots) / (views_v * views_u * psi.binning)
-    return brightness * max(SMALLEST_RELATIVE_MU, factor * (noise_sigma / brightness) ** 1.5)
-
-
-def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
-
-    Every colour is the ratio of blurred back-projections, as if all views were equal.
-    """
-    kept = np.where(usable, frames, 0).astype(np.float32)
-    seen = psi.forward(np.ones(psi.light_field_shape, dtype=np.float32)) * usable
-    top = psi.adjoint(kept).sum(axis=(0, 1))
-    bottom = psi.adjoint(seen).sum(axis=(0, 1))
-    blurred = [cv2.GaussianBlur(image, (0, 0), 4.0 * psi.binning) for image in (top, bottom)]
-    floor = 1e-3 * float(blurred[1].mean())
-    return np.maximum(blurred[0], 0) / np.maximum(blurred[1], floor)
-
-
-def colour_metric(chroma_weight: float) -> NDArray[np.float64]:
-    """Return what turns R, G, B into weighted opponent colours, (3, 3)."""
-    return np.diag([1, chroma_weight, chroma_weight]) @ OPPONENT
+def method_name(order: int, with_patches: bool) -> str:
+    """Return the name of a method: tv, tv-patch, dv2, dv2-patch, ..."""
+    return ("tv" if order == 1 else f"dv{order}") + ("-patch" if with_patches else "")
 
 
 def row_bands(pixel_rows: int, bands: int) -> NDArray[np.int64]:
     """Return the first and last + 1 row of at most `bands` bands of pixel rows: (band, 2)."""
     edges = np.unique(np.linspace(0, pixel_rows, bands + 1).round().astype(np.int64))
     return np.stack([edges[:-1], edges[1:]], axis=1)
-
-
-def _check(
-    psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_] | None
-) -> None:
-    if not 0 <= noise_sigma < np.inf:
-        raise ReconstructionError(
-            f"a noise level of {noise_sigma:g}: it must be finite, at least 0"
-        )
-    if frames.shape != psi.frames_shape:
-        raise ReconstructionError(
-            f"frames of shape {frames.shape} given, Psi needs {psi.frames_shape} "
-            "(shot, row, column): use the Psi measured with these shots"
-        )
-    if usable is not None and usable.shape != psi.frames_shape:
-        raise ReconstructionError(f"the mask of usable pixels has shape {usable.shape}")
-    if usable is not None and not usable.any():
-        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
-    judged = frames if usable is None else frames[usable]
-    if not np.isfinite(judged).all():
-        raise ReconstructionError("the frames hold values that are not finite: exclude them")
 
 
 def reconstruct_tv(
@@ -129,63 +85,52 @@ def reconstruct_tv(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    patch_term: PatchTerm | None = None,
+    start: Array | None = None,
 ) -> Reconstruction:
     """Return the light field of least total variation that explains the frames.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
     deviation, which sets mu when the settings do not. usable: pixels to fit (default all);
-    saturated and dead ones are left out exactly. Raises ReconstructionError for frames that do
-    not fit Psi or are not finite, and for a noise level that is negative or not finite.
+    saturated and dead ones are left out exactly. patch_term: estimates to stay near, rho times
+    their weight. start: the light field to begin with, (v, u, y, x, c); default: the patches where
+    there are any, and a blurred picture. Raises ReconstructionError for frames, patches or a start
+    that do not fit Psi or are not finite, and for a noise level that is negative or not finite.
     """
     settings = settings or TVSettings()
     started = clock()
-    _check(psi, frames, noise_sigma, usable)
+    check(psi, frames, noise_sigma, usable, patch_term, start)
     if usable is None:
         usable = np.ones(psi.frames_shape, dtype=bool)
     dtype = psi.weights.dtype.type
     data = np.where(usable, frames, 0).astype(dtype)
-    mu = settings.mu or choose_mu(psi, data[usable], noise_sigma)
+    mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
-    contrast = max(float(guess.std()), 0.05 * float(np.abs(guess).max()), 1e-12)
-    gamma = settings.primal_step or 0.18 * contrast / mu / max(1.0, settings.chroma_weight)
+    gamma = settings.primal_step or choose_primal_step(contrast(guess), mu, settings.chroma_weight)
     metric = colour_metric(settings.chroma_weight).astype(dtype)
-    norm_squared = DIFFERENCE_NORM_SQUARED * max(1.0, settings.chroma_weight) ** 2
-    dual_step = 1 / (norm_squared * gamma)
-    inverse = psi.solver(np.where(usable, 1 / gamma, np.inf)).inverse
-
+    problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
-    light_field[:] = rows_of_colours(guess)[:, :, :]
-    dual = np.zeros((*light_field.shape[:3], 4, *light_field.shape[3:]), dtype=dtype)
-    fit = kernels.Data(psi.weights, psi.colour_map, inverse, data, psi.binning)
-    steps = kernels.Steps(
-        dtype(gamma), dtype(dual_step), dtype(mu), dtype(settings.relaxation), metric
-    )
+    begin = first_light_field(psi, guess, patch_term) if start is None else start
+    light_field[:] = rows_of_colours(begin)
+    sweep, bands = _sweep(problem, dtype(gamma), dtype(settings.relaxation), light_field)
     moved = np.zeros((psi.frames_shape[1], 2))
-    bands = row_bands(psi.frames_shape[1], get_num_threads())
     history: list[tuple[int, float]] = []
     change, step = np.inf, 0
-
-    def objective() -> float:
-        natural = np.moveaxis(light_field, -2, -1)
-        misfit = (psi.forward(natural) - data)[usable]
-        rows = np.empty(psi.size[0])
-        kernels.total_variation_rows(light_field, metric, rows)
-        return float(0.5 * np.sum(np.square(misfit, dtype=np.float64)) + mu * rows.sum())
-
     with ThreadPoolExecutor(len(bands)) as pool:
         while step < settings.max_steps and change > settings.rtol:
-            kernels.sweep(fit, steps, light_field, dual, bands, moved, pool.map)
+            sweep(bands, moved, pool.map)
             step += 1
             change = float(np.sqrt(moved[:, 0].sum() / max(moved[:, 1].sum(), 1e-300)))
-            value = objective() if step % settings.objective_every == 0 else None
-            if value is not None:
+            value = None
+            if step % settings.objective_every == 0:
+                value = problem.value(np.moveaxis(light_field, -2, -1))
                 history.append((step, value))
             if on_step is not None:
                 on_step(Progress(step, change, value))
     converged = change <= settings.rtol
     result = np.ascontiguousarray(np.moveaxis(light_field, -2, -1), dtype=np.float32)
     return Reconstruction(
-        method=METHOD,
+        method=method_name(settings.order, patch_term is not None),
         light_field=np.clip(result, 0, 1, out=result),
         status="converged" if converged else "step limit reached",
         advice="" if converged else "raise max_steps or loosen rtol",
@@ -197,5 +142,37 @@ def reconstruct_tv(
             "chroma_weight": settings.chroma_weight,
             "primal_step": float(gamma),
             "noise_sigma": noise_sigma,
+            "order": settings.order,
+            "rho": settings.rho,
         },
     )
+
+
+def _sweep(
+    problem: Problem, gamma: np.floating, relaxation: np.floating, light_field: Array
+) -> tuple[Callable[..., None], NDArray[np.int64]]:
+    """Return a step of the solver on light_field (v, u, y, c, x), in place, and its bands of rows.
+
+    The steps do not depend on the size of the picture, so that its tiles take the same ones.
+    """
+    psi, order, dtype = problem.psi, problem.order, light_field.dtype
+    spread = float(np.linalg.norm(problem.metric, 2)) ** 2
+    norm_squared = spread * norm_squared_of(order, (*light_field.shape[:2], None, None))
+    pull = problem.pixel_weight()
+    total = 1 / gamma + pull
+    inverse = psi.solver(np.where(problem.usable, total, np.inf)).inverse
+    fit = kernels.Data(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
+    if problem.patch_term is not None and problem.rho > 0:
+        share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
+        pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
+        fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
+    dual_step = dtype.type(1 / (norm_squared * gamma))
+    steps = kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
+    bands = row_bands(psi.frames_shape[1], get_num_threads())
+    if order == 1:
+        dual = np.zeros((*light_field.shape[:3], 4, *light_field.shape[3:]), dtype=dtype)
+        return partial(kernels.sweep, fit, steps, light_field, dual), bands
+    taps = stencils(order, (*light_field.shape[:3], light_field.shape[4]), dtype)
+    dual = np.zeros((*light_field.shape[:3], len(taps.reach), *light_field.shape[3:]), dtype)
+    ahead = np.empty_like(light_field)
+    return partial(difference_kernels.sweep, fit, steps, taps, light_field, dual, ahead), bands

@@ -146,18 +146,20 @@ def test_matching_pursuit_rests_at_the_noise():
 
 def test_the_penalty_follows_the_noise_and_the_size_of_the_sensed_atoms():
     atoms, data, _ = problem(300, 45)
-    small, large = (solve_bpdn(atoms, data, sigma).penalty for sigma in (0.3, 0.6))
+    small, large = (solve_bpdn(atoms, data, sigma).penalty for sigma in (0.5, 1.0))
     assert large == pytest.approx(2 * small)
-    expected = 0.5 * 0.3 * np.sqrt((atoms**2).sum(axis=1).mean() * 2 * np.log(300))
+    size = np.median(np.linalg.norm(atoms, axis=1))
+    expected = 0.2 * 0.5 * size * np.sqrt(2 * np.log(300))
     assert small == pytest.approx(expected, rel=1e-5)
-    scaled = solve_bpdn(3 * atoms, 3 * data, 0.3).penalty
+    scaled = solve_bpdn(3 * atoms, 3 * data, 0.5).penalty
     assert scaled == pytest.approx(3 * small)
 
 
 def test_without_noise_the_penalty_is_a_small_share_of_the_largest_useful_one():
     atoms, data, _ = problem(300, 45)
     largest = np.abs(atoms @ data).max()
-    assert solve_bpdn(atoms, data).penalty == pytest.approx(1e-3 * largest, rel=1e-5)
+    bound = np.median(np.linalg.norm(atoms, axis=1)) * np.linalg.norm(data)
+    assert solve_bpdn(atoms, data).penalty == pytest.approx(5e-4 * bound, rel=1e-5)
     zero = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=1.01 * largest))
     assert not zero.weights.any()
 
@@ -221,3 +223,25 @@ def test_lars_agrees_with_scikit_learn():
     theirs = model.fit(atoms.T, data).coef_
     ours = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta)).weights
     np.testing.assert_allclose(ours, theirs, atol=2e-4)
+
+
+def plain_admm(atoms, data, eta, rho, steps):
+    """The paper's ADMM [59] in float64: scaled form, one factor, no relaxation."""
+    inverse = np.linalg.inv(atoms.T @ atoms + rho * np.eye(data.size))
+    z = u = np.zeros(len(atoms))
+    for _ in range(steps):
+        q = z - u
+        x = q + atoms @ (inverse @ (data - q @ atoms))
+        z = np.sign(x + u) * np.maximum(np.abs(x + u) - eta / rho, 0)
+        u = u + x - z
+    return z
+
+
+def test_the_default_settings_reach_the_objective_of_ten_thousand_plain_steps_to_a_thousandth():
+    atoms, data, _ = problem(300, 45, sparsity=12, noise=0.2)
+    for share in (0.002, 0.05):
+        eta = share * np.abs(atoms @ data).max()
+        reached = objective(atoms, data, eta, plain_admm(atoms, data, eta, 0.3 * eta, 10_000))
+        code = solve_bpdn(atoms, data, settings=BPDNSettings(penalty=eta))
+        assert objective(atoms, data, eta, code.weights) <= reached * (1 + 1e-3)
+        assert code.steps < 200

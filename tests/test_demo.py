@@ -14,6 +14,8 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import load_hdf5, psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.scene import open_scene
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import MethodSettings
 from reconstruction.tv import TVSettings
 
 SIZE = (96, 128)
@@ -87,7 +89,7 @@ def test_the_same_seed_gives_the_same_result_and_another_another(tmp_path):
     def run(seed, folder):
         folder.mkdir()
         camera = find_camera("rgbw-bayer-1shot")
-        solver = TVSettings(max_steps=3)
+        solver = MethodSettings(tv=TVSettings(max_steps=3))
         settings = DemoSettings("near-planar", "c", camera, (32, 32), seed, solver=solver)
         run_demo(settings, folder)
         return load_hdf5(folder / "light_field.h5")
@@ -102,7 +104,11 @@ def test_the_same_seed_gives_the_same_result_and_another_another(tmp_path):
 )
 def test_every_kind_of_sensor_and_mask_runs_the_loop(tmp_path, name):
     settings = DemoSettings(
-        "near-planar", name, find_camera(name), (24, 32), solver=TVSettings(max_steps=5)
+        "near-planar",
+        name,
+        find_camera(name),
+        (24, 32),
+        solver=MethodSettings(tv=TVSettings(max_steps=5)),
     )
     metrics = run_demo(settings, tmp_path)
     assert metrics["psi_relative_error"] < 0.02
@@ -113,7 +119,7 @@ def test_binned_pixels_run_the_loop(tmp_path):
     camera = find_camera("rgbw-bayer-3shots")
     binned = camera.model_copy(update={"sensor": camera.sensor.model_copy(update={"binning": 2})})
     settings = DemoSettings(
-        "near-planar", "binned", binned, (48, 64), solver=TVSettings(max_steps=5)
+        "near-planar", "binned", binned, (48, 64), solver=MethodSettings(tv=TVSettings(max_steps=5))
     )
     metrics = run_demo(settings, tmp_path)
     assert metrics["psnr_db"] > 10
@@ -126,3 +132,20 @@ def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path,
     camera = find_camera("rgbw-bayer-3shots")
     metrics = run_demo(DemoSettings(str(folder), "rgbw-bayer-3shots", camera, (160, 200)), tmp_path)
     assert metrics["psnr_db"] > metrics["replicate_psnr_db"] + 1
+
+
+def test_the_loop_reconstructs_with_a_dictionary(tmp_path):
+    name = "rgbw-bayer-2shots"
+    settings = DemoSettings(
+        "near-planar", name, find_camera(name), (24, 32), method="dict-omp", dictionary="dct"
+    )
+    metrics = run_demo(settings, tmp_path)
+    assert metrics["method"] == "dict-omp"
+    assert metrics["parameters"]["patches"] > 10
+
+
+def test_a_method_that_is_not_known_is_told_before_anything_is_captured(tmp_path):
+    settings = DemoSettings("near-planar", "rgbw-mono", find_camera("rgbw-mono"), method="dict-ump")
+    with pytest.raises(ReconstructionError, match="did you mean 'dict-omp'"):
+        run_demo(settings, tmp_path)
+    assert not any(tmp_path.iterdir())

@@ -6,8 +6,10 @@ import pytest
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction import kernels
+from reconstruction.choices import choose_mu
 from reconstruction.errors import ReconstructionError
-from reconstruction.tv import TVSettings, choose_mu, colour_metric, reconstruct_tv, row_bands
+from reconstruction.problem import colour_metric
+from reconstruction.tv import TVSettings, reconstruct_tv, row_bands
 from simulators.scenes import render
 
 DV_1 = np.eye(3)

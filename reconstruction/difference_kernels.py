@@ -1,0 +1,241 @@
+"""Loops of derivatives of any order, and the primal-dual sweep of DV_K, on `Stencils`.
+
+The sweep is that of `kernels`, with rows of the dual variable (v, u, y, index, colour, x) that
+need the rows of pixels up to K further down: it follows the primal step at that distance, so that
+both find their rows in cache. Bands of rows run in parallel; the dual steps of a band's last K
+rows need the next band's first and are done after all bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from reconstruction.kernels import Data, Steps, fit_rows, mix, pull_row
+
+
+class Stencils(NamedTuple):
+    """The stencils of all derivatives that fit somewhere; taps begin[i]:begin[i + 1] make the i-th.
+
+    reach: (index, 4), how many samples beyond its own a derivative needs along x, y, u, v.
+    offset: (tap, 4) along x, y, u, v. factor: (tap,), of the light field's type.
+    """
+
+    reach: Any
+    begin: Any
+    offset: Any
+    factor: Any
+
+
+@njit(cache=True)
+def _fits(shape, reach, v, u, y):
+    """Return whether a stencil fits along v, u and y."""
+    return v + reach[3] < shape[0] and u + reach[2] < shape[1] and y + reach[1] < shape[2]
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def gradient(light_field, stencils, colours, out):
+    """Set out (index, v, u, y, x c) to the derivatives of light_field (v, u, y, x c) that fit."""
+    reach, begin, offset, factor = stencils
+    views_v, views_u, rows, width = light_field.shape
+    for y in prange(rows):
+        for index in range(len(reach)):
+            inside = width - reach[index, 0] * colours
+            for v in range(views_v - reach[index, 3]):
+                for u in range(views_u - reach[index, 2]):
+                    if not _fits(light_field.shape, reach[index], v, u, y):
+                        continue
+                    line = out[index, v, u, y]
+                    for tap in range(begin[index], begin[index + 1]):
+                        dx, dy, du, dv = offset[tap]
+                        source = light_field[v + dv, u + du, y + dy]
+                        shift = dx * colours
+                        for x in range(inside):
+                            line[x] += factor[tap] * source[x + shift]
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def adjoint(derivatives, stencils, colours, out):
+    """Add to out (v, u, y, x c) the adjoint of `gradient` on derivatives (index, v, u, y, x c)."""
+    reach, begin, offset, factor = stencils
+    views_v, views_u, rows, width = out.shape
+    for y in prange(rows):
+        for v in range(views_v):
+            for u in range(views_u):
+                line = out[v, u, y]
+                for index in range(len(reach)):
+                    inside = width - reach[index, 0] * colours
+                    for tap in range(begin[index], begin[index + 1]):
+                        dx, dy, du, dv = offset[tap]
+                        if dv > v or du > u or dy > y:
+                            continue
+                        if _fits(out.shape, reach[index], v - dv, u - du, y - dy):
+                            source = derivatives[index, v - dv, u - du, y - dy]
+                            shift = dx * colours
+                            for x in range(inside):
+                                line[x + shift] += factor[tap] * source[x]
+
+
+@njit(cache=True, fastmath=True)
+def _differentiate(light_field, stencils, index, v, u, y, out):
+    """Set out (3, x), colours apart, to a derivative that fits of a light field (v, u, y, 3 x).
+
+    The colours of a row are taken as one line; where a stencil would reach into the next colour
+    the derivative does not exist and is set to 0.
+    """
+    reach, begin, offset, factor = stencils
+    line = out.reshape(-1)
+    for tap in range(begin[index], begin[index + 1]):
+        dx, dy, du, dv = offset[tap]
+        source = light_field[v + dv, u + du, y + dy]
+        scale = factor[tap]
+        if tap == begin[index]:
+            for x in range(line.size):
+                line[x] = scale * source[x]
+        else:
+            for x in range(line.size - dx):
+                line[x] += scale * source[x + dx]
+    out[:, out.shape[1] - reach[index, 0] :] = 0
+
+
+@njit(cache=True, fastmath=True)
+def _descend(light_field, dual, stencils, step, back, v, u, y, out):
+    """Set out (3, x) to a row of the light field less step times the adjoint on the dual variable.
+
+    dual: (v, u, y, index, 3 x), 0 where a stencil does not fit, so that no colour spills over.
+    """
+    reach, begin, offset, factor = stencils
+    line = out.reshape(-1)
+    line[:] = 0
+    for index in range(len(reach)):
+        for tap in range(begin[index], begin[index + 1]):
+            dx, dy, du, dv = offset[tap]
+            if dv > v or du > u or dy > y:
+                continue
+            if _fits(dual.shape, reach[index], v - dv, u - du, y - dy):
+                source = dual[v - dv, u - du, y - dy, index]
+                scale = factor[tap]
+                for x in range(line.size - dx):
+                    line[x + dx] += scale * source[x]
+    mix(back, out)
+    row = light_field[v, u, y].reshape(-1)
+    for x in range(line.size):
+        line[x] = row[x] - step * line[x]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _dual_rows(steps, stencils, ahead, dual, begin, end):
+    """Do the dual step of rows begin to end: ahead (v, u, y, 3 x), dual (v, u, y, index, 3 x)."""
+    _, step, bound, relax, _ = steps
+    views_v, views_u, _, count, values = dual.shape
+    width = values // 3
+    raised = np.empty((count, 3, width), dual.dtype)
+    size = np.empty(width, dual.dtype)
+    one = np.float32(1)
+    tiny = np.float32(1e-30)
+    for y in range(begin, end):
+        for v in range(views_v):
+            for u in range(views_u):
+                size[:] = 0
+                for index in range(count):
+                    if not _fits(dual.shape, stencils.reach[index], v, u, y):
+                        continue
+                    new, old = raised[index], dual[v, u, y, index]
+                    _differentiate(ahead, stencils, index, v, u, y, new)
+                    for c in range(3):
+                        line, before = new[c], old[c * width : (c + 1) * width]
+                        for x in range(width):
+                            line[x] = before[x] + step * line[x]
+                            size[x] += line[x] * line[x]
+                for x in range(width):
+                    size[x] = relax * min(one, bound / np.sqrt(size[x] + tiny))
+                for index in range(count):
+                    if not _fits(dual.shape, stencils.reach[index], v, u, y):
+                        continue
+                    new, old = raised[index], dual[v, u, y, index]
+                    for c in range(3):
+                        line, before = new[c], old[c * width : (c + 1) * width]
+                        for x in range(width):
+                            before[x] = (one - relax) * before[x] + size[x] * line[x]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved):
+    """Do the rows of pixels from begin to end, but for the dual steps of the last K rows."""
+    back = steps.metric.T.copy()
+    furthest = stencils.reach[:, 1].max()
+    flat = ahead.reshape((*ahead.shape[:3], ahead.shape[3] * ahead.shape[4]))
+    done = begin * data.binning
+    for row in range(begin, end):
+        base = row * data.binning
+        for v in range(light_field.shape[0]):
+            for u in range(light_field.shape[1]):
+                for y in range(base, base + data.binning):
+                    lines = ahead[v, u, y]
+                    _descend(light_field, dual, stencils, steps.primal, back, v, u, y, lines)
+                    pull_row(data, v, u, y, lines)
+        fit_rows(data, steps, light_field, row, ahead, base, moved)
+        ready = max(done, base + data.binning - furthest)
+        _dual_rows(steps, stencils, flat, dual, done, ready)
+        done = ready
+
+
+def sweep(
+    data: Data,
+    steps: Steps,
+    stencils: Stencils,
+    light_field: NDArray[np.floating],
+    dual: NDArray[np.floating],
+    ahead: NDArray[np.floating],
+    bands: NDArray[np.int64],
+    moved: NDArray[np.float64],
+    run: Callable[..., Iterable[object]] = map,
+) -> None:
+    """Do one over-relaxed primal-dual iteration in place, as `kernels.sweep` does for K = 1.
+
+    dual: (v, u, y, index, colour, x), 0 where no stencil fits. ahead: room for another light field.
+    """
+    dual = dual.reshape(*dual.shape[:4], -1)
+    flat = ahead.reshape(*ahead.shape[:3], -1)
+    furthest = int(stencils.reach[:, 1].max())
+
+    def rows(band: int) -> None:
+        begin, end = bands[band]
+        _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved)
+
+    def last_rows(band: int) -> None:
+        begin, end = bands[band] * data.binning
+        _dual_rows(steps, stencils, flat, dual, max(begin, end - furthest), end)
+
+    for stage in (rows, last_rows):
+        for _ in run(stage, range(len(bands))):
+            pass
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def variation_rows(light_field, stencils, metric, totals):
+    """Set totals (y,) to DV_K of every row of a light field (v, u, y, colour, x)."""
+    views_v, views_u, rows, _, width = light_field.shape
+    flat = light_field.reshape((views_v, views_u, rows, 3 * width))
+    for y in prange(rows):
+        square = np.empty(width, light_field.dtype)
+        lines = np.empty((3, width), light_field.dtype)
+        total = 0.0
+        for v in range(views_v):
+            for u in range(views_u):
+                square[:] = 0
+                for index in range(len(stencils.reach)):
+                    if not _fits(light_field.shape, stencils.reach[index], v, u, y):
+                        continue
+                    _differentiate(flat, stencils, index, v, u, y, lines)
+                    mix(metric, lines)
+                    for c in range(3):
+                        for x in range(width):
+                            square[x] += lines[c, x] ** 2
+                for x in range(width):
+                    total += np.sqrt(square[x])
+        totals[y] = total

@@ -1,0 +1,103 @@
+"""`emmc-rig reconstruct`: a folder of frames in, a light field out, by any method."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.errors import AppError
+from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.reconstruct import load_settings, open_dictionary, read_capture, run_reconstruct
+from emmc_rig.simulate import simulate
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import DictionaryError, ReconstructionError
+
+SCENE, CAMERA, SIZE = "deep-occlusions", "rgbw-bayer-2shots", (36, 44)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    simulate(SCENE, CAMERA, find_camera(CAMERA), SIZE, 0, folder)
+    return folder
+
+
+@pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-omp", "dct")])
+def test_frames_become_a_light_field_with_pictures_and_metrics(
+    frames, tmp_path, method, dictionary
+):
+    metrics = run_reconstruct(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
+    light_field = load_hdf5(tmp_path / "light_field.h5")
+    assert light_field.shape == (5, 5, *SIZE, 3)
+    assert metrics["method"] == method
+    assert metrics["psnr_db"] > 12
+    assert json.loads((tmp_path / "metrics.json").read_text())["noise_sigma"] > 0
+    assert any((tmp_path / "pictures").iterdir())
+
+
+def test_the_noise_level_is_that_of_the_usable_pixels(frames):
+    capture = read_capture(frames)
+    with h5py.File(frames / "frames.h5") as file:
+        deviation = np.asarray(file["deviation"])
+        error = np.asarray(file["readings"]) - np.asarray(file["noise_free"])
+    assert capture.usable.all()
+    assert capture.noise_sigma == pytest.approx(np.sqrt(np.mean(deviation**2)))
+    # Over 3,168 pixels the spread is known to 1.3 per cent.
+    assert capture.noise_sigma == pytest.approx(error.std(), rel=0.06)
+
+
+def test_folders_that_hold_no_capture_are_refused(frames, tmp_path):
+    with pytest.raises(AppError, match=r"holds no frames\.h5"):
+        run_reconstruct(tmp_path, tmp_path, "tv")
+    whole = (frames / "frames.h5").read_bytes()
+    (tmp_path / "frames.h5").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(AppError, match="cannot be read"):
+        read_capture(tmp_path)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["readings"] = np.zeros((1, 2, 2))
+    (tmp_path / "frames.h5").unlink()
+    (tmp_path / "other.h5").rename(tmp_path / "frames.h5")
+    with pytest.raises(AppError, match="deviation"):
+        read_capture(tmp_path)
+
+
+def test_settings_come_from_yaml_and_a_misspelt_key_names_the_nearest(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("tv: {mu: 0.01}\nsparse: {stride: 3, solver: {atoms: 7}}\n")
+    settings = load_settings(path)
+    assert settings.tv.mu == 0.01
+    assert settings.sparse.stride == 3
+    assert settings.sparse.solver.atoms == 7
+    path.write_text("sparse: {solver: {atom: 7}}\n")
+    with pytest.raises(AppError, match="atoms"):
+        load_settings(path)
+    path.write_text("tv: {mu: -1}\n")
+    with pytest.raises(AppError, match="mu"):
+        load_settings(path)
+
+
+def test_dictionaries_come_by_name_or_file(random_psi, tmp_path):
+    psi = random_psi(views=(5, 5), size=(24, 24))
+    assert open_dictionary(None, psi).kind == "lambertian"
+    made = open_dictionary("dct", psi)
+    assert made.patch_shape == (5, 5, 9, 9, 3)
+    made.save(tmp_path / "own.h5")
+    np.testing.assert_array_equal(open_dictionary(str(tmp_path / "own.h5"), psi).atoms, made.atoms)
+    binned = random_psi(views=(5, 5), size=(24, 24), binning=2)
+    assert open_dictionary("dct", binned).patch_shape[2:4] == (8, 8)
+    with pytest.raises(DictionaryError, match="no such file"):
+        open_dictionary("nowhere.h5", psi)
+
+
+def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
+    atoms = np.random.default_rng(0).normal(size=(10, 3, 3, 9, 9, 3))
+    Dictionary.normalised(atoms, "ksvd").save(tmp_path / "small.h5")
+    with pytest.raises(DictionaryError, match="3x3 views"):
+        run_reconstruct(frames, tmp_path, "dict-omp", dictionary_spec=str(tmp_path / "small.h5"))
+
+
+def test_a_misspelt_method_is_told_first(tmp_path):
+    with pytest.raises(ReconstructionError, match="did you mean 'tv'"):
+        run_reconstruct(tmp_path, tmp_path, "tvv")
