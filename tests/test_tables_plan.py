@@ -125,7 +125,7 @@ def test_nothing_stands_where_the_paper_prints_nothing():
 
 def test_the_papers_means_over_its_real_scenes_come_out():
     # Computed from the printed table by hand, Dict-ADMM and TV-Dict.
-    means = {
+    means: dict[tuple[paper.Scenario, int], tuple[float, float]] = {
         ("i", 3): (35.12, 35.62),
         ("ii", 1): (30.09, 30.19),
         ("ii", 2): (34.18, 34.34),

@@ -22,11 +22,14 @@ from emmc_rig.tables.library import Array, Cut, Library
 from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.tables.scores import scored
-from emmc_rig.tables.shots import Sensors
+from emmc_rig.tables.shots import Sensors, Shots
 from reconstruction.bpdn import BPDNSettings
+from reconstruction.dictionary import Dictionary
+from reconstruction.inputs import checked_inputs
 from reconstruction.learning import LearningSettings
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
-from reconstruction.sparse import SparseSettings
+from reconstruction.result import Reconstruction
+from reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
 from reconstruction.training_patches import PatchSettings
 from reconstruction.tv import TVSettings
 
@@ -235,25 +238,18 @@ def _do(
     watcher.begin(f"reconstruct, {len(inputs) - len(todo)} kept from before", len(todo))
     forecast = Forecast(list(todo))
     sensors = Sensors(run.settings.seed)
-    dictionary = None
     for (scene, capture), group in groupby(todo, lambda cell: (cell.scene, cell.capture)):
         group = list(group)
         truth = run.truth(group[0])
         shots = sensors.take(capture, truth, scene)
-        if any(METHODS[cell.method].needs_dictionary for cell in group):
-            dictionary = run.source.dictionary(scene, capture.binning, watcher)
+        first = None
         for cell in group:
             started = clock()
-            found = reconstruct(
-                cell.method,
-                shots.psi,
-                shots.frames,
-                shots.noise_sigma,
-                dictionary,
-                run.settings.of(cell.method, capture),
-                shots.usable,
-                clock=clock,
-            )
+            settings = run.settings.of(cell.method, capture)
+            if METHODS[cell.method].needs_dictionary and first is None:
+                dictionary = run.source.dictionary(scene, capture.binning, watcher)
+                first = _first_stage(shots, dictionary, settings.sparse, clock)
+            found, seconds = _solved(cell.method, shots, settings, first, clock)
             scores = scored(found.light_field, truth)
             if cell in pictured:
                 kept = pictures_of(found.light_field, telling_lines(truth))
@@ -262,7 +258,7 @@ def _do(
                 **asdict(scores),
                 "sensor_psnr_db": shots.sensor_psnr_db,
                 "noise_sigma": shots.noise_sigma,
-                "seconds": found.seconds,
+                "seconds": seconds,
                 "steps": found.steps,
                 "status": found.status,
                 "advice": found.advice,
@@ -270,6 +266,48 @@ def _do(
             journal.add(digests[cell], inputs[cell], _plain(result))
             forecast.done(cell, clock() - started)
             watcher.step(f"{scores.psnr_db:.2f} dB {cell.label}; {forecast.left()}")
+
+
+@dataclass(frozen=True, eq=False)
+class _FirstStage:
+    """Dict-ADMM's patches, from which TV-Dict goes on, and what they took."""
+
+    dictionary: Dictionary
+    estimates: PatchEstimates
+    seconds: float
+
+
+def _first_stage(
+    shots: Shots, dictionary: Dictionary, settings: SparseSettings, clock: Callable[[], float]
+) -> _FirstStage:
+    started = clock()
+    sigma = shots.noise_sigma
+    frames, usable = checked_inputs(shots.psi, shots.frames, sigma, shots.usable)
+    estimates = estimate_patches(shots.psi, frames, sigma, dictionary, settings, usable)
+    return _FirstStage(dictionary, estimates, clock() - started)
+
+
+def _solved(
+    method: str,
+    shots: Shots,
+    settings: MethodSettings,
+    first: _FirstStage | None,
+    clock: Callable[[], float],
+) -> tuple[Reconstruction, float]:
+    """Return a method's result and its seconds, those of the first stage included."""
+    used = first if METHODS[method].needs_dictionary else None
+    found = reconstruct(
+        method,
+        shots.psi,
+        shots.frames,
+        shots.noise_sigma,
+        used.dictionary if used else None,
+        settings,
+        shots.usable,
+        clock=clock,
+        estimates=used.estimates if used else None,
+    )
+    return found, found.seconds + (used.seconds if used else 0)
 
 
 def _plain(result: dict) -> dict:
