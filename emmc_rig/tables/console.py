@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from rich.box import SIMPLE
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
@@ -14,7 +14,7 @@ from emmc_rig.tables.page import CAVEAT
 from emmc_rig.tables.plan import METHOD_TITLES
 
 COLOURS = {"holds": "green", "does not hold": "red"}
-WIDE = 4
+WIDE = 3
 
 
 def shown(grids: Sequence[Grid], findings: Sequence[Finding]) -> Iterator[Table | Text]:
@@ -27,9 +27,10 @@ def shown(grids: Sequence[Grid], findings: Sequence[Finding]) -> Iterator[Table 
 def _tables(grids: Sequence[Grid]) -> Iterator[Table]:
     """Yield one table per grid: ours, and the paper's behind a bar or, in wide ones, below."""
     for grid in grids:
-        table = Table(title=grid.title, box=SIMPLE, title_justify="left", caption_justify="left")
+        table = Table(title=grid.title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        table.title_justify = table.caption_justify = "left"
         for head in grid.heads:
-            table.add_column(head)
+            table.add_column(head, no_wrap=True)
         stacked = len(grid.columns) > WIDE
         for column in grid.columns:
             table.add_column(column, justify="right")
@@ -64,7 +65,7 @@ def _db(value: float | None) -> str:
 
 def _findings_table(findings: Sequence[Finding]) -> Table:
     """Return the findings: verdict, by how much and in how many scenes, and in the paper."""
-    table = Table(title="The paper's findings on these light fields", box=SIMPLE)
+    table = Table(title="The paper's findings on these light fields", box=SIMPLE_HEAD)
     table.title_justify = table.caption_justify = "left"
     table.add_column("verdict", no_wrap=True)
     table.add_column("dB: mean (range), scenes", no_wrap=True)

@@ -71,16 +71,16 @@ class TablesSettings(Settings):
 
 
 FAST = TablesSettings(
-    cut=Cut((96, 128)),
+    cut=Cut((80, 112)),
     binned_cut=Cut((64, 80), 2),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
-        sparse=SparseSettings(solver=BPDNSettings(max_steps=300, rtol=1e-2)),
+        sparse=SparseSettings(solver=BPDNSettings(rtol=1e-2)),
     ),
     training=TrainingSettings(
-        cut=Cut((256, 256)),
-        patches=PatchSettings(count=3000, candidates_per_patch=4),
-        learning=LearningSettings(atoms=256, iterations=6),
+        cut=Cut((192, 192)),
+        patches=PatchSettings(count=2000, candidates_per_patch=2),
+        learning=LearningSettings(atoms=256, iterations=4),
     ),
 )
 """Crops and small dictionaries: all tables on nine scenes in minutes."""
