@@ -460,6 +460,46 @@ def train(
     typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
 
 
+@app.command()
+def tables(
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="a folder of scenes (default: the built-in)")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option("--only", help="table2,table3,table4,figure5,...,figure10")
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="crops and small dictionaries: minutes, not days")
+    ] = False,
+    dictionary: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--dictionary",
+            help="a file, lambertian or dct; again for r = 1/4 (default: train leave-one-out)",
+        ),
+    ] = None,
+    seed: SeedOption = 0,
+    out: OutOption = Path("emmc-tables"),
+) -> None:
+    """Reproduce the paper's tables and figures; run it again to go on where it stopped."""
+    from emmc_rig.tables.command import run_tables
+    from emmc_rig.tables.console import shown
+    from emmc_rig.tables.run import FAST, TablesSettings, TablesStopped
+
+    settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
+    try:
+        with _progress() as progress:
+            bars = Bars(progress)
+            outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
+            bars.finish()
+    except TablesStopped as stop:
+        _fail(str(stop), INTERRUPTED)
+    else:
+        for part in shown(outcome.grids, outcome.findings):
+            Console().print(part)
+        typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
+
+
 def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics

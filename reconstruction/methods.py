@@ -22,7 +22,12 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs
 from reconstruction.patch_term import PatchTerm
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.sparse import SparseSettings, estimate_patches, reconstruct_sparse
+from reconstruction.sparse import (
+    PatchEstimates,
+    SparseSettings,
+    estimate_patches,
+    reconstruct_sparse,
+)
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -146,12 +151,14 @@ def reconstruct(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    estimates: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field that the method called `name` finds.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
-    deviation. usable: pixels to fit (default all). Raises ReconstructionError for a method that
-    is not known, a dictionary that is missing, and inputs that do not fit each other.
+    deviation. usable: pixels to fit (default all). estimates: what `estimate_patches` found from
+    the same inputs, for `dict-admm` and `tv-dict` to go on from. Raises ReconstructionError for a
+    method that is not known, a dictionary that is missing, and inputs that do not fit each other.
     """
     method = find_method(name)
     settings = settings or MethodSettings()
@@ -162,12 +169,16 @@ def reconstruct(
             f"'{name}' needs a dictionary: `emmc-rig train` makes one, --dictionary names it"
         )
     if name == "tv-dict":
-        return _tv_dict(psi, frames, noise_sigma, dictionary, settings, usable, on_step, clock)
+        return _tv_dict(
+            psi, frames, noise_sigma, dictionary, settings, usable, on_step, clock, estimates
+        )
     solver = name.removeprefix("dict-")
     assert solver in get_args(bpdn.Method)
     chosen = settings.sparse.solver.model_copy(update={"method": solver})
     sparse = settings.sparse.model_copy(update={"solver": chosen})
-    return reconstruct_sparse(psi, frames, noise_sigma, dictionary, sparse, usable, on_step, clock)
+    return reconstruct_sparse(
+        psi, frames, noise_sigma, dictionary, sparse, usable, on_step, clock, estimates
+    )
 
 
 def patched_weights(
@@ -196,10 +207,14 @@ def _tv_dict(
     usable: NDArray[np.bool_] | None,
     on_step: Callable[[Progress], None] | None,
     clock: Callable[[], float],
+    found: PatchEstimates | None,
 ) -> Reconstruction:
     started = clock()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    found = estimate_patches(psi, frames, noise_sigma, dictionary, settings.sparse, usable, on_step)
+    if found is None:
+        found = estimate_patches(
+            psi, frames, noise_sigma, dictionary, settings.sparse, usable, on_step
+        )
     first_s = clock() - started
     term = PatchTerm(found.light_field, found.weight)
     tv = patched_weights(settings.tv, settings.sparse, psi, frames[usable], noise_sigma)

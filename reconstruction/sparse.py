@@ -275,19 +275,22 @@ def reconstruct_sparse(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    found: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field whose patches are sparse in the dictionary.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
     deviation, which sets the penalty when the settings do not. usable: pixels to fit (default
     all); saturated and dead ones are left out exactly, and where a whole patch is unusable it
-    says nothing. Raises ReconstructionError for inputs that do not fit each other, and a light
-    field smaller than a patch.
+    says nothing. found: the estimates of the same inputs, where they are known already. Raises
+    ReconstructionError for inputs that do not fit each other, and a light field smaller than a
+    patch.
     """
     settings = settings or SparseSettings()
     started = clock()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    found = estimate_patches(psi, frames, noise_sigma, dictionary, settings, usable, on_step)
+    if found is None:
+        found = estimate_patches(psi, frames, noise_sigma, dictionary, settings, usable, on_step)
     uncovered = int((found.weight == 0).sum())
     if found.empty == len(found.atoms):
         raise ReconstructionError("no patch holds a usable pixel: nothing can be reconstructed")
@@ -303,7 +306,7 @@ def reconstruct_sparse(
         )
     return Reconstruction(
         method=f"dict-{settings.solver.method}",
-        light_field=np.clip(found.light_field, 0, 1, out=found.light_field),
+        light_field=np.clip(found.light_field, 0, 1),
         status="converged" if found.converged == 1 and not found.empty else "incomplete",
         advice="; ".join(advice),
         steps=round(found.passes),

@@ -1,0 +1,75 @@
+"""What a figure needs of a light field, small enough to keep: two views and two epipolar images."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.lightfield import centre_view, epi_horizontal, epi_vertical
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """corner, centre: views (y, x, c), the top-left and the centre one. across: (u, x, c), along
+    a row of the centre row of views; down: (v, y, c), along a column.
+    """
+
+    corner: Array
+    centre: Array
+    across: Array
+    down: Array
+
+    def save(self, path: Path) -> None:
+        """Write the file, whole or not at all; half precision is finer than a screen."""
+        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            path.parent.mkdir(exist_ok=True)
+            arrays = {f.name: getattr(self, f.name).astype(np.float16) for f in fields(self)}
+            with open(partial, "wb") as file:
+                np.savez(file, **arrays)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: Path) -> Pictures | None:
+        """Read what `save` wrote; None where there is nothing whole."""
+        try:
+            with open(path, "rb") as stream, np.load(stream) as file:
+                return cls(*(file[f.name].astype(np.float32) for f in fields(cls)))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+
+
+def telling_lines(truth: Array) -> tuple[int, int]:
+    """Return the row and the column (y, x) along which the outer views differ most.
+
+    Epipolar images through them show slopes. They lie in the middle three fifths of the picture.
+    """
+    across = np.abs(truth[truth.shape[0] // 2, -1] - truth[truth.shape[0] // 2, 0])
+    down = np.abs(truth[-1, truth.shape[1] // 2] - truth[0, truth.shape[1] // 2])
+    found = []
+    for difference, axis in ((across, 0), (down, 1)):
+        inner = difference[tuple(slice(n // 5, n - n // 5) for n in difference.shape[:2])].mean(
+            axis=(1 - axis, 2)
+        )
+        found.append(int(inner.argmax()) + difference.shape[axis] // 5)
+    return found[0], found[1]
+
+
+def pictures_of(light_field: Array, lines: tuple[int, int]) -> Pictures:
+    """Return the pictures of a light field (v, u, y, x, c); lines: row and column."""
+    y, x = lines
+    return Pictures(
+        light_field[0, 0],
+        centre_view(light_field),
+        epi_horizontal(light_field, light_field.shape[0] // 2, y),
+        epi_vertical(light_field, light_field.shape[1] // 2, x),
+    )

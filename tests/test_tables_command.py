@@ -1,0 +1,288 @@
+"""`emmc-rig tables` end to end: every file it writes, what it prints, and how it fails."""
+
+import csv
+import html.parser
+import json
+import re
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from emmc_rig import cli
+from emmc_rig.demo import Silent
+from emmc_rig.model.lightfield import save_hdf5
+from emmc_rig.tables.command import run_tables
+from emmc_rig.tables.console import shown
+from emmc_rig.tables.grids import MEAN, Pair
+from emmc_rig.tables.library import Cut
+from emmc_rig.tables.mosaic import Piece, Tile, composed, telling_pieces
+from emmc_rig.tables.plan import PARTS, cells_of, distinct
+from emmc_rig.tables.rows import COLUMNS
+from emmc_rig.tables.run import TablesSettings
+from reconstruction.bpdn import BPDNSettings
+from reconstruction.dictionary import Dictionary, dct_dictionary
+from reconstruction.methods import MethodSettings
+from reconstruction.sparse import SparseSettings
+from reconstruction.tv import TVSettings
+
+NAMES = ("attic", "dragons")
+QUICK = TablesSettings(
+    cut=Cut((16, 18)),
+    binned_cut=Cut((16, 18), 2),
+    methods=MethodSettings(
+        tv=TVSettings(max_steps=2),
+        sparse=SparseSettings(stride=8, solver=BPDNSettings(max_steps=3, rtol=0.5)),
+    ),
+    binned_stride=8,
+)
+
+
+def save_scenes(folder):
+    for seed, name in enumerate(NAMES):
+        rng = np.random.default_rng(seed)
+        picture = np.clip(0.5 + cv2.GaussianBlur(rng.random((24, 26, 3)) - 0.5, (0, 0), 1), 0, 1)
+        views = [[picture[v : v + 20, u : u + 22] for u in range(5)] for v in range(5)]
+        save_hdf5(folder / f"{name}.h5", np.asarray(views, np.float32), {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    return save_scenes(tmp_path_factory.mktemp("scenes"))
+
+
+@pytest.fixture(scope="module")
+def small_dictionary(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dictionary") / "small.h5"
+    dct_dictionary((5, 5), (8, 8), (1, 1, 3, 3), (1, 1, 1, 1)).save(path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def whole(scenes, small_dictionary, tmp_path_factory):
+    """All tables and figures of two tiny scenes."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    outcome = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
+    return folder, outcome
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", "tables", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        told = capsys.readouterr()
+        return stop.value.code or 0, told.out, told.err
+
+    return call
+
+
+def one_line(text):
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
+def test_every_cell_is_one_row_of_the_csv(whole):
+    folder, _ = whole
+    with open(folder / "tables.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    cells = distinct(cell for part in PARTS.values() for cell in cells_of(part, list(NAMES)))
+    assert len(rows) == len(cells) == 18 + 21 + 36 + (12 - 3) + 2
+    assert tuple(rows[0]) == COLUMNS
+    shared = [row for row in rows if "figure8" in row["tables"] and "table2" in row["tables"]]
+    assert [row["mask"] for row in shared] == ["rgbw"] * 3
+    printed = [row for row in rows if row["paper_psnr_db"]]
+    assert {row["scene"] for row in printed} == {"dragons"}
+    row = next(r for r in printed if (r["scenario"], r["method"]) == ("i", "tv-dict"))
+    assert (row["paper_psnr_db"], row["shots"], row["noise"]) == ("30.2200", "3", "no")
+    for row in rows:
+        assert float(row["psnr_db"]) > 0
+        assert float(row["replicate_psnr_db"]) > 0
+        assert (row["rows"], row["columns"]) == ("16", "18")
+        assert bool(row["dictionary"]) == (row["method"] != "tv")
+        assert bool(row["sensor_psnr_db"]) == (row["noise"] == "yes")
+
+
+class Links(html.parser.HTMLParser):
+    """Collects what a page refers to."""
+
+    def __init__(self):
+        super().__init__()
+        self.targets, self.anchors, self.pictures = [], set(), 0
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.anchors.add(found.get("id"))
+        self.pictures += tag == "img"
+        self.targets += [found[key] for key in ("href", "src") if key in found]
+
+
+def test_the_page_is_whole_and_asks_for_nothing(whole):
+    folder, outcome = whole
+    assert outcome.page == folder / "tables.html"
+    text = outcome.page.read_text()
+    assert "{{" not in text
+    links = Links()
+    links.feed(text)
+    for target in links.targets:
+        assert target.startswith(("data:", "#"))
+        if target.startswith("#"):
+            assert target[1:] in links.anchors
+    assert links.pictures == 4 + 6
+    assert not re.search(r"https?://", re.sub(r'"data:[^"]*"', "", text))
+    for part in PARTS.values():
+        assert part.title.partition(":")[0] in text
+    assert "30.22" in text
+
+
+def test_figures_and_charts_are_pictures(whole):
+    folder, _ = whole
+    names = {path.name for path in (folder / "figures").iterdir()}
+    figures = {f"figure{n}.png" for n in (5, 6, 7, 8, 9, 10)}
+    assert names == figures | {
+        "chart-shots.svg", "chart-noise.svg", "chart-colour.svg", "chart-masks.svg",
+    }  # fmt: skip
+    for name in figures:
+        picture = cv2.imread(str(folder / "figures" / name))
+        assert picture is not None
+        assert min(picture.shape[:2]) > 300
+        assert picture.std() > 10
+
+
+def test_the_metrics_tell_the_findings(whole):
+    folder, outcome = whole
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["cells"] == 86
+    told = {finding["name"]: finding for finding in metrics["findings"]}
+    for finding in outcome.findings:
+        assert told[finding.claim.name]["verdict"] == finding.verdict
+        assert finding.verdict != "not measured"
+    assert told["cfa-noise"]["paper_db"] == pytest.approx(1.2725)
+
+
+def test_grids_hold_means_and_the_papers_numbers(whole):
+    _, outcome = whole
+    table_2, table_3, table_4, figure_8 = outcome.grids
+    line = next(x for x in table_2.lines if x.heads == ("dragons", "noise-free", "TV-Dict"))
+    assert [pair.paper for pair in line.pairs] == [30.22, 27.98, 30.52]
+    assert all(pair.ours is not None for pair in line.pairs)
+    theirs = next(x for x in table_3.lines if x.heads == ("paper's 7", "TV-Dict"))
+    assert theirs.pairs[0] == Pair(None, pytest.approx(35.62, abs=0.006))
+    assert len(table_4.lines[0].pairs) == 4
+    assert figure_8.columns == ("RGBW", "random binary", "uniform colour", "Gaussian colour")
+    assert not any(line.heads[0] == MEAN for line in table_3.lines)
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_the_console_shows_all_without_cutting_numbers(whole, width):
+    _, outcome = whole
+    console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        for part in shown(outcome.grids, outcome.findings):
+            console.print(part)
+    text = console.export_text()
+    assert "…" not in text
+    assert "30.22" in text
+    assert "aperture variant" in " ".join(text.split())
+
+
+def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
+    whole, scenes, small_dictionary, monkeypatch
+):
+    folder, outcome = whole
+    (folder / "mine.txt").write_text("keep")
+    before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
+    from emmc_rig.tables import run as module
+
+    monkeypatch.setattr(module, "reconstruct", None)
+    again = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
+    assert again.grids == outcome.grids
+    assert before == ((folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes())
+    assert (folder / "mine.txt").read_text() == "keep"
+    assert not [path for path in folder.rglob("*") if ".part" in path.name]
+
+
+def test_a_part_alone_is_done_from_the_command_line(run, scenes):
+    code, out, _ = run("--scenes", scenes, "--only", "figure5", "--fast", "--out", "r")
+    assert code == 0
+    assert "open r/tables.html" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--only", "figure11"], "did you mean 'figure1"),
+        (["--scenes", "nowhere"], "no such folder"),
+        (["--scenes", "."], "no scenes"),
+        (["--dictionary", "nothing.h5"], "no such file"),
+        (["--out", "taken"], "holds something else"),
+        (["--out", "taken/cat.jpg"], "a file of that name"),
+        (["--out", "/proc/tables"], "cannot be written"),
+    ],
+)
+def test_faults_are_one_line(run, tmp_path, arguments, told):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "cat.jpg").write_text("meow")
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert told in one_line(err)
+    assert (tmp_path / "taken" / "cat.jpg").read_text() == "meow"
+
+
+def test_a_dictionary_that_saw_the_scene_is_refused(run, scenes, tmp_path):
+    atoms = np.random.default_rng(0).normal(size=(4, 5, 5, 8, 8, 3))
+    provenance = json.dumps({"scenes": ["attic"]})
+    Dictionary.normalised(atoms, "ksvd", provenance).save(tmp_path / "d.h5")
+    code, _, err = run("--scenes", scenes, "--only", "table3", "--dictionary", "d.h5")
+    assert (code, "was trained on 'attic'" in one_line(err)) == (1, True)
+
+
+def test_ctrl_c_is_told_with_how_to_go_on(run, scenes, monkeypatch):
+    from emmc_rig.tables import command
+
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    for stage in ("do_cells", "draw_figures"):
+        with monkeypatch.context() as patch:
+            patch.setattr(command, stage, interrupted)
+            code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
+        assert code == 130
+        assert "run the same command again" in one_line(err)
+
+
+def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
+    from emmc_rig.tables import command
+
+    def full(*arguments, **named):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(command, "draw_figures", full)
+    code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
+    assert (code, "No space left" in one_line(err)) == (1, True)
+
+
+def test_the_most_telling_piece_is_where_the_texture_is():
+    picture = np.full((60, 80, 3), 0.5, np.float32)
+    picture[30:42, 50:62] = np.random.default_rng(0).random((12, 12, 3))
+    (piece,) = telling_pieces(picture, 16)
+    assert 26 <= piece.y <= 32
+    assert 46 <= piece.x <= 52
+
+
+def test_a_tile_frames_its_piece_and_shows_it_enlarged():
+    whole = np.zeros((30, 40, 3), np.uint8)
+    whole[10:20, 10:20] = 200
+    piece = Piece(10, 10, 10)
+    drawn = composed(Tile("", whole, (piece.of(whole),), (piece,)), 80)
+    assert drawn.shape == (60 + 8 + 80, 80, 3)
+    assert (drawn[68:] == 200).all()
+    assert tuple(drawn[20, 30]) == (255, 176, 0)
