@@ -156,7 +156,7 @@ def _settled(
     mu = tv.mu or choose_mu(part, readings, noise_sigma, tv.order)
     kept = np.where(usable[seen], frames[seen], 0).astype(np.float32)
     guess = smooth_guess(part, kept, usable[seen])
-    step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight)
+    step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight, tv.order)
     tv = tv.model_copy(
         update={"mu": mu, "primal_step": step, "rtol": 1e-12, "max_steps": min(STEPS, tv.max_steps)}
     )
