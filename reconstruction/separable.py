@@ -14,14 +14,16 @@ Operations of one step for N patches of a x s (a views, s samples per view) and 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numba import get_num_threads, njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from reconstruction.batch_omp import Array
+from reconstruction.batch_omp import Array, bands
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import Iteration, squared_norms
@@ -49,27 +51,60 @@ class SeparableState:
     history: tuple[Iteration, ...] = ()
 
 
-def _keep_largest(values: Array, count: int) -> Array:
-    """Set all but the `count` largest values of every matrix (patch, ., .) to 0, in place."""
-    flat = values.reshape(len(values), -1)
-    if count < flat.shape[1]:
-        size = np.abs(flat)
-        places = np.argpartition(size, flat.shape[1] - count, axis=1)[:, : flat.shape[1] - count]
-        np.put_along_axis(flat, places, 0, axis=1)
-    return values
+@njit(cache=True, nogil=True)
+def _keep_largest_rows(values, count, energies):
+    """Set all but the `count` largest values of every row to 0; set energies to what is left."""
+    largest = np.empty(count, values.dtype)
+    for row in range(len(values)):
+        line = values[row]
+        largest[:] = -1
+        for i in range(line.size):
+            size = abs(line[i])
+            if size > largest[0]:
+                # Ascending, so that the first is the one to beat.
+                place = 0
+                while place + 1 < count and largest[place + 1] < size:
+                    largest[place] = largest[place + 1]
+                    place += 1
+                largest[place] = size
+        least, total = largest[0], 0.0
+        equal = np.sum(largest == least)
+        for i in range(line.size):
+            size = abs(line[i])
+            if size > least or (size == least and equal > 0):
+                equal -= size == least
+                total += np.float64(line[i]) * line[i]
+            else:
+                line[i] = 0
+        energies[row] = total
 
 
-def _codes(state: SeparableState, patches: Array, count: int) -> tuple[NDArray[np.intp], Array]:
-    """Return every patch's best pair and its kept values (patch, view column, sample column)."""
+def _codes(
+    state: SeparableState, patches: Array, count: int
+) -> tuple[NDArray[np.intp], Array, NDArray[np.float64]]:
+    """Return every patch's best pair, its kept values (patch, view column, sample column), energy.
+
+    patches: (patch, view, sample).
+    """
+    views, samples = patches.shape[1:]
+    rows = patches.reshape(-1, samples)
     best = np.full(len(patches), -1.0)
     member = np.zeros(len(patches), np.intp)
     codes = np.empty_like(patches)
-    for pair, (views, samples) in enumerate(zip(state.view_bases, state.sample_bases, strict=True)):
-        turned = _keep_largest(views.T @ (patches @ samples), count)
-        energy = squared_norms(turned.reshape(len(turned), -1))
+    for pair in range(len(state.view_bases)):
+        turned = (rows @ state.sample_bases[pair]).reshape(patches.shape)
+        turned = np.ascontiguousarray(state.view_bases[pair].T @ turned).reshape(len(patches), -1)
+        energy = np.empty(len(patches))
+
+        def keep(band: tuple[int, int], turned: Array = turned, energy: NDArray = energy) -> None:
+            _keep_largest_rows(turned[slice(*band)], count, energy[slice(*band)])
+
+        with ThreadPoolExecutor(get_num_threads()) as pool:
+            list(pool.map(keep, bands(len(patches))))
         better = energy > best
-        best[better], member[better], codes[better] = energy[better], pair, turned[better]
-    return member, codes
+        best[better], member[better] = energy[better], pair
+        codes[better] = turned[better].reshape(-1, views, samples)
+    return member, codes, best
 
 
 def _nearest_orthonormal(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -90,13 +125,13 @@ def separable_step(
     error = 0.0
     for start in range(0, len(patches), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        members[part], kept[part] = _codes(state, patches[part], settings.sparsity)
+        members[part], kept[part], energy = _codes(state, patches[part], settings.sparsity)
         for pair in range(pairs):
             mine = start + np.flatnonzero(members[part] == pair)
             seen = (state.view_bases[pair].T @ patches[mine]).reshape(-1, samples)
             sample_fits[pair] += seen.T @ kept[mine].reshape(-1, samples)
         error += float(squared_norms(patches[part].reshape(-1, views * samples)).sum())
-        error -= float(squared_norms(kept[part].reshape(-1, views * samples)).sum())
+        error -= float(energy.sum())
     view_bases, sample_bases = state.view_bases.copy(), state.sample_bases.copy()
     for pair in range(pairs):
         if not (members == pair).any():
@@ -126,6 +161,10 @@ def learn_separable(
     Raises DictionaryError for patches of another size, too few, or not finite.
     """
     matrices = _matrices(patches, patch_shape, settings)
+    if settings.sparsity > patches.shape[1]:
+        raise DictionaryError(
+            f"a sparsity of {settings.sparsity}, but patches of {patches.shape[1]} samples"
+        )
     state = start or _first_state(matrices, settings)
     if (len(state.view_bases), state.sample_bases.shape[1]) != (settings.pairs, matrices.shape[2]):
         raise DictionaryError("the state to resume from is of other patches or settings")
@@ -147,7 +186,7 @@ def separable_dictionary(
     matrices = _matrices(patches, patch_shape, settings)
     energy = np.zeros((len(state.view_bases), *matrices.shape[1:]))
     for start in range(0, len(matrices), _AT_ONCE):
-        members, kept = _codes(state, matrices[start : start + _AT_ONCE], settings.sparsity)
+        members, kept, _ = _codes(state, matrices[start : start + _AT_ONCE], settings.sparsity)
         for pair in range(len(energy)):
             energy[pair] += np.square(kept[members == pair]).sum(axis=0)
     order = np.argsort(-energy, axis=None, kind="stable")[: settings.atoms]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from emmc_rig.model.settings import validated
-from reconstruction import learning
+from reconstruction import learning, separable
 from reconstruction.batch_omp import NO_ATOM, batch_omp
 from reconstruction.checkpoint import load_checkpoint, save_checkpoint
 from reconstruction.errors import DictionaryError
@@ -413,6 +413,23 @@ def test_a_planted_ensemble_of_separable_bases_is_learnt():
     assert dictionary.kind == "separable"
     codes = dense(*batch_omp(dictionary.matrix, patches, 3), dictionary.size)
     assert np.square(patches - codes @ dictionary.matrix).mean() < 1e-3 * np.square(patches).mean()
+
+
+def test_the_largest_values_are_kept_whatever_their_sign_and_ties():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((40, 30)).astype(np.float32)
+    values[0] = 1
+    values[1, :20] = -2
+    values[1, 20:] = 2
+    values[1, 25] = 3
+    plain = np.zeros_like(values)
+    for row, kept in zip(values, plain, strict=True):
+        largest = np.argsort(-np.abs(row), kind="stable")[:7]
+        kept[largest] = row[largest]
+    energies = np.empty(40)
+    separable._keep_largest_rows(values, 7, energies)
+    np.testing.assert_array_equal(values, plain)
+    np.testing.assert_allclose(energies, np.square(plain).sum(axis=1), rtol=1e-6)
 
 
 def test_separable_bases_stay_orthonormal():
