@@ -345,7 +345,12 @@ class GrblController(SimulatedController):
             self._say(f"[OPT:{self.options},{PLANNER_BLOCKS},{RX_BUFFER}]")
         elif line == "$#":
             offsets = ",".join(f"{self.work_offset_mm[letter]:.3f}" for letter in self.axes)
+            nothing = ",".join("0.000" for _ in self.axes)
             self._say(f"[G54:{offsets}]")
+            for name in ("G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"):
+                self._say(f"[{name}:{nothing}]")
+            self._say("[TLO:0.000]")
+            self._say(f"[PRB:{nothing}:0]")
         elif line == "$N":
             self._say("$N0=")
             self._say("$N1=")

@@ -1,0 +1,244 @@
+"""Independent clients, which know nothing of this project, drive its simulated firmware.
+
+They come with the extra `peers`, and talk over real pseudo-terminals and TCP in real time.
+"""
+
+import io
+import struct
+import time
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import pytest
+
+from drivers import apt_codec
+from drivers.apt_codec import Id
+from drivers.clock import SYSTEM_CLOCK
+from simulators.apt import COUNTS_PER_UM, Z825, AptController
+from simulators.grbl import BENCH_AXES, GrblController
+from simulators.wire import PtyServer, TcpServer
+from simulators.zaber import AxisSpec, ZaberChain
+
+PATIENCE_S = 10.0
+QUICK = AxisSpec(max_speed_um_s=200_000.0, acceleration_um_s2=2e7)
+
+
+def wait_until(condition):
+    """Return when the condition holds; peers work in threads of their own."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "the peer never got there"
+        time.sleep(0.005)
+
+
+@contextmanager
+def zaber_peer(wire):
+    """Yield a chain, and the devices that zaber-motion finds on it."""
+    ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
+    chain = ZaberChain(
+        SYSTEM_CLOCK, {(device, axis): QUICK for device in (1, 2) for axis in (1, 2)}
+    )
+    with ExitStack() as opened:
+        if wire == "pty":
+            server = opened.enter_context(PtyServer(chain))
+            connection = ascii_protocol.Connection.open_serial_port(server.port)
+        else:
+            server = opened.enter_context(TcpServer(chain))
+            connection = ascii_protocol.Connection.open_tcp(*server.address)
+        opened.enter_context(connection)
+        yield chain, connection.detect_devices(identify_devices=False)
+
+
+@pytest.mark.parametrize("wire", ["pty", "tcp"])
+def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
+    with zaber_peer(wire) as (chain, devices):
+        refusals = pytest.importorskip("zaber_motion.exceptions")
+        assert [device.device_address for device in devices] == [1, 2]
+        axis = devices[0].get_axis(2)
+        assert {"WR", "WH"} <= axis.warnings.get_flags()
+        axis.home()
+        assert axis.get_position() == 0.0
+        assert axis.warnings.get_flags() == set()
+        axis.move_absolute(100_000)
+        axis.move_relative(-25_000)
+        assert axis.get_position() == 75_000.0
+        there_um = 75_000 * QUICK.microstep_um
+        assert chain.position_um(1, 2) == pytest.approx(there_um, abs=QUICK.backlash_um + 0.1)
+        assert not axis.is_busy()
+
+        axis.settings.set("maxspeed", 200_000.0)
+        assert axis.settings.get("maxspeed") == 200_000.0
+        axis.move_absolute(500_000, wait_until_idle=False)
+        assert axis.is_busy()
+        axis.stop()
+        assert 75_000 < axis.get_position() < 400_000
+        assert not axis.is_busy()
+
+        with pytest.raises(refusals.BadDataException):
+            axis.move_absolute(99_999_999)
+        with pytest.raises(refusals.BadCommandException):
+            axis.generic_command("sing")
+        assert devices[1].generic_command("get system.serial").data == "73003"
+
+        axis.settings.set("maxspeed", 5_000_000.0)
+        devices[0].all_axes.home()
+        chain.faults.inject("stall")
+        with pytest.raises(refusals.MovementFailedException, match="FS"):
+            axis.move_absolute(400_000)
+        assert "WR" in axis.warnings.get_flags()
+
+
+def test_zaber_motion_follows_moves_by_alerts():
+    with zaber_peer("pty") as (chain, devices):
+        devices[0].connection.enable_alerts()
+        for device in devices:
+            device.all_axes.home()
+        axis = devices[1].get_axis(1)
+        for target in (40_000, 10, 90_000):
+            axis.move_absolute(target)
+            assert chain.position_um(2, 1) == pytest.approx(target * QUICK.microstep_um, abs=3.1)
+
+
+@pytest.fixture
+def apt_controller():
+    spec = replace(Z825, max_speed_um_s=50_000.0, acceleration_um_s2=1e6, start_um=150.0)
+    return AptController(SYSTEM_CLOCK, {apt_codec.USB_UNIT: spec})
+
+
+@pytest.mark.parametrize("model", ["kdc101.KDC101", "tdc001.TDC001"])
+def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
+    module, _, name = model.partition(".")
+    devices = pytest.importorskip(
+        f"thorlabs_apt_device.devices.{module}", reason="needs the extra `peers`"
+    )
+    client = getattr(devices, name)
+    with PtyServer(apt_controller) as server:
+        peer = client(serial_port=server.port, home=False)
+        try:
+            wait_until(lambda: peer.status["msg"] and peer.velparams["msg"])
+            assert not peer.status["homed"]
+            assert peer.status["motor_connected"]
+            assert peer.homeparams["offset_distance"] == round(300 * COUNTS_PER_UM)
+            peer.set_enabled(True)
+            peer.home()
+            wait_until(lambda: peer.status["homed"])
+            wait_until(lambda: peer.status["position"] == 0)
+            peer.move_absolute(200_000)
+            wait_until(lambda: peer.status["position"] == 200_000 and peer.status["settled"])
+            assert apt_controller.position_um() == pytest.approx(200_000 / COUNTS_PER_UM, abs=0.1)
+            peer.move_relative(-50_000)
+            wait_until(lambda: peer.status["position"] == 150_000 and peer.status["settled"])
+            peer.set_velocity_params(2_620, 767_367)
+            wait_until(lambda: peer.velparams["max_velocity"] == 767_367)
+            peer.move_absolute(800_000)
+            wait_until(lambda: peer.status["moving_forward"])
+            peer.stop()
+            wait_until(lambda: peer.status["settled"])
+            assert 150_000 < peer.status["position"] < 799_000
+        finally:
+            peer.close()
+            peer._thread.join()
+
+
+def test_the_apt_codec_writes_the_bytes_that_an_independent_one_writes():
+    apt = pytest.importorskip("thorlabs_apt_device.protocol", reason="needs the extra `peers`")
+    here = {"source": 1, "dest": 0x50}
+    position = apt_codec.encode_position(1, -123_456)
+    velocity = apt_codec.encode_velocity(apt_codec.VelocityParameters(1, 0, 261, 767_367))
+    for theirs, ours in (
+        (apt.hw_req_info(**here), apt_codec.encode(Id.HW_REQ_INFO, 0x50)),
+        (apt.hw_no_flash_programming(**here), apt_codec.encode(Id.HW_NO_FLASH_PROGRAMMING, 0x50)),
+        (apt.hw_stop_updatemsgs(**here), apt_codec.encode(Id.HW_STOP_UPDATEMSGS, 0x50)),
+        (
+            apt.mod_set_chanenablestate(**here, chan_ident=1, enable_state=1),
+            apt_codec.encode(Id.MOD_SET_CHANENABLESTATE, 0x50, 1, apt_codec.ENABLE),
+        ),
+        (
+            apt.mot_move_home(**here, chan_ident=1),
+            apt_codec.encode(Id.MOT_MOVE_HOME, 0x50, 1),
+        ),
+        (
+            apt.mot_move_absolute(**here, chan_ident=1, position=-123_456),
+            apt_codec.encode(Id.MOT_MOVE_ABSOLUTE, 0x50, data=position),
+        ),
+        (
+            apt.mot_move_stop(**here, chan_ident=1, stop_mode=2),
+            apt_codec.encode(Id.MOT_MOVE_STOP, 0x50, 1, apt_codec.STOP_PROFILED),
+        ),
+        (
+            apt.mot_set_velparams(
+                **here, chan_ident=1, min_velocity=0, acceleration=261, max_velocity=767_367
+            ),
+            apt_codec.encode(Id.MOT_SET_VELPARAMS, 0x50, data=velocity),
+        ),
+        (
+            apt.mot_req_homeparams(**here, chan_ident=1),
+            apt_codec.encode(Id.MOT_REQ_HOMEPARAMS, 0x50, 1),
+        ),
+        (
+            apt.mot_set_genmoveparams(**here, chan_ident=1, backlash_distance=-123_456),
+            apt_codec.encode(Id.MOT_SET_GENMOVEPARAMS, 0x50, data=position),
+        ),
+        (
+            apt.mot_req_dcstatusupdate(**here, chan_ident=1),
+            apt_codec.encode(Id.MOT_REQ_DCSTATUSUPDATE, 0x50, 1),
+        ),
+    ):
+        assert ours == theirs
+
+
+def test_an_independent_apt_codec_reads_what_the_firmware_and_ours_write():
+    apt = pytest.importorskip("thorlabs_apt_device.protocol", reason="needs the extra `peers`")
+    status = apt_codec.MotorStatus(1, -200_000, -7, 0x8000_4610)
+    wire = apt_codec.encode(
+        Id.MOT_GET_DCSTATUSUPDATE, 1, data=apt_codec.encode_status(status), source=0x50
+    )
+    home = struct.pack("<HHHii", 1, 2, 1, 767_367, 10_291)
+    wire += apt_codec.encode(Id.MOT_GET_HOMEPARAMS, 1, data=home, source=0x50)
+    wire += apt_codec.encode(Id.MOT_MOVE_HOMED, 1, 1, source=0x50)
+    first, second, third = apt.Unpacker(io.BytesIO(wire), on_error="raise")
+    assert (first.position, first.velocity, first.chan_ident) == (-200_000, -7, 1)
+    assert first.motion_error
+    assert first.homed
+    assert first.homing
+    assert first.moving_forward
+    assert first.channel_enabled
+    assert (second.home_velocity, second.offset_distance) == (767_367, 10_291)
+    assert third.msg == "mot_move_homed"
+
+
+def test_grbl_streamer_homes_streams_and_is_alarmed():
+    streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
+    quick = replace(
+        BENCH_AXES["X"], max_speed_um_s=200_000.0, acceleration_um_s2=1e7, start_um=24_000.0
+    )
+    device = GrblController(
+        SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={24: 6000, 25: 12_000}
+    )
+    told = []
+    with PtyServer(device) as server:
+        peer = streamer.GrblStreamer(lambda *event: told.append(event))
+        peer.poll_interval = 0.01
+        peer.cnect(server.port)
+        try:
+            wait_until(lambda: ("on_boot",) in told)
+            peer.poll_start()
+            wait_until(lambda: peer.cmode == "Alarm")
+            peer.homing()
+            wait_until(lambda: peer.cmode == "Idle")
+            wait_until(lambda: peer.cmpos == (-1.0, -1.0, -1.0))
+            peer.incremental_streaming = True
+            peer.write("G21 G90\nG53 G0 X-5 Y-3\nG1 F3000 X-6.5\nG91 G1 X1")
+            peer.job_run()
+            wait_until(lambda: ("on_job_completed",) in told)
+            wait_until(lambda: peer.cmpos == (-5.5, -3.0, -1.0))
+            assert device.position_um("X") == pytest.approx(25_400 - 5_500, abs=3.5)
+            assert not any(event[0] == "on_error" for event in told)
+            peer.send_immediately("G90 G0 X50")
+            wait_until(lambda: ("on_alarm", "ALARM:2") in told)
+            peer.softreset()
+            peer.killalarm()
+            wait_until(lambda: peer.cmode == "Idle")
+            assert peer.cmpos == (-5.5, -3.0, -1.0)
+        finally:
+            peer.disconnect()
