@@ -65,11 +65,15 @@ class PtpUsb:
         self._device = device
         self._clock = clock
         self._timeout_s = timeout_s
-        interface = device.claim(PTP_INTERFACE)
-        self._interface = interface.number
-        self._in = interface.pipe(BULK, inward=True)
-        self._out = interface.pipe(BULK, inward=False)
-        self._events = interface.pipe(INTERRUPT, inward=True)
+        try:
+            interface = device.claim(PTP_INTERFACE)
+            self._interface = interface.number
+            self._in = interface.pipe(BULK, inward=True)
+            self._out = interface.pipe(BULK, inward=False)
+            self._events = interface.pipe(INTERRUPT, inward=True)
+        except BaseException:
+            device.close()
+            raise
         self._buffer = array.array("B", bytes(self._in.whole_packets(BUFFER_BYTES)))
         self._first = array.array("B", bytes(self._in.packet_size))
         self._event_buffer = array.array("B", bytes(self._events.whole_packets(EVENT_BYTES)))

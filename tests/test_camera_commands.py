@@ -15,6 +15,7 @@ from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
 from emmc_rig import camera_commands, hardware
+from emmc_rig.camera_benchmark import picture_timing
 from emmc_rig.camera_commands import register, save_frame
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import frame_figures, histogram, histogram_text, preview
@@ -165,6 +166,14 @@ def test_a_name_from_the_camera_never_leaves_the_folder(tmp_path):
     frame = type(frame)(**{**frame.__dict__, "metadata": {"name": "../../etc/passwd.nef/x"}})
     assert save_frame(tmp_path / ".", frame) == tmp_path / "frame-0001.dng"
     assert len(files(tmp_path)) == 3
+
+
+def test_the_benchmark_times_a_download_against_rawpy():
+    timing = picture_timing((1000, 1500), repeats=2)
+    assert timing.megabytes == pytest.approx(3.0, rel=0.01)
+    assert min(timing.as_dict().values()) > 0
+    # The bytes and the mosaic are two pictures; a third would be a copy too many.
+    assert timing.peak_pictures < 2.5
 
 
 def test_half_the_light_is_half_way_to_white():
