@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -64,7 +64,7 @@ STAGE_AXES = {
 MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
 SIMULATED = "simulated"
-PROBE_TIMEOUT_S = 0.4
+PROBE_TIMEOUT_S = 0.2
 
 
 class Attendant(Protocol):
@@ -223,21 +223,16 @@ def probe_port(port: str) -> str:
     device = find_port(port)
     guesses = {one.device: one.guess for one in list_serial_ports()}
     guess = guesses.get(device, "")
-    for protocol, ask in _PROBES.items():
-        if guess in ("", protocol):
-            with ExitStack() as opened:
-                flow_control = protocol == "apt"
-                transport = SerialTransport(
-                    port, timeout_s=PROBE_TIMEOUT_S, flow_control=flow_control
-                )
-                opened.callback(transport.close)
+    transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
+    with closing(transport):
+        for protocol, ask in _PROBES.items():
+            if guess in ("", protocol):
                 try:
                     answer = ask(transport)
+                    if answer:
+                        return f"{protocol}: {answer}"
                 except DriverError as error:
                     _log.debug("%s is no %s: %s", port, protocol, error)
-                    continue
-                if answer:
-                    return f"{protocol}: {answer}"
     return ""
 
 
@@ -254,7 +249,8 @@ def _probe_apt(transport: Transport) -> str:
     return f"{info.model}, serial number {info.serial_number}, firmware {info.firmware}"
 
 
-_PROBES = {"zaber": _probe_zaber, "grbl": identify_grbl, "apt": _probe_apt}
+_PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
+"""In this order: half a line of text would leave an APT controller in the middle of a message."""
 
 
 def _stage(config: StageConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:

@@ -1,0 +1,338 @@
+"""`emmc-rig devices`: alike on simulated and real stages, stopped by every interruption."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from serial.tools import list_ports
+
+from drivers.apt import AptAxis, AptStage
+from drivers.clock import SYSTEM_CLOCK
+from drivers.stage import StageSettings
+from drivers.transport import SerialTransport
+from drivers.zaber import ZaberStage
+from emmc_rig import cli
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import open_stage, probe_port
+from emmc_rig.stage_config import parse_stage
+from simulators.apt import Z825, AptController
+from simulators.grbl import BENCH_AXES, GrblController
+from simulators.wire import PtyServer
+from simulators.zaber import AxisSpec, ZaberChain
+
+PATIENCE_S = 20.0
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()", "devices")
+QUICK = AxisSpec(max_speed_um_s=100_000.0, acceleration_um_s2=1e7, start_um=500.0)
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run `emmc-rig devices` in-process: returns exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "150")
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", "devices", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        shown = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else code), shown.out, shown.err
+
+    return call
+
+
+def usb_port(device, product):
+    return SimpleNamespace(
+        device=device,
+        vid=0x0403,
+        pid=product,
+        serial_number="A1",
+        description="FT232R",
+        manufacturer="FTDI",
+    )
+
+
+def one_line(text):
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
+def wait_until(condition):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize("rig", ["simulated", "simulated:grbl", "simulated:apt"])
+def test_a_simulated_stage_is_shown_homed_and_jogged(run, rig):
+    code, out, _ = run("info", "--rig", rig)
+    assert (code, "unknown" in out) == (0, True)
+    code, out, _ = run("home", "--rig", rig)
+    assert (code, "unknown" in out) == (0, False)
+    axis = "mask_x" if rig == "simulated" else "x"
+    place = -5000 if "grbl" in rig else 5000
+    code, out, _ = run("jog", "--rig", rig, "--home", "--to", "--speed", 900, axis, "--", place)
+    assert code == 0
+    assert abs(float(out.split()[2]) - place) < 1.0
+
+
+def test_a_real_port_works_alike(run):
+    with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK, (1, 2): QUICK})) as server:
+        stage = f"zaber:{server.port}"
+        assert "unknown" in run("info", "--stage", stage)[1]
+        code, _, err = run("jog", "--stage", stage, "1.2", 100)
+        assert (code, "home it first" in one_line(err)) == (1, True)
+        assert run("home", "--stage", stage, "1.2")[0] == 0
+        code, out, _ = run("jog", "--stage", stage, "1.2", 100)
+        assert code == 0
+        assert out.startswith("1.2 at 100.")
+        out = run("info", "--stage", stage)[1]
+        assert out.count("unknown") == 1
+
+
+def test_names_are_wired_to_axes_in_a_file(run, tmp_path):
+    with PtyServer(ZaberChain(SYSTEM_CLOCK, {(3, 1): QUICK}), tmp_path / "port") as _:
+        wiring = {
+            "protocol": "zaber",
+            "port": f"{tmp_path}/por*",
+            "axes": {"mask_x": [3, 1]},
+            "microstep_um": 0.047625,
+            "speeds_um_s": {"mask_x": 20_000},
+            "soft_limits_um": {"mask_x": [100, 900]},
+        }
+        (tmp_path / "rig.yaml").write_text(yaml.safe_dump(wiring))
+        assert run("home", "--stage", "rig.yaml")[0] == 0
+        code, out, _ = run("info", "--stage", "rig.yaml")
+        assert (code, "110 to 900" in out, "20000" in out) == (0, True, True)
+        code, _, err = run("jog", "--stage", "rig.yaml", "mask_x", 901)
+        assert (code, "choose 110 to 900 um" in one_line(err)) == (1, True)
+
+
+def test_apt_axes_may_be_on_ports_of_their_own(tmp_path):
+    spec = replace(Z825, max_speed_um_s=50_000.0, acceleration_um_s2=1e6, start_um=150.0)
+    first, second = (AptController(SYSTEM_CLOCK, {0x50: spec}) for _ in range(2))
+    with PtyServer(first) as one, PtyServer(second) as two:
+        wiring = {
+            "protocol": "apt",
+            "axes": {
+                "mask_x": {"port": one.port},
+                "mask_y": {"port": two.port, "actuator": "z812"},
+            },
+        }
+        (tmp_path / "rig.yaml").write_text(yaml.safe_dump(wiring))
+        with open_stage(str(tmp_path / "rig.yaml")) as stage:
+            stage.home()
+            stage.move_to_um({"mask_x": 500.0, "mask_y": 700.0})
+            assert stage.limits_um("mask_y") == (10.0, 12_000.0)
+    assert first.position_um() == pytest.approx(500.0, abs=0.1)
+    assert second.position_um() == pytest.approx(700.0, abs=0.1)
+
+
+def test_the_rigs_own_chain_gets_the_rigs_own_names():
+    with PtyServer(ZaberChain(SYSTEM_CLOCK)) as server, open_stage(f"zaber:{server.port}") as stage:
+        assert stage.axes == ("mask_x", "mask_y", "aperture_x", "aperture_y")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "firmware", "told"),
+    [
+        ("zaber", ZaberChain, "axes 2"),
+        ("grbl", GrblController, "version 1.1h"),
+        ("apt", AptController, "KDC101, serial number 27000001"),
+    ],
+)
+def test_probing_tells_what_answers(run, protocol, firmware, told):
+    with PtyServer(firmware(SYSTEM_CLOCK)) as server:
+        code, out, _ = run("probe", server.port)
+    assert code == 0
+    assert f"{server.port}: {protocol}: " in out
+    assert told in out
+
+
+def test_probing_asks_a_known_adapter_in_its_own_protocol_only(monkeypatch):
+    chain = ZaberChain(SYSTEM_CLOCK)
+    asked = []
+    chain.feed = lambda data: asked.append(data) or b""
+    with PtyServer(chain) as server:
+        adapter = usb_port(server.port, 0xFAF0)
+        monkeypatch.setattr(list_ports, "comports", lambda: [adapter])
+        assert probe_port(server.port) == ""
+    assert asked
+    assert all(data == bytes.fromhex("05 00 00 00 50 01") for data in asked)
+
+
+def test_ports_are_listed_with_their_holder(run, monkeypatch):
+    with PtyServer(ZaberChain(SYSTEM_CLOCK)) as server:
+        port = usb_port(server.port, 0x6001)
+        monkeypatch.setattr(list_ports, "comports", lambda: [port])
+        held = SerialTransport(server.port)
+        code, out, _ = run("list")
+        held.close()
+        assert code == 0
+        for part in (server.port, "0403:6001", "A1", "FT232R", f"(pid {os.getpid()})"):
+            assert part in " ".join(out.split())
+    monkeypatch.setattr(list_ports, "comports", list)
+    assert "no serial port" in run("list")[1]
+
+
+def test_the_udev_rule_is_printed(run):
+    code, out, _ = run("udev-rule")
+    assert (code, out.splitlines()[-1]) == (0, 'LABEL="emmc_rig_end"')
+
+
+def test_what_a_command_costs_is_measured(run, tmp_path):
+    code, out, _ = run("bench", "--repeats", 3, "--out", "bench")
+    assert code == 0
+    assert "position" in out
+    rows = json.loads((tmp_path / "bench/metrics.json").read_text())["stage_commands"]
+    assert {row["protocol"] for row in rows} == {"zaber", "grbl", "apt"}
+    assert all(row["milliseconds"] > 0 and row["exchanges"] >= 1 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["info", "--stage", "zaber:/dev/no-such-port"], "does not exist"),
+        (["info", "--stage", "teapot:/dev/ttyUSB0"], "one of zaber, grbl, apt"),
+        (["info", "--stage", "zaber:"], "write PROTOCOL:PORT"),
+        (["info", "--stage", "nowhere.yaml"], "no such file"),
+        (["info", "--rig", "simulated:teapot"], "use one of zaber, grbl, apt"),
+        (["jog", "--rig", "simulated", "mask_z", "5"], "use one of mask_x"),
+        (["jog", "--rig", "simulated", "--home", "mask_x", "1e9"], "choose 10 to"),
+        (["jog", "--rig", "simulated", "mask_x", "5", "--speed", "0"], "cannot move at 0"),
+        (["probe", "/dev/no-such-port"], "does not exist"),
+        (["serve", "zaber", "--tcp", "here"], "write HOST:PORT"),
+        (["serve", "teapot"], "no simulated stage"),
+    ],
+)
+def test_faults_are_one_line_that_says_what_to_do(run, arguments, told):
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert told in one_line(err)
+
+
+@pytest.mark.parametrize("arguments", [["info"], ["info", "--rig", "real"], ["jog", "x"]])
+def test_wrong_usage_is_exit_code_2(run, arguments):
+    assert run(*arguments)[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("wiring", "told"),
+    [
+        ({"protocol": "zaber", "port": "p", "axis": {}}, "did you mean 'axes'"),
+        ({"protocol": "zaber", "port": "p", "microstep_um": -1}, "greater than 0"),
+        ({"protocol": "zaber"}, "port"),
+        ({"protocol": "grbl", "port": "p", "axes": {"x": "Q"}}, "axes.x"),
+        ({"protocol": "apt", "axes": {"x": {"port": "p", "actuator": "z9"}}}, "use one of z806"),
+        ({"port": "p"}, "protocol must be one of"),
+    ],
+)
+def test_faults_of_a_stage_file_are_one_line(tmp_path, wiring, told):
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(wiring))
+    with pytest.raises(AppError, match=told):
+        parse_stage(str(path))
+
+
+def test_a_setting_that_the_stage_cannot_have_is_one_line(tmp_path):
+    with pytest.raises(AppError, match="loosen it"):
+        open_stage("simulated:grbl", {"tolerance_um": 0.1})
+
+
+def homed_zaber(clock=SYSTEM_CLOCK):
+    spec = replace(QUICK, max_speed_um_s=2_000.0, acceleration_um_s2=1e5, start_um=50.0)
+    chain = ZaberChain(clock, {(1, 1): spec})
+    with ZaberStage(chain.transport(), {"x": (1, 1)}, spec.microstep_um, clock) as stage:
+        stage.home()
+    return chain, lambda: chain.position_um(1, 1), ["1.1", "20000"]
+
+
+def homed_apt(clock=SYSTEM_CLOCK):
+    device = AptController(clock, {0x50: replace(Z825, start_um=290.0)})
+    settings = StageSettings(approach_um=0.0)
+    with AptStage({"x": AptAxis(device.transport())}, clock, settings) as stage:
+        stage.home()
+    return device, device.position_um, ["x", "20000"]
+
+
+def fresh_grbl(clock=SYSTEM_CLOCK):
+    spec = replace(BENCH_AXES["X"], max_speed_um_s=20_000.0, start_um=24_500.0)
+    device = GrblController(clock, {"X": spec, "Y": spec}, settings={24: 600, 25: 1200, 110: 120})
+    travel_um = spec.travel_um
+    distance = ["--home", "x", "--", "-20000"]
+    return device, lambda: travel_um - device.position_um("X"), distance
+
+
+@pytest.mark.parametrize(
+    ("protocol", "make", "number"),
+    [
+        ("zaber", homed_zaber, signal.SIGINT),
+        ("apt", homed_apt, signal.SIGTERM),
+        ("grbl", fresh_grbl, signal.SIGHUP),
+    ],
+)
+def test_every_way_to_interrupt_a_move_stops_the_stage_and_leaves_it_stopped(
+    protocol, make, number
+):
+    device, distance_um, jog = make()
+    with PtyServer(device) as server:
+        command = [*PROGRAM, "jog", "--stage", f"{protocol}:{server.port}", *jog]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        with subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                wait_until(lambda: distance_um() > 1500.0 or process.poll() is not None)
+                process.send_signal(number)
+                out, err = process.communicate(timeout=PATIENCE_S)
+            finally:
+                process.kill()
+        assert (process.returncode, out) == (130, ""), err
+        assert "told to stop" in err
+        assert "Traceback" not in err
+        time.sleep(0.7)  # the slowest of them takes 0.6 s to come to rest
+        stopped_um = distance_um()
+        time.sleep(0.2)
+        assert distance_um() == stopped_um
+        assert 1500.0 < stopped_um < 19_000.0
+
+
+def test_a_stage_that_vanishes_in_a_move_is_an_error_that_says_it_could_not_be_stopped(run):
+    device, _, jog = homed_zaber()
+    device.faults.inject("unplug", when=lambda occasion: b" move " in occasion.command)
+    with PtyServer(device) as server:
+        code, _, err = run("jog", "--stage", f"zaber:{server.port}", *jog)
+    assert code == 1
+    assert "went away" in one_line(err)
+    assert "could not be stopped" in one_line(err)
+
+
+@pytest.mark.parametrize("wire", [[], ["--tcp", "127.0.0.1:0"]])
+def test_a_simulated_stage_is_served_to_other_programs(wire, tmp_path):
+    command = [*PROGRAM, "serve", "zaber", *wire]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            stage = process.stdout.readline().strip()
+            with open_stage(stage) as opened:
+                opened.home(["mask_y"])
+                assert opened.is_homed("mask_y")
+        finally:
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "Traceback" not in err
