@@ -1,16 +1,43 @@
-"""A camera that gives RAW frames: what every camera offers, and the one that sends RAW files."""
+"""A camera that gives RAW frames: what every camera offers, and what all of them check."""
 
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Protocol
 
-from drivers.errors import RawFrameError
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import CameraClosedError, CameraSettingError, RawFrameError
 from drivers.raw import RawFrame, decode_raw
 
 EXPOSURE_AGREEMENT = 0.1
 """Shutter times are nominal: a marked 1/30 s is 1/32 s, 7 per cent off."""
 
+Limits = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CameraIdentity:
+    """Who made the camera; "" where it does not say."""
+
+    maker: str = ""
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+
 
 class Camera(Protocol):
-    """A camera on manual exposure."""
+    """A camera on manual exposure.
+
+    A setting that is asked for and the one that is taken differ where the camera has steps:
+    `exposure_s` and `gain` are what the camera does, read back from it.
+    """
+
+    @property
+    def identity(self) -> CameraIdentity:
+        """Who made it."""
+        ...
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -27,17 +54,86 @@ class Camera(Protocol):
         """Exposure of the next frame."""
         ...
 
+    @property
+    def exposure_limits_s(self) -> Limits:
+        """Shortest and longest exposure; equal where it cannot be chosen."""
+        ...
+
+    @property
+    def gain(self) -> float:
+        """Gain of the next frame, linear: ISO over base ISO, or 10^(dB/20)."""
+        ...
+
+    @property
+    def gain_limits(self) -> Limits:
+        """Lowest and highest gain; equal where it cannot be chosen."""
+        ...
+
     def set_exposure_s(self, exposure_s: float) -> None:
-        """Choose the exposure of the frames that follow; raises `ValueError` unless positive."""
+        """Choose the exposure of the frames that follow: the nearest that the camera has.
+
+        Raises `ValueError` unless positive, `CameraSettingError` outside the limits.
+        """
+        ...
+
+    def set_gain(self, gain: float) -> None:
+        """Choose the gain of the frames that follow; raises as `set_exposure_s`."""
         ...
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises a `DriverError`."""
         ...
 
+    def close(self) -> None:
+        """Let go of the camera; closing twice is allowed."""
+        ...
+
+
+class StreamingCamera(Camera, Protocol):
+    """A camera that sends frame after frame without being asked for each."""
+
+    def stream(self) -> Iterator[RawFrame]:
+        """Yield frames as they come; closing the generator stops the acquisition."""
+        ...
+
+
+def check_setting(setting: str, value: float, limits: Limits) -> None:
+    """Raise `ValueError` unless positive and finite, `CameraSettingError` outside the limits."""
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"the {setting} {value:g} is not positive")
+    low, high = limits
+    # Limits that went through a camera's own units come back rounded.
+    if not low * (1 - 1e-9) <= value <= high * (1 + 1e-9):
+        offered = f"is fixed at {low:g}" if low == high else f"goes from {low:g} to {high:g}"
+        raise CameraSettingError(setting, f"{offered}, not to {value:g}")
+
+
+def check_frame(
+    frame: RawFrame,
+    cfa: str | None = None,
+    exposure_s: float | None = None,
+    tolerance_s: float = 0.0,
+) -> RawFrame:
+    """Return the frame; raises `RawFrameError` unless its colours and exposure are as expected.
+
+    An exposure that the file does not state is not checked; else it may be off by
+    `EXPOSURE_AGREEMENT` or `tolerance_s`, whichever is more.
+    """
+    if cfa is not None and frame.cfa != cfa:
+        raise RawFrameError(f"its colours are {frame.cfa} instead of {cfa}")
+    if (
+        exposure_s is not None
+        and frame.exposure_s is not None
+        and abs(frame.exposure_s - exposure_s) > max(EXPOSURE_AGREEMENT * exposure_s, tolerance_s)
+    ):
+        raise RawFrameError(
+            f"it was exposed for {frame.exposure_s:g} s instead of {exposure_s:g} s"
+        )
+    return frame
+
 
 class CaptureTransport(Protocol):
-    """Whatever exposes once and hands over the RAW file: PTP, or a simulated camera."""
+    """Whatever exposes once and hands over the RAW file."""
 
     def capture(self, exposure_s: float) -> bytes:
         """Expose for `exposure_s` and return the file's bytes."""
@@ -45,11 +141,15 @@ class CaptureTransport(Protocol):
 
 
 class RawFileCamera:
-    """A camera over a transport that yields RAW files.
+    """A camera over a transport that yields RAW files, of one sensitivity and any exposure.
 
     Every frame must have the `shape` and `cfa` stated here, and the exposure that was asked for
     where the file states one; a frame that does not raises `RawFrameError`.
     """
+
+    exposure_limits_s: Limits = (1e-6, 3600.0)
+    gain: float = 1.0
+    gain_limits: Limits = (1.0, 1.0)
 
     def __init__(
         self,
@@ -57,43 +157,37 @@ class RawFileCamera:
         shape: tuple[int, int],
         cfa: str,
         exposure_s: float = 0.01,
+        clock: Clock = SYSTEM_CLOCK,
+        identity: CameraIdentity | None = None,
     ) -> None:
         self._transport = transport
-        self._shape = shape
-        self._cfa = cfa
+        self._clock = clock
+        self.identity = identity or CameraIdentity()
+        self.shape = shape
+        self.cfa = cfa
+        self._closed = False
         self.set_exposure_s(exposure_s)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
-        return self._shape
-
-    @property
-    def cfa(self) -> str:
-        """Colour phase or tile name of a frame, as in `RawFrame`."""
-        return self._cfa
-
-    @property
-    def exposure_s(self) -> float:
-        """Exposure of the next frame."""
-        return self._exposure_s
-
     def set_exposure_s(self, exposure_s: float) -> None:
-        """Choose the exposure of the frames that follow; raises `ValueError` unless positive."""
-        if not exposure_s > 0:
-            raise ValueError(f"an exposure of {exposure_s:g} s is not positive")
-        self._exposure_s = exposure_s
+        """Choose the exposure of the frames that follow.
+
+        Raises `ValueError` unless positive, `CameraSettingError` outside the limits.
+        """
+        check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
+        self.exposure_s = exposure_s
+
+    def set_gain(self, gain: float) -> None:
+        """Accept a gain of 1; raises as `set_exposure_s`."""
+        check_setting("gain", gain, self.gain_limits)
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `RawFrameError` or an error of the transport."""
-        frame = decode_raw(self._transport.capture(self._exposure_s), self._shape)
-        if frame.cfa != self._cfa:
-            raise RawFrameError(f"its colours are {frame.cfa} instead of {self._cfa}")
-        if (
-            frame.exposure_s is not None
-            and abs(frame.exposure_s / self._exposure_s - 1) > EXPOSURE_AGREEMENT
-        ):
-            raise RawFrameError(
-                f"it was exposed for {frame.exposure_s:g} s instead of {self._exposure_s:g} s"
-            )
-        return frame
+        if self._closed:
+            raise CameraClosedError(self.identity.model or "the camera")
+        frame = decode_raw(self._transport.capture(self.exposure_s), self.shape)
+        check_frame(frame, self.cfa, self.exposure_s)
+        return replace(frame, gain=self.gain, host_time_s=self._clock.now_s())
+
+    def close(self) -> None:
+        """Refuse further frames; closing twice is allowed."""
+        self._closed = True

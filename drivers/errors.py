@@ -1,38 +1,91 @@
 """Errors of the drivers: each carries its data and says in one line what happened, what to do."""
 
+from typing import Self
+
 
 class DriverError(Exception):
-    """Root of the drivers' errors; shown to the user as one line."""
+    """Root of the drivers' errors; shown to the user as one line.
+
+    `axis`, `command` and `reply` are what the error is about, "" where unknown.
+    `loses_position`: the axis no longer knows where it is.
+    """
+
+    loses_position = False
+
+    def __init__(
+        self, what: str, advice: str = "", *, axis: str = "", command: str = "", reply: str = ""
+    ) -> None:
+        super().__init__(what)
+        self.what = what
+        self.advice = advice
+        self.axis = axis
+        self.command = command
+        self.reply = reply
+
+    def about(self, *, axis: str = "", command: str = "", reply: str = "") -> Self:
+        """Fill in what was unknown where the error arose; returns the same error."""
+        self.axis = self.axis or axis
+        self.command = self.command or command
+        self.reply = self.reply or reply
+        return self
+
+    def __str__(self) -> str:
+        facts = []
+        if self.axis and self.axis not in self.what:
+            facts.append(f"axis {self.axis}")
+        if self.command and repr(self.command) not in self.what:
+            facts.append(f"command {self.command!r}")
+        if self.reply and self.reply not in self.what:
+            facts.append(f"reply {self.reply!r}")
+        text = self.what + (f" ({', '.join(facts)})" if facts else "")
+        return f"{text}: {self.advice}" if self.advice else text
 
 
-class PortNotFoundError(DriverError):
-    """No such serial port."""
+class PortError(DriverError):
+    """Something is wrong with a port, not with the device behind it."""
 
-    def __init__(self, port: str) -> None:
-        super().__init__(f"serial port {port} does not exist: check the cable, power and port name")
+    def __init__(self, port: str, what: str, advice: str) -> None:
+        super().__init__(f"serial port {port} {what}", advice)
         self.port = port
 
 
-class PortBusyError(DriverError):
-    """The serial port exists but cannot be opened."""
+class PortNotFoundError(PortError):
+    """No such serial port, or more than one."""
 
-    def __init__(self, port: str, reason: str) -> None:
-        super().__init__(
-            f"serial port {port} cannot be opened ({reason}): close the program that holds it, "
-            "or ask for permission to use it"
-        )
-        self.port = port
+    def __init__(self, port: str, what: str = "does not exist") -> None:
+        super().__init__(port, what, "check the cable, power and port name")
+
+
+class PortBusyError(PortError):
+    """The serial port exists, but somebody else holds it; `holder` is "" when nobody can tell."""
+
+    def __init__(self, port: str, reason: str, holder: str = "") -> None:
+        what = f"is held by {holder}" if holder else f"cannot be opened ({reason})"
+        super().__init__(port, what, "close the program that holds it, then try again")
         self.reason = reason
+        self.holder = holder
 
 
-class PortGoneError(DriverError):
+class PortPermissionError(PortError):
+    """The serial port exists, but this user may not open it; `rule` is the udev rule that helps."""
+
+    def __init__(self, port: str, rule: str) -> None:
+        super().__init__(
+            port,
+            "may not be opened by this user",
+            f"copy {rule} to /etc/udev/rules.d/, run `sudo udevadm control --reload-rules`, "
+            "and plug the device in again",
+        )
+        self.rule = rule
+
+
+class PortGoneError(PortError):
     """The port went away while it was open."""
 
+    loses_position = True
+
     def __init__(self, port: str) -> None:
-        super().__init__(
-            f"serial port {port} went away: plug it in, open a new transport and home the axes"
-        )
-        self.port = port
+        super().__init__(port, "went away", "plug it in, reconnect, then home the axes")
 
 
 class TransportTimeoutError(DriverError):
@@ -41,7 +94,7 @@ class TransportTimeoutError(DriverError):
     def __init__(self, port: str, timeout_s: float, partial: bytes = b"") -> None:
         got = f"only {partial!r}" if partial else "nothing"
         super().__init__(
-            f"{port} answered {got} within {timeout_s:g} s: check power, baud rate and address"
+            f"{port} answered {got} within {timeout_s:g} s", "check power, baud rate and address"
         )
         self.port = port
         self.timeout_s = timeout_s
@@ -49,10 +102,10 @@ class TransportTimeoutError(DriverError):
 
 
 class GarbledReplyError(DriverError):
-    """Bytes arrived that are not a valid message."""
+    """Bytes arrived that are not a valid message, or contradict each other."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
-        super().__init__(f"garbled reply {raw!r} ({reason}): check the cable and the baud rate")
+        super().__init__(f"garbled reply {raw!r} ({reason})", "check the cable and the baud rate")
         self.raw = raw
         self.reason = reason
 
@@ -61,18 +114,22 @@ class CommandRefusedError(DriverError):
     """The device understood the command and said no."""
 
     def __init__(self, command: str, reply: str, axis: str, advice: str) -> None:
-        super().__init__(f"{axis} refused {command!r} with {reply}: {advice}")
-        self.command = command
-        self.reply = reply
-        self.axis = axis
+        super().__init__(
+            f"{axis} refused {command!r} with {reply}",
+            advice,
+            axis=axis,
+            command=command,
+            reply=reply,
+        )
 
 
 class UnknownAxisError(DriverError):
     """The stage has no axis of that name."""
 
     def __init__(self, axis: str, known: tuple[str, ...]) -> None:
-        super().__init__(f"no axis {axis!r} on this stage: use one of {', '.join(known)}")
-        self.axis = axis
+        super().__init__(
+            f"no axis {axis!r} on this stage", f"use one of {', '.join(known)}", axis=axis
+        )
         self.known = known
 
 
@@ -82,36 +139,79 @@ class LimitExceededError(DriverError):
     def __init__(self, axis: str, target_um: float, limits_um: tuple[float, float]) -> None:
         low_um, high_um = limits_um
         super().__init__(
-            f"{axis} cannot go to {target_um:g} um: choose {low_um:g} to {high_um:g} um"
+            f"{axis} cannot go to {target_um:g} um",
+            f"choose {low_um:g} to {high_um:g} um",
+            axis=axis,
         )
-        self.axis = axis
         self.target_um = target_um
         self.limits_um = limits_um
+
+
+class SpeedLimitError(DriverError):
+    """A speed that the axis cannot have; nothing was sent to the device."""
+
+    def __init__(self, axis: str, speed_um_s: float, top_speed_um_s: float) -> None:
+        super().__init__(
+            f"{axis} cannot move at {speed_um_s:g} um/s",
+            f"choose a speed above 0, up to {top_speed_um_s:g} um/s",
+            axis=axis,
+        )
+        self.speed_um_s = speed_um_s
+        self.top_speed_um_s = top_speed_um_s
 
 
 class NotHomedError(DriverError):
     """The axis does not know where it is; nothing was sent to the device."""
 
-    def __init__(self, axis: str) -> None:
-        super().__init__(f"{axis} does not know where it is: home it first")
-        self.axis = axis
-
-
-class StalledError(DriverError):
-    """The motor was blocked during a move."""
-
-    def __init__(self, axis: str) -> None:
-        super().__init__(f"{axis} stalled and lost its position: clear the obstacle, then home it")
-        self.axis = axis
+    def __init__(self, axis: str, why: str = "") -> None:
+        super().__init__(
+            f"{axis} does not know where it is{f', {why}' if why else ''}",
+            "home it first",
+            axis=axis,
+        )
+        self.why = why
 
 
 class AxisFaultError(DriverError):
-    """The axis reports a fault other than a stall."""
+    """The axis reports a fault."""
 
-    def __init__(self, axis: str, fault: str) -> None:
-        super().__init__(f"{axis} reports a fault, {fault}: resolve it, then home the axis")
-        self.axis = axis
+    loses_position = True
+
+    def __init__(
+        self, axis: str, fault: str, advice: str = "resolve it, then home the axis"
+    ) -> None:
+        super().__init__(f"{axis} reports a fault, {fault}", advice, axis=axis)
         self.fault = fault
+
+
+class StalledError(AxisFaultError):
+    """The motor was blocked during a move."""
+
+    def __init__(self, axis: str, fault: str = "stalled") -> None:
+        super().__init__(axis, fault, "clear the obstacle, then home it")
+
+
+class EmergencyStopError(AxisFaultError):
+    """The emergency stop was pressed, or the motor driver is off."""
+
+    def __init__(self, axis: str, fault: str = "emergency stop") -> None:
+        super().__init__(axis, fault, "make the bench safe, release the stop, then home it")
+
+
+class LimitSwitchError(AxisFaultError):
+    """The axis ran into the end of its travel."""
+
+    def __init__(self, axis: str, fault: str = "limit switch reached") -> None:
+        super().__init__(
+            axis, fault, "check the limits and what stands in the way, then home the axis"
+        )
+
+
+class LostPositionError(AxisFaultError):
+    """The axis no longer knows where it is."""
+
+    def __init__(self, axis: str, fault: str = "position lost") -> None:
+        super().__init__(axis, fault, "home it, and repeat what was done since it was last homed")
 
 
 class MoveTimeoutError(DriverError):
@@ -119,9 +219,10 @@ class MoveTimeoutError(DriverError):
 
     def __init__(self, axis: str, time_limit_s: float) -> None:
         super().__init__(
-            f"{axis} still moves after {time_limit_s:.3g} s: check its speed and that nothing drags"
+            f"{axis} still moves after {time_limit_s:.3g} s",
+            "check its speed and that nothing drags",
+            axis=axis,
         )
-        self.axis = axis
         self.time_limit_s = time_limit_s
 
 
@@ -131,9 +232,10 @@ class PositionMismatchError(DriverError):
     def __init__(self, axis: str, commanded_um: float, read_um: float, tolerance_um: float) -> None:
         super().__init__(
             f"{axis} was sent to {commanded_um:.3f} um but reads {read_um:.3f} um "
-            f"(tolerance {tolerance_um:g} um): check the cable, then move again or home it"
+            f"(tolerance {tolerance_um:g} um)",
+            "check the cable, then move again or home it",
+            axis=axis,
         )
-        self.axis = axis
         self.commanded_um = commanded_um
         self.read_um = read_um
         self.tolerance_um = tolerance_um
@@ -145,3 +247,234 @@ class RawFrameError(DriverError):
     def __init__(self, reason: str) -> None:
         super().__init__(f"unusable RAW frame, {reason}: capture it again")
         self.reason = reason
+
+
+class UsbUnavailableError(DriverError):
+    """USB cannot be used on this computer at all."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"USB cannot be used here ({reason}): reinstall libusb-package, and in a container "
+            "pass /dev/bus/usb through"
+        )
+        self.reason = reason
+
+
+class UsbNotFoundError(DriverError):
+    """No device that matches is plugged in; `present` names those that are."""
+
+    def __init__(self, wanted: str, present: tuple[str, ...] = ()) -> None:
+        seen = ", ".join(present) if present else "no device of that kind"
+        super().__init__(
+            f"no {wanted} on USB ({seen} found): check cable, power and the device's USB mode"
+        )
+        self.wanted = wanted
+        self.present = present
+
+
+class UsbPermissionError(DriverError):
+    """The device is there but this user may not open it."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(
+            f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
+            "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
+        )
+        self.device = device
+
+
+class UsbClaimedError(DriverError):
+    """Another program holds the device; `holders` are its name and process id, where known."""
+
+    def __init__(self, device: str, holders: tuple[str, ...], advice: str) -> None:
+        by = ", ".join(holders) if holders else "another program"
+        super().__init__(f"{device} is claimed by {by}: {advice}")
+        self.device = device
+        self.holders = holders
+
+
+class UsbGoneError(DriverError):
+    """The device was unplugged, or lost its power, while it was open."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(f"{device} went away: plug it in, switch it on and open it again")
+        self.device = device
+
+
+class UsbStalledError(DriverError):
+    """The device halted an endpoint: it did not accept what it was sent."""
+
+    def __init__(self, device: str, endpoint: int) -> None:
+        super().__init__(
+            f"{device} stalled endpoint {endpoint:#04x}: clear the halt and try again, "
+            "or switch the device off and on"
+        )
+        self.device = device
+        self.endpoint = endpoint
+
+
+class UsbTimeoutError(DriverError):
+    """A transfer did not finish in time; `done` is how many bytes of it passed."""
+
+    def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
+        got = f"stopped after {done} bytes" if done else "was silent"
+        super().__init__(
+            f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
+        )
+        self.device = device
+        self.timeout_s = timeout_s
+        self.done = done
+
+
+class UsbTransferError(DriverError):
+    """The transfer failed in any other way; `reason` is what libusb says."""
+
+    def __init__(self, device: str, reason: str, advice: str) -> None:
+        super().__init__(f"{device}: transfer failed ({reason}): {advice}")
+        self.device = device
+        self.reason = reason
+
+
+class CameraSettingError(DriverError):
+    """The camera cannot be set to that; nothing was sent to it."""
+
+    def __init__(self, setting: str, reason: str) -> None:
+        super().__init__(f"the camera's {setting} {reason}")
+        self.setting = setting
+        self.reason = reason
+
+
+class PtpFormatError(DriverError):
+    """Bytes from a camera that are no PTP message, or not the one that must come now."""
+
+    def __init__(self, raw: bytes, reason: str) -> None:
+        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
+        super().__init__(
+            f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw
+        self.reason = reason
+
+
+class PtpRefusedError(DriverError):
+    """The camera understood the request and said no; `code` is its answer."""
+
+    def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
+        super().__init__(f"the camera refused {operation} with {answer}: {advice}")
+        self.operation = operation
+        self.code = code
+        self.answer = answer
+
+
+class CameraBusyError(DriverError):
+    """The camera answered "busy" for too long."""
+
+    def __init__(self, operation: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
+            "has stored its pictures, check its battery and close its menus"
+        )
+        self.operation = operation
+        self.waited_s = waited_s
+
+
+class CardFullError(DriverError):
+    """There is no room for another picture."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"the card of {camera} is full or missing: empty or insert it")
+        self.camera = camera
+
+
+class CaptureError(DriverError):
+    """The camera was released but gave no usable picture."""
+
+    def __init__(self, reason: str, advice: str) -> None:
+        super().__init__(f"no picture, {reason}: {advice}")
+        self.reason = reason
+
+
+class DownloadError(DriverError):
+    """A picture is on the card but could not be fetched whole."""
+
+    def __init__(self, name: str, got: int, size: int, reason: str) -> None:
+        super().__init__(
+            f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
+            "the picture is still on the card"
+        )
+        self.name = name
+        self.got = got
+        self.size = size
+        self.reason = reason
+
+
+class FolderCameraError(DriverError):
+    """A folder of recorded frames has none to give."""
+
+    def __init__(self, folder: str, reason: str) -> None:
+        super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
+        self.folder = folder
+        self.reason = reason
+
+
+class CameraClosedError(DriverError):
+    """The camera was closed by this program."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"{camera} was closed: open it again")
+        self.camera = camera
+
+
+class U3vFormatError(DriverError):
+    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
+
+    def __init__(self, raw: bytes, reason: str) -> None:
+        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
+        super().__init__(
+            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
+            "check the cable, then open the camera again"
+        )
+        self.raw = raw[:64]
+        self.reason = reason
+
+
+class U3vRefusedError(DriverError):
+    """The camera understood a command and said no; `status` is its answer."""
+
+    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
+        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
+        self.command = command
+        self.status = status
+
+
+class U3vBusyError(DriverError):
+    """The camera kept asking for more time for one command."""
+
+    def __init__(self, command: str, waited_s: float) -> None:
+        super().__init__(
+            f"the camera was still busy with {command} after {waited_s:.3g} s: "
+            "switch it off and on, then open it again"
+        )
+        self.command = command
+        self.waited_s = waited_s
+
+
+class CameraDescriptionError(DriverError):
+    """The camera's own description of its features (GenICam) cannot be used."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"unusable camera description, {reason}: update the camera's firmware, "
+            "or use another camera"
+        )
+        self.reason = reason
+
+
+class FrameLostError(DriverError):
+    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
+
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"frame lost, {reason}: {advice}")
+        self.reason = reason
+        self.advice = advice

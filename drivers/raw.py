@@ -3,7 +3,10 @@
 import hashlib
 import io
 import struct
-from dataclasses import dataclass
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,27 @@ IMAGE_DESCRIPTION_TAG = 270
 SUB_IFDS_TAG = 330
 CFA_TILE_PREFIX = "cfa_tile="
 """An ImageDescription that begins so names a colour tile that LibRaw's 2x2 phase cannot tell."""
+
+RAW_SUFFIXES = frozenset(
+    (
+        *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc"),
+        *(".mef", ".mos", ".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl"),
+        *(".sr2", ".srf", ".srw", ".x3f"),
+    )
+)
+"""What makers call the RAW files that LibRaw knows."""
+
+TOLD = {"maker": 271, "model": 272, "captured": 306, "serial": 42033}
+TOLD_IN_EXIF = {
+    "iso": "ISOSpeedRatings",
+    "aperture": "FNumber",
+    "captured": "DateTimeOriginal",
+    "serial": "BodySerialNumber",
+}
+"""What a frame's metadata take from the file, where it has it."""
+
+HASH_BESIDE_BYTES = 1 << 20
+"""From here on a file is hashed in a thread of its own, while LibRaw decodes it."""
 
 _DAMAGED_TIFF = (
     tifffile.TiffFileError,
@@ -41,8 +65,12 @@ class RawFrame:
     `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
     `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
-    `exposure_s`: None where the file does not say.
+    `exposure_s`: None where neither the file nor the camera says.
     `original`: the camera's own bytes, `sha256` their digest in hexadecimal.
+    `gain`: linear, 1 at the camera's base sensitivity; None where nobody says.
+    `camera_time_s`: the camera's own timestamp, from an origin of its own.
+    `host_time_s`: when the frame had arrived, on the clock that the camera was given.
+    `metadata`: what else the camera said of the frame.
     """
 
     mosaic: Array
@@ -52,6 +80,10 @@ class RawFrame:
     exposure_s: float | None
     original: bytes
     sha256: str
+    gain: float | None = None
+    camera_time_s: float | None = None
+    host_time_s: float | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
 
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
@@ -64,14 +96,15 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
     """
     if not data:
         raise RawFrameError("it is empty")
-    exposure_s, tile = _read_tiff(data) if data[:4] in TIFF_MAGICS else (None, None)
-    try:
-        with rawpy.imread(io.BytesIO(data)) as raw:
-            mosaic = raw.raw_image_visible.copy()
-            black_level_dn, cfa = _read_levels_and_phase(raw)
-            white_level_dn = int(raw.white_level)
-    except rawpy.LibRawError as error:
-        raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
+    told = _read_tiff(data) if data[:4] in TIFF_MAGICS else _Told()
+    with hashed(data) as digest:
+        try:
+            with rawpy.imread(io.BytesIO(data)) as raw:
+                mosaic = raw.raw_image_visible.copy()
+                black_level_dn, cfa = _read_levels_and_phase(raw)
+                white_level_dn = int(raw.white_level)
+        except rawpy.LibRawError as error:
+            raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
     if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
         raise RawFrameError("it holds colour or floating-point pixels, not one mosaic of 16 bits")
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
@@ -84,11 +117,37 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
         mosaic=mosaic,
         black_level_dn=black_level_dn,
         white_level_dn=white_level_dn,
-        cfa=tile or cfa,
-        exposure_s=exposure_s,
+        cfa=told.tile or cfa,
+        exposure_s=told.exposure_s,
         original=data,
-        sha256=hashlib.sha256(data).hexdigest(),
+        sha256=digest.hexdigest(),
+        metadata=told.metadata,
     )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the file says besides its pixels."""
+
+    exposure_s: float | None = None
+    tile: str | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+@contextmanager
+def hashed(data: bytes) -> Iterator[Any]:
+    """Yield the data's SHA-256, complete when the block ends."""
+    digest = hashlib.sha256()
+    if len(data) < HASH_BESIDE_BYTES:
+        digest.update(data)
+        yield digest
+        return
+    thread = threading.Thread(target=digest.update, args=(data,), name="sha256")
+    thread.start()
+    try:
+        yield digest
+    finally:
+        thread.join()
 
 
 def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
@@ -111,8 +170,8 @@ def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
     return by_colour[np.array(colours)], "".join(letters[c] for pair in colours for c in pair)
 
 
-def _read_tiff(data: bytes) -> tuple[float | None, str | None]:
-    """Return exposure and tile name, having checked that every strip lies inside the file."""
+def _read_tiff(data: bytes) -> _Told:
+    """Return what the tags say, having checked that every strip lies inside the file."""
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             pages = list(tiff.pages)
@@ -120,14 +179,29 @@ def _read_tiff(data: bytes) -> tuple[float | None, str | None]:
                 pages.extend(page.pages or ())
             missing = max(_bytes_missing(page, len(data)) for page in pages)
             tags = tiff.pages.first.tags
-            exposure_s = _exposure_s(tags)
+            exif = tags.valueof(EXIF_TAG)
+            exif = exif if isinstance(exif, dict) else {}
+            exposure_s = _exposure_s(tags, exif)
             description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
+            metadata = {name: tags.valueof(tag) for name, tag in TOLD.items()}
+            metadata |= {name: exif.get(key) for name, key in TOLD_IN_EXIF.items() if key in exif}
     except _DAMAGED_TIFF as error:
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
     tile = description.removeprefix(CFA_TILE_PREFIX)
-    return exposure_s, tile if tile != description else None
+    return _Told(
+        exposure_s,
+        tile if tile != description else None,
+        {name: _shown(value) for name, value in metadata.items() if value is not None},
+    )
+
+
+def _shown(value: object) -> str:
+    """Return a tag's value as text: a fraction as a number."""
+    if isinstance(value, tuple) and len(value) == 2 and value[1]:
+        return f"{value[0] / value[1]:g}"
+    return str(value).strip()
 
 
 def _bytes_missing(page: Any, file_size: int) -> int:
@@ -146,11 +220,10 @@ def _bytes_missing(page: Any, file_size: int) -> int:
     return max([short, *beyond])
 
 
-def _exposure_s(tags: Any) -> float | None:
+def _exposure_s(tags: Any, exif: Mapping[str, Any]) -> float | None:
     """Return the exposure time from the first directory or from its EXIF directory."""
-    exif = tags.valueof(EXIF_TAG)
     rational = tags.valueof(EXPOSURE_TIME_TAG)
-    if rational is None and isinstance(exif, dict):
+    if rational is None:
         rational = exif.get("ExposureTime")
     if rational is None:
         return None

@@ -11,27 +11,39 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import (
+    AxisFaultError,
     DriverError,
     GarbledReplyError,
     LimitExceededError,
+    LostPositionError,
     MoveTimeoutError,
     NotHomedError,
+    PortError,
     PositionMismatchError,
+    SpeedLimitError,
     TransportTimeoutError,
     UnknownAxisError,
 )
+from drivers.transport import Transport
 
 _log = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer")
 
 MOVE_TIME_FACTOR = 1.5
 MOVE_TIME_EXTRA_S = 2.0
 """Acceleration and polling; short moves are all acceleration."""
 HOMING_TIME_FACTOR = 4.0
 """Homing crosses the travel slower than a move does, and backs off from its switch."""
+START_GRACE_S = 0.5
+"""An axis that stands still away from its target may not have begun yet, for this long."""
+STOP_TIME_S = 5.0
+READINGS_TRIED = 3
+RECONNECT_POLL_S = 0.1
 
 
 class Stage(Protocol):
@@ -59,19 +71,35 @@ class Stage(Protocol):
         ...
 
     def position_um(self, axis: str) -> float:
-        """Return where the axis reads to be."""
+        """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
         ...
 
     def limits_um(self, axis: str) -> tuple[float, float]:
         """Return the lowest and highest target that `move_to_um` accepts."""
         ...
 
+    def speed_um_s(self, axis: str) -> float:
+        """Return the speed of a move."""
+        ...
+
+    def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
+        """Choose the speed of the moves that follow, also after a reconnect."""
+        ...
+
     def stop(self, axes: Iterable[str] | None = None) -> None:
-        """Stop the given axes (all by default) at once."""
+        """Stop the given axes (all by default) at once, and return when they stand."""
         ...
 
     def wait_until_settled(self, axes: Iterable[str] | None = None) -> None:
         """Return when the given axes (all by default) stand and their vibration has died down."""
+        ...
+
+    def reconnect(self, wait_s: float = 10.0) -> None:
+        """Open the ports again after an unplug; every axis must be homed before its next move."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the ports; nothing is moved or stopped."""
         ...
 
 
@@ -84,6 +112,7 @@ class StageSettings:
     `tolerance_um`: largest difference between command and read-back.
     `settle_s`: pause between standing still and being used.
     `soft_limits_um`: limits by axis, narrower than the device's own.
+    `speeds_um_s`: speed by axis, instead of the device's own; restored after every reconnect.
     """
 
     approach_um: float = 10.0
@@ -91,6 +120,7 @@ class StageSettings:
     settle_s: float = 0.05
     poll_s: float = 0.02
     soft_limits_um: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    speeds_um_s: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for settings no stage can work with."""
@@ -101,6 +131,14 @@ class StageSettings:
 
 
 DEFAULT_SETTINGS = StageSettings()
+
+
+class Reading(NamedTuple):
+    """What an axis says of itself: where it is, whether it knows that from homing, and moves."""
+
+    position_um: float
+    homed: bool
+    moving: bool
 
 
 def move_time_limit_s(distance_um: float, speed_um_s: float) -> float:
@@ -120,10 +158,13 @@ def check_within_limits(axis: str, target_um: float, limits_um: tuple[float, flo
         raise LimitExceededError(axis, target_um, limits_um)
 
 
-def check_arrived(axis: str, commanded_um: float, read_um: float, tolerance_um: float) -> None:
-    """Raise `PositionMismatchError` when the axis is not where it was sent."""
-    if abs(read_um - commanded_um) > tolerance_um:
-        raise PositionMismatchError(axis, commanded_um, read_um, tolerance_um)
+def check_tolerance(axis: str, tolerance_um: float, resolution_um: float) -> None:
+    """Raise `ValueError` for a tolerance that rounding alone exceeds."""
+    if tolerance_um < resolution_um / 2:
+        raise ValueError(
+            f"tolerance_um {tolerance_um:g} is finer than half a step of {axis} "
+            f"({resolution_um:g} um): loosen it"
+        )
 
 
 class HostStage(ABC):
@@ -131,51 +172,132 @@ class HostStage(ABC):
 
     No move is ever sent twice: when the answer to one is lost, the position decides whether it
     was carried out. Any exception during a move, Ctrl-C included, stops the axes that move.
+    A protocol's constructor ends with `_start_up`.
     """
 
-    def __init__(self, axes: Iterable[str], clock: Clock, settings: StageSettings) -> None:
+    def __init__(
+        self,
+        axes: Iterable[str],
+        transports: Iterable[Transport],
+        clock: Clock,
+        settings: StageSettings,
+    ) -> None:
         self._axes = tuple(axes)
+        self._transports = tuple(dict.fromkeys(transports))
         self._clock = clock
         self._settings = settings
-        for axis in settings.soft_limits_um:
+        self._speeds_um_s = dict(settings.speeds_um_s)
+        self._not_trusted: dict[str, str] = {}
+        for axis in (*settings.soft_limits_um, *settings.speeds_um_s):
             self._require_axis(axis)
 
     @abstractmethod
-    def is_homed(self, axis: str) -> bool:
-        """Return whether the axis knows where it is."""
+    def _configure(self) -> None:
+        """Bring a device on a freshly opened port into a known state; moves nothing."""
 
     @abstractmethod
-    def position_um(self, axis: str) -> float:
-        """Return where the axis reads to be."""
+    def _read(self, axis: str) -> Reading:
+        """Ask the device where the axis is, and whether it is homed."""
 
     @abstractmethod
-    def _start_home(self, axis: str) -> None:
+    def _start_home(self, axes: tuple[str, ...]) -> None:
         """Send the homing command and return at once."""
 
     @abstractmethod
-    def _start_move(self, axis: str, target_um: float) -> None:
-        """Send an absolute move and return at once."""
+    def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
+        """Send absolute moves, each once, and return at once."""
 
     @abstractmethod
     def _stop_axis(self, axis: str) -> None:
-        """Stop the axis."""
+        """Send the stop command."""
 
     @abstractmethod
     def _is_moving(self, axis: str) -> bool:
-        """Return whether the axis moves; raises when it reports a fault."""
+        """Return whether the axis moves; raises `AxisFaultError` when it reports a fault."""
 
     @abstractmethod
     def _travel_um(self, axis: str) -> tuple[float, float]:
         """Return the device's own limits."""
 
     @abstractmethod
-    def _speed_um_s(self, axis: str) -> float:
+    def _apply_speed(self, axis: str, speed_um_s: float) -> None:
+        """Make the axis move at this speed from now on."""
+
+    @abstractmethod
+    def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
+
+    def _is_homing(self, axis: str) -> bool:
+        """Return whether the homing that was started still goes on; raises as `_is_moving`."""
+        return self._is_moving(axis)
+
+    def _homing_speed_um_s(self, axis: str) -> float:
+        """Return the speed at which the axis looks for its reference."""
+        return self.speed_um_s(axis)
+
+    def _top_speed_um_s(self, axis: str) -> float:
+        """Return the fastest speed that the axis can be given."""
+        return math.inf
+
+    def _readings_are_checked(self, axis: str) -> bool:
+        """Return whether a checksum protects what `_read` reads."""
+        return False
+
+    def _why_short(self, axis: str) -> DriverError | None:
+        """Return why the axis stands away from its target, where the device tells."""
+        return None
 
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the axes."""
         return self._axes
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the ports; nothing is moved or stopped."""
+        for transport in self._transports:
+            transport.close()
+
+    def reconnect(self, wait_s: float = 10.0) -> None:
+        """Open the ports again after an unplug, wherever they are now; nothing moves.
+
+        Waits up to `wait_s` for each port, stops what still moves, restores the settings, and
+        marks every position as unknown: an axis must be homed before its next move. Raises a
+        `PortError` when a port stays away, and what talking to the device raises.
+        """
+        self._distrust(self._axes, "the connection was lost")
+        for transport in self._transports:
+            self._reopen(transport, self._clock.now_s() + wait_s)
+        for axis in self._axes:
+            self._stop_axis(axis)
+        self._start_up()
+
+    def is_homed(self, axis: str) -> bool:
+        """Return whether the axis knows where it is."""
+        self._require_axis(axis)
+        return axis not in self._not_trusted and self._noting_loss(axis, self._read).homed
+
+    def position_um(self, axis: str) -> float:
+        """Return where the axis reads to be; raises `NotHomedError` while it does not know.
+
+        Where no checksum protects the reply, two readings in a row must agree; an axis that
+        moves may be further by the second. Raises `GarbledReplyError` when they never do.
+        """
+        self._require_axis(axis)
+        self._require_trust(axis)
+        before_s = self._clock.now_s()
+        reading = self._noting_loss(axis, self._read)
+        if not self._readings_are_checked(axis):
+            reading = self._confirmed(axis, reading, before_s)
+        self._require_trust(axis)
+        if not reading.homed:
+            raise NotHomedError(axis)
+        return reading.position_um
 
     def limits_um(self, axis: str) -> tuple[float, float]:
         """Return the lowest and highest target that `move_to_um` accepts.
@@ -188,6 +310,18 @@ class HostStage(ABC):
         soft_low_um, soft_high_um = self._settings.soft_limits_um.get(axis, (low_um, high_um))
         return max(low_um, soft_low_um) + self._settings.approach_um, min(high_um, soft_high_um)
 
+    def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
+        """Choose the speed of the moves that follow, also after a reconnect.
+
+        Raises `SpeedLimitError` before anything is sent, or `CommandRefusedError`.
+        """
+        self._require_axis(axis)
+        top_um_s = self._top_speed_um_s(axis)
+        if not (math.isfinite(speed_um_s) and 0 < speed_um_s <= top_um_s):
+            raise SpeedLimitError(axis, speed_um_s, top_um_s)
+        self._apply_speed(axis, speed_um_s)
+        self._speeds_um_s[axis] = speed_um_s
+
     def home(self, axes: Iterable[str] | None = None) -> None:
         """Find the reference of the given axes (all by default), and wait until they stand.
 
@@ -195,29 +329,33 @@ class HostStage(ABC):
         """
         chosen = self._choose(axes)
         with self._stopped_on_error(chosen):
+            self._distrust(chosen, "its homing did not finish")
+            self._start_home(chosen)
+            started_s = self._clock.now_s()
+            limits_s = {axis: self._homing_time_limit_s(axis) for axis in chosen}
+            self._wait_until_idle(limits_s, started_s, self._is_homing)
             for axis in chosen:
-                self._start(axis, partial(self._start_home, axis))
-            self._wait_until_idle(
-                {axis: HOMING_TIME_FACTOR * self._full_travel_time_s(axis) for axis in chosen}
-            )
+                if not self._read(axis).homed:
+                    raise NotHomedError(axis, self._not_trusted[axis])
         for axis in chosen:
-            if not self.is_homed(axis):
-                raise NotHomedError(axis)
+            self._not_trusted.pop(axis, None)
 
     def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
         """Move the axes together, wait until they settle, and return where they read to be.
 
         Raises `UnknownAxisError`, `LimitExceededError` or `NotHomedError` before anything moves;
-        afterwards `PositionMismatchError`, `StalledError`, `AxisFaultError`, `MoveTimeoutError`
-        or an error of the transport, with the axes stopped.
+        afterwards `PositionMismatchError`, `AxisFaultError` (a stall, a limit switch, an
+        emergency stop, a lost position), `MoveTimeoutError` or an error of the transport, with
+        the axes stopped.
         """
         for axis, target_um in targets_um.items():
             check_within_limits(axis, target_um, self.limits_um(axis))
-        start_um = self._positions_when_homed_um(targets_um)
+        start_um = {axis: self.position_um(axis) for axis in self._choose(targets_um)}
+        approach_um = self._settings.approach_um
         waypoints_um = {
-            axis: target_um - self._settings.approach_um
+            axis: target_um - approach_um
             for axis, target_um in targets_um.items()
-            if needs_approach(start_um[axis], target_um, self._settings.approach_um)
+            if approach_um and needs_approach(start_um[axis], target_um, approach_um)
         }
         with self._stopped_on_error(targets_um):
             reached_um = start_um | self._travel(start_um, waypoints_um)
@@ -227,34 +365,61 @@ class HostStage(ABC):
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
         """As `move_to_um`, relative to where the axes read to be; they must be homed too."""
-        start_um = self._positions_when_homed_um(steps_um)
+        start_um = {axis: self.position_um(axis) for axis in self._choose(steps_um)}
         return self.move_to_um({axis: start_um[axis] + step for axis, step in steps_um.items()})
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
-        """Stop the given axes (all by default) at once.
+        """Stop the given axes (all by default) at once, and return when they stand.
 
-        Every axis is tried before the first error is raised.
+        Every axis is tried before the first error is raised. An axis that reports a fault counts
+        as standing: the next move tells about it.
         """
+        chosen = self._choose(axes)
         errors: list[DriverError] = []
-        for axis in self._choose(axes):
+        for axis in chosen:
             try:
                 self._stop_axis(axis)
             except DriverError as error:
                 errors.append(error)
         if errors:
             raise errors[0]
+        limits_s = dict.fromkeys(chosen, STOP_TIME_S)
+        self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving_without_fault)
 
     def wait_until_settled(self, axes: Iterable[str] | None = None) -> None:
         """Return when the given axes (all by default) stand and their vibration has died down.
 
         Raises `MoveTimeoutError` when an axis moves longer than its whole travel takes.
         """
-        self._wait_until_idle({axis: self._full_travel_time_s(axis) for axis in self._choose(axes)})
+        limits_s = {axis: self._full_travel_time_s(axis) for axis in self._choose(axes)}
+        self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving)
         self._clock.sleep(self._settings.settle_s)
+
+    def _start_up(self) -> None:
+        self._configure()
+        for axis, speed_um_s in self._speeds_um_s.items():
+            self.set_speed_um_s(axis, speed_um_s)
+
+    def _reopen(self, transport: Transport, deadline_s: float) -> None:
+        while True:
+            try:
+                transport.reopen()
+                return
+            except PortError:
+                if self._clock.now_s() >= deadline_s:
+                    raise
+                self._clock.sleep(RECONNECT_POLL_S)
 
     def _require_axis(self, axis: str) -> None:
         if axis not in self._axes:
             raise UnknownAxisError(axis, self._axes)
+
+    def _require_trust(self, axis: str) -> None:
+        if axis in self._not_trusted:
+            raise NotHomedError(axis, self._not_trusted[axis])
+
+    def _distrust(self, axes: Iterable[str], why: str) -> None:
+        self._not_trusted.update(dict.fromkeys(axes, why))
 
     def _choose(self, axes: Iterable[str] | None) -> tuple[str, ...]:
         chosen = self._axes if axes is None else tuple(axes)
@@ -262,58 +427,135 @@ class HostStage(ABC):
             self._require_axis(axis)
         return chosen
 
-    def _positions_when_homed_um(self, axes: Iterable[str]) -> dict[str, float]:
-        chosen = self._choose(axes)
-        for axis in chosen:
-            if not self.is_homed(axis):
-                raise NotHomedError(axis)
-        return {axis: self.position_um(axis) for axis in chosen}
+    def _confirmed(self, axis: str, reading: Reading, before_s: float) -> Reading:
+        for _ in range(READINGS_TRIED):
+            again = self._noting_loss(axis, self._read)
+            possible_um = self._settings.tolerance_um
+            if reading.moving or again.moving:
+                possible_um += self.speed_um_s(axis) * (self._clock.now_s() - before_s)
+            if (
+                again.homed == reading.homed
+                and abs(again.position_um - reading.position_um) <= possible_um
+            ):
+                return again
+            _log.warning("%s: read %s, then %s", axis, reading, again)
+            reading, before_s = again, self._clock.now_s()
+        raise GarbledReplyError(b"", f"{axis} never reads the same twice").about(
+            axis=axis, command="position"
+        )
 
     def _full_travel_time_s(self, axis: str) -> float:
         low_um, high_um = self._travel_um(axis)
-        return move_time_limit_s(high_um - low_um, self._speed_um_s(axis))
+        return move_time_limit_s(high_um - low_um, self.speed_um_s(axis))
 
-    def _start(self, axis: str, send: Callable[[], None]) -> None:
+    def _homing_time_limit_s(self, axis: str) -> float:
+        low_um, high_um = self._travel_um(axis)
+        limit_s = move_time_limit_s(high_um - low_um, self._homing_speed_um_s(axis))
+        return HOMING_TIME_FACTOR * limit_s
+
+    def _is_moving_without_fault(self, axis: str) -> bool:
+        try:
+            return self._is_moving(axis)
+        except AxisFaultError as fault:
+            _log.warning("%s: %s", axis, fault)
+            return False
+
+    def _send_once(self, axes: Iterable[str], send: Callable[[], None]) -> None:
         """Send a command that must not be repeated; the position tells later if it arrived."""
         try:
             send()
         except (TransportTimeoutError, GarbledReplyError) as error:
             _log.warning(
-                "%s: no answer to a motion command, its position will tell: %s", axis, error
+                "%s: no answer to a motion command, the position will tell: %s",
+                ", ".join(axes),
+                error,
             )
 
     def _travel(
         self, start_um: Mapping[str, float], targets_um: Mapping[str, float]
     ) -> dict[str, float]:
-        for axis, target_um in targets_um.items():
-            self._start(axis, partial(self._start_move, axis, target_um))
-        self._wait_until_idle(
-            {
-                axis: move_time_limit_s(target_um - start_um[axis], self._speed_um_s(axis))
-                for axis, target_um in targets_um.items()
-            }
-        )
-        reached_um = {axis: self.position_um(axis) for axis in targets_um}
-        for axis, target_um in targets_um.items():
-            check_arrived(axis, target_um, reached_um[axis], self._settings.tolerance_um)
-        return reached_um
-
-    def _wait_until_idle(self, time_limits_s: Mapping[str, float]) -> None:
+        """Move, wait, and return the positions read; all within the tolerance."""
+        if not targets_um:
+            return {}
+        self._send_once(targets_um, partial(self._start_moves, targets_um, start_um))
         started_s = self._clock.now_s()
-        for axis, time_limit_s in time_limits_s.items():
-            while self._is_moving(axis):
-                if self._clock.now_s() - started_s > time_limit_s:
-                    raise MoveTimeoutError(axis, time_limit_s)
+        slowest_s = max(
+            move_time_limit_s(target_um - start_um[axis], self.speed_um_s(axis))
+            for axis, target_um in targets_um.items()
+        )
+        limits_s = dict.fromkeys(targets_um, slowest_s)
+        while True:
+            moved_s = self._wait_until_idle(limits_s, started_s, self._is_moving)
+            reached_um = self._positions_after_move_um(targets_um)
+            short = [
+                axis
+                for axis, target_um in targets_um.items()
+                if abs(reached_um[axis] - target_um) > self._settings.tolerance_um
+            ]
+            if not short:
+                return reached_um
+            if self._clock.now_s() - moved_s > START_GRACE_S:
+                axis = short[0]
+                raise self._why_short(axis) or PositionMismatchError(
+                    axis, targets_um[axis], reached_um[axis], self._settings.tolerance_um
+                )
+            self._clock.sleep(self._settings.poll_s)
+
+    def _positions_after_move_um(self, axes: Iterable[str]) -> dict[str, float]:
+        positions_um = {}
+        for axis in axes:
+            try:
+                positions_um[axis] = self.position_um(axis)
+            except NotHomedError as error:
+                raise LostPositionError(axis, f"position lost during a move, {error}") from error
+        return positions_um
+
+    def _wait_until_idle(
+        self,
+        limits_s: Mapping[str, float],
+        started_s: float,
+        is_moving: Callable[[str], bool],
+    ) -> float:
+        """Return when the axes stand; the value is when one was last seen to move.
+
+        `limits_s` count from `started_s`. Raises `MoveTimeoutError`.
+        """
+        moved_s = started_s
+        for axis, limit_s in limits_s.items():
+            while self._noting_loss(axis, is_moving):
+                moved_s = self._clock.now_s()
+                if moved_s - started_s > limit_s:
+                    raise MoveTimeoutError(axis, limit_s)
                 self._clock.sleep(self._settings.poll_s)
+        return moved_s
+
+    def _noting_loss(self, axis: str, ask: Callable[[str], Answer]) -> Answer:
+        """Return what `ask` returns; an error that loses the position marks it as unknown."""
+        try:
+            return ask(axis)
+        except DriverError as error:
+            self._note_loss(error)
+            raise
+
+    def _note_loss(self, error: DriverError) -> None:
+        if error.loses_position:
+            lost = (error.axis,) if error.axis in self._axes else self._axes
+            self._distrust(lost, error.what)
 
     @contextmanager
     def _stopped_on_error(self, axes: Iterable[str]) -> Iterator[None]:
+        """Stop every axis when anything goes wrong, Ctrl-C included, and note what is now unknown.
+
+        Nothing, a second Ctrl-C neither, keeps an axis from being told to stop.
+        """
         try:
             yield
         except BaseException as error:
+            if isinstance(error, DriverError):
+                self._note_loss(error)
             for axis in axes:
                 try:
                     self._stop_axis(axis)
-                except DriverError as stop_error:
+                except BaseException as stop_error:
                     error.add_note(f"{axis} could not be stopped: {stop_error}")
             raise

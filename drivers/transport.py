@@ -9,11 +9,15 @@ from typing import Any, Protocol
 import serial
 
 from drivers.errors import (
+    DriverError,
+    GarbledReplyError,
     PortBusyError,
     PortGoneError,
     PortNotFoundError,
+    PortPermissionError,
     TransportTimeoutError,
 )
+from drivers.ports import BY_SERIAL_NUMBER, find_port, holder_of, udev_rule_path, usb_serial_number
 
 try:
     from termios import error as _TermiosError  # noqa: N812
@@ -22,10 +26,20 @@ except ImportError:  # Windows
 
 _PORT_FAILURES = (serial.SerialException, OSError, _TermiosError)
 """What pyserial lets through when the port breaks; the terminal's own error is no OSError."""
+_FORBIDDEN = (errno.EACCES, errno.EPERM)
+_ABSENT = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ECONNREFUSED, errno.EHOSTUNREACH)
+QUIET_LIMIT = 20
+"""Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
+RTS_PAUSE_S = 0.05
 
 
 class Transport(Protocol):
     """What a serial driver needs of a port, real or simulated."""
+
+    @property
+    def port(self) -> str:
+        """Name of the port, for messages."""
+        ...
 
     @property
     def lock(self) -> AbstractContextManager[Any]:
@@ -40,8 +54,24 @@ class Transport(Protocol):
         """Return bytes up to and including `terminator`; raises as `write` does."""
         ...
 
+    def read_exactly(self, count: int) -> bytes:
+        """Return the next `count` bytes; raises as `write` does."""
+        ...
+
+    def waiting(self) -> int:
+        """Return how many bytes can be read at once; raises `PortGoneError`."""
+        ...
+
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
+        ...
+
+    def discard_until_quiet(self) -> None:
+        """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
+        ...
+
+    def reopen(self) -> None:
+        """Open the port again, wherever it is now; raises as opening it does."""
         ...
 
     def close(self) -> None:
@@ -52,8 +82,10 @@ class Transport(Protocol):
 class SerialTransport:
     """A serial port by pyserial, 8 data bits, no parity, 1 stop bit.
 
-    `timeout_s` bounds a read, `write_timeout_s` a write (pyserial waits for ever by default).
-    The port is opened for this process alone. Raises `PortNotFoundError` or `PortBusyError`.
+    `port` is named as `drivers.ports` says. `timeout_s` bounds a read, `write_timeout_s` a write
+    (pyserial waits for ever by default). `flow_control` is RTS/CTS, which APT controllers want.
+    The port is opened for this process alone. Raises `PortNotFoundError`, `PortBusyError` or
+    `PortPermissionError`.
     """
 
     def __init__(
@@ -62,29 +94,33 @@ class SerialTransport:
         baud: int = 115200,
         timeout_s: float = 0.5,
         write_timeout_s: float = 1.0,
+        flow_control: bool = False,
     ) -> None:
         self.port = port
         self.timeout_s = timeout_s
         self.write_timeout_s = write_timeout_s
+        self._baud = baud
+        self._flow_control = flow_control
         self._lock = threading.RLock()
         self._unread = bytearray()
-        try:
-            self._serial = serial.Serial(
-                port, baud, timeout=timeout_s, write_timeout=write_timeout_s, exclusive=True
-            )
-        except serial.SerialException as error:
-            if error.errno == errno.ENOENT or "FileNotFoundError" in str(error):
-                raise PortNotFoundError(port) from error
-            raise PortBusyError(port, str(error)) from error
+        device = find_port(port)
+        self._serial = self._open(device)
+        self._serial_number = "" if "://" in device else usb_serial_number(device)
 
     @property
     def lock(self) -> AbstractContextManager[Any]:
         """Held by a driver from the first byte of a command to the last of its answer."""
         return self._lock
 
+    @property
+    def usb_serial_number(self) -> str:
+        """Serial number of the USB adapter, by which the port is found again; "" if it has none."""
+        return self._serial_number
+
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError` or `TransportTimeoutError`."""
         with self._lock:
+            self._require_open()
             try:
                 self._serial.write(data)
             except serial.SerialTimeoutException as error:
@@ -100,27 +136,138 @@ class SerialTransport:
         with self._lock:
             deadline_s = time.monotonic() + self.timeout_s
             while (end := self._unread.find(terminator)) < 0:
-                if time.monotonic() > deadline_s:
-                    raise TransportTimeoutError(self.port, self.timeout_s, bytes(self._unread))
-                try:
-                    self._unread += self._serial.read(max(1, self._serial.in_waiting))
-                except _PORT_FAILURES as error:
-                    raise PortGoneError(self.port) from error
-            end += len(terminator)
-            message = bytes(self._unread[:end])
-            del self._unread[:end]
-            return message
+                self._receive(deadline_s)
+            return self._take(end + len(terminator))
+
+    def read_exactly(self, count: int) -> bytes:
+        """Return the next `count` bytes; raises as `write` does.
+
+        What arrived of an incomplete answer is kept for the next read.
+        """
+        with self._lock:
+            deadline_s = time.monotonic() + self.timeout_s
+            while len(self._unread) < count:
+                self._receive(deadline_s)
+            return self._take(count)
+
+    def waiting(self) -> int:
+        """Return how many bytes can be read at once; raises `PortGoneError`."""
+        with self._lock:
+            self._require_open()
+            try:
+                arrived = self._serial.in_waiting
+                if arrived:
+                    self._unread += self._serial.read(arrived)
+            except _PORT_FAILURES as error:
+                raise PortGoneError(self.port) from error
+            return len(self._unread)
 
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
         with self._lock:
             self._unread.clear()
+            self._require_open()
             try:
                 self._serial.reset_input_buffer()
             except _PORT_FAILURES as error:
                 raise PortGoneError(self.port) from error
 
+    def discard_until_quiet(self) -> None:
+        """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
+        with self._lock:
+            for _ in range(QUIET_LIMIT):
+                self.discard_input()
+                try:
+                    last = self.read_exactly(1)
+                except TransportTimeoutError:
+                    return
+            raise GarbledReplyError(last, f"{self.port} never falls silent")
+
+    def reopen(self) -> None:
+        """Open the port again, wherever it is now; raises as the constructor does.
+
+        A port opened by its name is looked for by the serial number of its USB adapter, if that
+        has one: after an unplug it may have another name.
+        """
+        with self._lock:
+            self.close()
+            self._unread.clear()
+            number = self._serial_number
+            self._serial = self._open(find_port(BY_SERIAL_NUMBER + number if number else self.port))
+
     def close(self) -> None:
         """Let go of the port; closing twice is allowed."""
         with self._lock:
+            # pyserial forgets to close a socket that the other side has closed already.
+            opened = getattr(self._serial, "_socket", None)
             self._serial.close()
+            if opened is not None:
+                opened.close()
+
+    def _open(self, device: str) -> serial.Serial:
+        try:
+            opened = serial.serial_for_url(
+                device,
+                baudrate=self._baud,
+                timeout=self.timeout_s,
+                write_timeout=self.write_timeout_s,
+                rtscts=self._flow_control,
+                exclusive=True,
+            )
+        except (serial.SerialException, OSError) as error:
+            raise _port_error(self.port, device, error) from error
+        except ValueError as error:
+            raise PortNotFoundError(self.port, f"is no port ({error})") from error
+        if self._flow_control:
+            _cycle_rts(opened)
+        return opened
+
+    def _receive(self, deadline_s: float) -> None:
+        """Read what there is, or wait for a byte; raises when the deadline has passed."""
+        self._require_open()
+        if time.monotonic() > deadline_s:
+            raise TransportTimeoutError(self.port, self.timeout_s, bytes(self._unread))
+        try:
+            self._unread += self._serial.read(max(1, self._serial.in_waiting))
+        except _PORT_FAILURES as error:
+            raise PortGoneError(self.port) from error
+
+    def _take(self, count: int) -> bytes:
+        message = bytes(self._unread[:count])
+        del self._unread[:count]
+        return message
+
+    def _require_open(self) -> None:
+        """Raise `PortGoneError` for a port that was closed; pyserial would trip over itself."""
+        if not self._serial.is_open:
+            raise PortGoneError(self.port)
+
+
+def _port_error(wanted: str, device: str, error: Exception) -> DriverError:
+    """Return the error that says why a port did not open."""
+    code = getattr(error, "errno", None)
+    text = str(error)
+    if code in _FORBIDDEN:
+        return PortPermissionError(wanted, str(udev_rule_path()))
+    if code in _ABSENT or "FileNotFoundError" in text:
+        return PortNotFoundError(wanted)
+    if "://" in device:
+        return PortNotFoundError(wanted, f"cannot be reached ({text})")
+    return PortBusyError(wanted, text, holder_of(device))
+
+
+def _cycle_rts(opened: serial.Serial) -> None:
+    """Drop and raise RTS, which wakes an FTDI adapter that was left in the middle of a message.
+
+    A pseudo-terminal has no such line and says so.
+    """
+    try:
+        opened.rts = False
+        time.sleep(RTS_PAUSE_S)
+        opened.reset_input_buffer()
+        opened.reset_output_buffer()
+        time.sleep(RTS_PAUSE_S)
+        opened.rts = True
+    except OSError as error:
+        if error.errno not in (errno.ENOTTY, errno.EINVAL):
+            raise PortGoneError(str(opened.port)) from error

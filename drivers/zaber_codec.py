@@ -1,7 +1,7 @@
 """Zaber ASCII wire format: pure functions between values and bytes.
 
 Source: Zaber ASCII Protocol Manual, "Message Format" (commands `/`, replies `@`, alerts `!`,
-information `#`) and "Message Checksums".
+information `#`), "Message Checksums" and "Warning Flags".
 """
 
 import re
@@ -14,16 +14,38 @@ MESSAGE_IDS = range(1, 100)
 SPEED_SCALE = 1.6384
 """Speed settings count microsteps per second times this."""
 
-NO_FLAG = "--"
 FLAG_MEANINGS = {
     "FF": "critical system error",
-    "FE": "limit error",
-    "FH": "emergency stop",
+    "FN": "peripheral not supported",
+    "FZ": "peripheral inactive",
+    "FH": "emergency stop, motor driver off",
+    "FV": "supply voltage out of range, motor driver off",
+    "FO": "motor driver off",
+    "FC": "inrush current error",
+    "FM": "motor too hot",
+    "FD": "motor driver off",
+    "FQ": "encoder error",
+    "FI": "index error",
+    "FA": "analog encoder not in step",
+    "FR": "overdrive limit exceeded",
     "FS": "stalled and stopped",
+    "FB": "stream left its bounds",
+    "FP": "strayed from its path",
+    "FE": "limit error",
+    "FT": "twisted too far",
+    "WL": "limit sensor triggered unexpectedly",
+    "WV": "supply voltage out of range",
+    "WT": "controller hot",
+    "WS": "stalled and recovered",
+    "WM": "displaced while it stood still",
+    "WP": "calibration of the wrong type",
     "WR": "no reference position",
     "WH": "not homed",
+    "NC": "somebody turns its knob",
     "NI": "movement interrupted",
 }
+"""Warning flags, the most severe first: a reply shows the first one that is raised."""
+NO_FLAG = "--"
 
 _LINE = re.compile(rb"([@!#])([^\r\n]*?)(?::([0-9A-Fa-f]{2}))?\r?\n")
 _REPLY = re.compile(r"(\d{2}) (\d) (?:(\d{2}) )?(OK|RJ) (BUSY|IDLE) (\S{2}) (.*)")

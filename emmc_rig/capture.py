@@ -61,10 +61,13 @@ def _go(rig: Rig, offsets_um: dict[str, float]) -> None:
     rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in offsets_um.items()})
 
 
-def _snaps(
-    rig: Rig, exposure_s: float, count: int, label: str, on_frame: Callable[[str], None]
-) -> Iterator[Frame]:
+def _expose(rig: Rig, exposure_s: float) -> float:
+    """Set the exposure and return the one that the camera took: cameras have steps."""
     rig.camera.set_exposure_s(exposure_s)
+    return rig.camera.exposure_s
+
+
+def _snaps(rig: Rig, count: int, label: str, on_frame: Callable[[str], None]) -> Iterator[Frame]:
     for _ in range(count):
         yield rig.camera.snap().mosaic
         on_frame(label)
@@ -89,8 +92,9 @@ def capture_whiteboards(
     try:
         rig.attendant.place("whiteboard")
         rig.attendant.set_lamp("off")
-        dark_frames = _snaps(rig, METERING_EXPOSURE_S, REFERENCE_REPEATS, "dark", on_frame)
-        dark = average(dark_frames, METERING_EXPOSURE_S, white_dn, "dark frame")
+        exposure_s = _expose(rig, METERING_EXPOSURE_S)
+        dark_frames = _snaps(rig, REFERENCE_REPEATS, "dark", on_frame)
+        dark = average(dark_frames, exposure_s, white_dn, "dark frame")
         references, pinholes = {}, {}
         for shot in range(len(camera.shots)):
             rig.attendant.fit_masks(shot, fitted=False)
@@ -98,13 +102,14 @@ def capture_whiteboards(
             for lamp in lamps:
                 label = f"reference, shot {shot + 1}, {lamp} lamp"
                 rig.attendant.set_lamp(lamp)
-                (metered,) = _snaps(rig, METERING_EXPOSURE_S, 1, label, on_frame)
+                metered_s = _expose(rig, METERING_EXPOSURE_S)
+                (metered,) = _snaps(rig, 1, label, on_frame)
                 bright = float(np.percentile(metered, 99.9)) - black_dn
                 if bright < 1:
                     raise AppError(f"{label}: the whiteboard is dark; is the lamp on?")
                 level = WHITEBOARD_LEVEL * (white_dn - black_dn) / bright
-                exposure_s = min(METERING_EXPOSURE_S * level, MAX_EXPOSURE_S)
-                frames = _snaps(rig, exposure_s, REFERENCE_REPEATS, label, on_frame)
+                exposure_s = _expose(rig, min(metered_s * level, MAX_EXPOSURE_S))
+                frames = _snaps(rig, REFERENCE_REPEATS, label, on_frame)
                 references[shot, lamp] = average(frames, exposure_s, white_dn, label)
             rig.attendant.fit_masks(shot)
             move_masks(rig, camera, shot)
@@ -116,10 +121,11 @@ def capture_whiteboards(
                         on_setting((shot, v, u, lamp))
                         label = f"whiteboard, shot {shot + 1}, view {v},{u}, {lamp} lamp"
                         exposure_s = references[shot, lamp].exposure_s
-                        exposure_s = min(
-                            exposure_s * camera.views[0] * camera.views[1], MAX_EXPOSURE_S
+                        exposure_s = _expose(
+                            rig,
+                            min(exposure_s * camera.views[0] * camera.views[1], MAX_EXPOSURE_S),
                         )
-                        frames = _snaps(rig, exposure_s, repeats, label, on_frame)
+                        frames = _snaps(rig, repeats, label, on_frame)
                         pinholes[shot, v, u, lamp] = average(frames, exposure_s, white_dn, label)
         return Whiteboards(dark, references, pinholes)
     finally:
@@ -129,9 +135,12 @@ def capture_whiteboards(
 
 def capture_shots(
     rig: Rig, camera: Camera, on_frame: Callable[[str], None] = lambda label: None
-) -> Frame:
-    """Return the shots of the scene, (shot, pixel_y, pixel_x) uint16 DN; the lamp is off after."""
-    frames = []
+) -> tuple[Frame, NDArray[np.float64]]:
+    """Return the shots of the scene, (shot, pixel_y, pixel_x) uint16 DN, and their exposures in s.
+
+    The lamp is off after.
+    """
+    frames, exposures_s = [], []
     try:
         rig.attendant.place("scene")
         rig.attendant.set_lamp("white")
@@ -139,7 +148,8 @@ def capture_shots(
         for shot, exposure_s in enumerate(camera.exposures_s()):
             rig.attendant.fit_masks(shot)
             move_masks(rig, camera, shot)
-            frames.extend(_snaps(rig, float(exposure_s), 1, f"shot {shot + 1}", on_frame))
+            exposures_s.append(_expose(rig, float(exposure_s)))
+            frames.extend(_snaps(rig, 1, f"shot {shot + 1}", on_frame))
     finally:
         rig.attendant.set_lamp("off")
-    return np.stack(frames)
+    return np.stack(frames), np.array(exposures_s)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.box import SIMPLE
@@ -23,6 +23,7 @@ from rich.table import Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
+from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
@@ -43,6 +44,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(devices, name="devices")
 console = Console(stderr=True)
 
 SceneOption = Annotated[
@@ -119,12 +121,13 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
+def _size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
     if text is None:
         return None
     rows, cross, columns = text.lower().partition("x")
     if not (cross and rows.isdigit() and columns.isdigit()):
-        raise AppError(f"--size {text}: write ROWSxCOLUMNS, for instance 192x256")
+        example = "192x256" if option == "--size" else "9x9"
+        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
     return int(rows), int(columns)
 
 
@@ -289,11 +292,14 @@ def reconstruct(
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
+    tile: Annotated[
+        int | None, typer.Option("--tile", min=1, help="in tiles of so many samples: less memory")
+    ] = None,
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.output import result_folder
-    from emmc_rig.reconstruct import load_settings, run_reconstruct
+    from emmc_rig.reconstruct import load_settings, run_in_tiles, run_reconstruct
     from reconstruction.methods import COSTS, METHODS
 
     if list_methods:
@@ -307,6 +313,20 @@ def reconstruct(
     if frames is None:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
     chosen = load_settings(settings)
+    if tile is not None:
+        if truth is not None:
+            raise typer.BadParameter(
+                "--truth needs the whole light field in memory, without --tile"
+            )
+        with result_folder(out) as folder, _progress() as progress:
+            bars = Bars(progress)
+            bars.begin(f"{method} in tiles", None)
+            metrics = run_in_tiles(
+                frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
+            )
+        typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
+        typer.echo(f"read {out / 'light_field.h5'}")
+        return
     with result_folder(out) as folder, _progress() as progress:
         bars = Bars(progress)
         bars.begin(method, None)
@@ -333,18 +353,31 @@ def chart(
     kernels: Annotated[
         bool, typer.Option("--kernels", help="time the kernels against a memory triad")
     ] = False,
+    solvers: Annotated[
+        bool, typer.Option("--solvers", help="time the sparse solvers, and scikit-learn's beside")
+    ] = False,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="time the primal-dual step, and pyproximal's beside")
+    ] = False,
+    dictionary: DictionaryOption = None,
     camera: CameraOption = "rgbw-bayer-1shot",
     size: SizeOption = "593x840",
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
     out: OutOption = Path("emmc-kernels"),
 ) -> None:
-    """Measure speed: `--kernels` prints every kernel as a ratio to its memory bound."""
+    """Measure speed: kernels against their memory bound, sparse solvers against theirs."""
     from emmc_rig.benchmark import kernel_timings, reconstruction_memory
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
-    if not kernels:
-        raise typer.BadParameter("say what to chart: --kernels")
+    if solvers:
+        _chart_solvers(camera, dictionary, out)
+        return
+    if not kernels and not peers:
+        raise typer.BadParameter("say what to chart: --kernels, --solvers or --peers")
+    if peers:
+        _chart_peers(camera, size, repeats, out)
+        return
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
@@ -372,6 +405,59 @@ def chart(
         write_metrics(folder, metrics)
     Console().print(table)
     typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+
+
+@app.command()
+def train(
+    out: Annotated[Path, typer.Option("--out", help="the dictionary to write, FILE.h5")],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scenes",
+            help="a folder of scenes, a scene, or a built-in name; may repeat "
+            "(default: the built-in scenes)",
+        ),
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option("--leave-out", help="a scene not to train on, by its name; may repeat"),
+    ] = None,
+    kind: Annotated[str, typer.Option("--kind", help="ksvd, online or separable")] = "ksvd",
+    atoms: Annotated[int, typer.Option("--atoms", help="number of atoms")] = 1024,
+    patch: Annotated[str, typer.Option("--patch", help="ROWSxCOLUMNS of a patch")] = "9x9",
+    patches: Annotated[int, typer.Option("--patches", help="patches to train on")] = 10_000,
+    sparsity: Annotated[int, typer.Option("--sparsity", help="atoms per patch at most")] = 8,
+    iterations: Annotated[int, typer.Option("--iterations", help="steps in all")] = 15,
+    seed: SeedOption = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on where the same training stopped")
+    ] = False,
+) -> None:
+    """Train a dictionary of light-field patches; Ctrl-C leaves a checkpoint for --resume."""
+    from emmc_rig.train import InterruptedTrainingError, picture_path, train_settings
+    from emmc_rig.train import train as run
+
+    size = _size(patch, "--patch")
+    assert size is not None
+    chosen = {
+        "patches": {"rows": size[0], "columns": size[1], "count": patches, "seed": seed},
+        "learning": {"atoms": atoms, "sparsity": sparsity, "iterations": iterations, "seed": seed},
+    }
+    settings = train_settings(out, scenes or (), leave_out or (), kind, chosen, resume)
+    try:
+        with _progress() as progress:
+            bars = Bars(progress)
+            dictionary, told = run(settings, bars)
+            bars.finish()
+    except InterruptedTrainingError as stop:
+        _fail(str(stop), INTERRUPTED)
+    last = told["history"][-1]
+    typer.echo(
+        f"{dictionary.size} atoms from {patches} patches of {len(told['sources'])} scene(s): error "
+        f"{last['updated_rmse'] or last['coded_rmse']:.5f} with {sparsity} atoms per patch; "
+        f"{told['learning_seconds']:.1f} s, peak memory {told['peak_memory_gib']:.2f} GiB"
+    )
+    typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
 
 
 @app.command()
@@ -414,6 +500,68 @@ def tables(
         typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
 
 
+def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.variational_benchmark import variational_timings
+
+    described, shape = find_camera(camera), _size(size)
+    assert shape is not None
+    table = Table("primal-dual step", "ms", "times ours")
+    rows = []
+    with result_folder(out) as folder:
+        for timing in variational_timings(described, shape, repeats):
+            rows.append(timing.as_dict())
+            table.add_row(timing.name, f"{timing.seconds * 1e3:.1f}", f"{timing.times_ours:.1f}")
+        metrics = {"camera": camera, "size": list(shape), "steps": rows}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
+
+
+def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.reconstruct import open_dictionary
+    from emmc_rig.sparse_benchmark import TIMED_SIZE, peer_timings, solver_timings
+
+    described = find_camera(camera)
+    atoms = open_dictionary(dictionary, described.views, described.sensor.binning)
+    table = Table("solver", "ms/patch", "passes", "GFLOP/s", "times its bound", "gap", "dB")
+    rows, peers = [], []
+    with result_folder(out) as folder:
+        for timing in solver_timings(described, TIMED_SIZE, atoms):
+            rows.append(timing.as_dict())
+            table.add_row(
+                timing.name,
+                f"{timing.milliseconds:.2f}",
+                f"{timing.passes:.0f}",
+                f"{timing.gigaflops:.1f}",
+                f"{timing.ratio:.1f}",
+                f"{timing.gap:.1e}",
+                f"{timing.psnr_db:.2f}",
+            )
+        Console().print(table)
+        try:
+            peers = [timing.as_dict() for timing in peer_timings(described, TIMED_SIZE, atoms)]
+        except AppError as missing:
+            console.print(f"[yellow]not compared:[/] {missing}", highlight=False)
+        metrics = {
+            "camera": camera,
+            "dictionary": atoms.kind,
+            "atoms": atoms.size,
+            "solvers": rows,
+            "peers": peers,
+            "command": command_line(),
+            "versions": versions(),
+        }
+        write_metrics(folder, metrics)
+    for peer in peers:
+        typer.echo(
+            f"{peer['name']}: ours {peer['ours_ms']:.2f} ms a patch, scikit-learn's "
+            f"{peer['theirs_ms']:.2f} ms: {peer['ratio']:.1f} times faster"
+        )
+
+
 def main() -> None:
     """Run the program; never shows a traceback for a fault that the user can mend."""
     try:
@@ -437,6 +585,6 @@ def main() -> None:
         sys.exit(code)
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str, code: int) -> NoReturn:
     console.print(f"[bold red]emmc-rig:[/] {message}", highlight=False, soft_wrap=True)
     sys.exit(code)

@@ -124,7 +124,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         design = build_imaging_matrix(camera, size)
         dictionary = None
         if find_method(settings.method).needs_dictionary:
-            dictionary = open_dictionary(settings.dictionary, design)
+            dictionary = open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
         rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
     lamps = lamps_needed(design)
     seen: dict[tuple[int, int, int, str], Array] = {}
@@ -144,11 +144,11 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         psi_error = calibration.psi.relative_difference(exact)
         design_error = design.relative_difference(exact)
     with stages("capture", design.shots):
-        frames_dn = capture_shots(rig, camera, watcher.step)
+        frames_dn, exposures_s = capture_shots(rig, camera, watcher.step)
     with stages("reconstruct"):
-        readings = calibration.readings(frames_dn, camera.exposures_s())
+        readings = calibration.readings(frames_dn, exposures_s)
         usable = frames_dn < camera.sensor.noise.white_level_dn
-        variance = calibration.reading_variance(frames_dn, camera.exposures_s())
+        variance = calibration.reading_variance(frames_dn, exposures_s)
         sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
 
         def light_field(psi: ImagingMatrix) -> Reconstruction:
@@ -204,7 +204,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             folder / "frames.h5",
             frames_dn,
             readings,
-            camera.exposures_s(),
+            exposures_s,
             deviation=np.sqrt(variance),
             usable=usable,
         )

@@ -1,4 +1,4 @@
-"""The only place that chooses devices: here the simulated rig, which speaks the real bytes.
+"""The only place that chooses devices: real ones by name, or simulated ones on the same bytes.
 
 The stage chain: device 1 carries the coded mask (axes x, y), device 2 the aperture plate (axes
 x, y), which has a pinhole of one aperture cell and, beside it, a window that leaves the whole
@@ -7,22 +7,53 @@ aperture open.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.apt import ACTUATORS, AptAxis, AptStage
+from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
-from drivers.camera import RawFileCamera
-from drivers.stage import Stage, StageSettings
-from drivers.zaber import ZaberStage
-from emmc_rig.model.camera import Camera
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import DriverError, TransportTimeoutError
+from drivers.folder import FolderCamera
+from drivers.grbl import GrblStage
+from drivers.grbl import identify as identify_grbl
+from drivers.ports import find_port, list_serial_ports
+from drivers.ptp import PtpCamera, PtpSession
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.stage import HostStage, Stage, StageSettings
+from drivers.transport import SerialTransport, Transport
+from drivers.u3v import open_u3v
+from drivers.usb import open_device
+from drivers.zaber import ZaberStage, find_devices
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, Sensor
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.scene import open_scene
+from emmc_rig.stage_config import (
+    USUAL_MICROSTEP_UM,
+    AptConfig,
+    GrblConfig,
+    StageConfig,
+    ZaberConfig,
+    parse_stage,
+)
+from simulators.apt import AptController
 from simulators.bench import Bench
-from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
+from simulators.firmware import SimulatedController
+from simulators.grbl import GrblController
+from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb
 from simulators.zaber import AxisSpec, ZaberChain
+
+_log = logging.getLogger(__name__)
 
 STAGE_AXES = {
     "mask_x": (1, 1),
@@ -32,6 +63,8 @@ STAGE_AXES = {
 }
 MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
+SIMULATED = "simulated"
+PROBE_TIMEOUT_S = 0.4
 
 
 class Attendant(Protocol):
@@ -120,9 +153,218 @@ def simulated_rig(
     )
     noise = camera.sensor.noise
     cfa = camera.sensor.cfa_name
-    device = SimulatedRawCamera(
-        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn
+    simulator = PtpCameraSimulator(
+        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
     )
     k = camera.sensor.binning
-    raw = RawFileCamera(device, (size[0] // k, size[1] // k), cfa)
-    return Rig(stage, raw, SimulatedAttendant(bench), zero_um, window_um), bench
+    still = _ptp_camera(
+        clock,
+        SimulatedUsb(clock, PtpUsbFunction(simulator)),
+        shape=(size[0] // k, size[1] // k),
+        cfa=cfa,
+        # The card lies in this computer's memory.
+        from_card=True,
+    )
+    return Rig(stage, still, SimulatedAttendant(bench), zero_um, window_um), bench
+
+
+def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStage:
+    """Return the stage that `spec` names, connected; it must be closed.
+
+    spec: `PROTOCOL:PORT` (zaber, grbl, apt) or a YAML file, see `emmc_rig.stage_config`;
+    `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
+    once. settings: single settings that replace those of the file. Raises AppError or a
+    `DriverError`.
+    """
+    name, _, protocol = spec.partition(":")
+    if name == SIMULATED:
+        return open_simulated(protocol or "zaber", settings)[0]
+    config = parse_stage(spec, settings)
+    transports: dict[str, Transport] = {}
+    with ExitStack() as opened:
+
+        def transport(port: str) -> Transport:
+            if port not in transports:
+                flow_control = isinstance(config, AptConfig)
+                transports[port] = SerialTransport(port, flow_control=flow_control)
+                opened.callback(transports[port].close)
+            return transports[port]
+
+        stage = _stage(config, transport, SYSTEM_CLOCK)
+        opened.pop_all()
+    return stage
+
+
+def open_simulated(
+    protocol: str, settings: Mapping[str, Any] | None = None
+) -> tuple[HostStage, SimulatedController]:
+    """Return a stage over simulated firmware in memory, and that firmware."""
+    clock = ManualClock()
+    firmware = simulated_firmware(protocol, clock)
+    wire = firmware.transport()
+    config = parse_stage(f"{protocol}:{SIMULATED}", settings)
+    return _stage(config, lambda port: wire, clock), firmware
+
+
+def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
+    """Return a simulated controller: of the rig's four axes, or the protocol's usual ones."""
+    makers = {"zaber": ZaberChain, "grbl": GrblController, "apt": AptController}
+    if protocol not in makers:
+        raise AppError(f"no simulated stage {protocol!r}: use one of {', '.join(makers)}")
+    return makers[protocol](clock)
+
+
+def probe_port(port: str) -> str:
+    """Return what answers on a port, in words, "" when nothing does; nothing moves.
+
+    A port whose USB adapter tells what it is is asked in that protocol alone: bytes of another
+    may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
+    """
+    device = find_port(port)
+    guesses = {one.device: one.guess for one in list_serial_ports()}
+    guess = guesses.get(device, "")
+    for protocol, ask in _PROBES.items():
+        if guess in ("", protocol):
+            with ExitStack() as opened:
+                flow_control = protocol == "apt"
+                transport = SerialTransport(
+                    port, timeout_s=PROBE_TIMEOUT_S, flow_control=flow_control
+                )
+                opened.callback(transport.close)
+                try:
+                    answer = ask(transport)
+                except DriverError as error:
+                    _log.debug("%s is no %s: %s", port, protocol, error)
+                    continue
+                if answer:
+                    return f"{protocol}: {answer}"
+    return ""
+
+
+def _probe_zaber(transport: Transport) -> str:
+    return ", ".join(
+        f"device {one.address} (id {one.device_id}, serial number {one.serial_number}, firmware "
+        f"{one.firmware}, axes {one.axis_count})"
+        for one in find_devices(transport)
+    )
+
+
+def _probe_apt(transport: Transport) -> str:
+    info = identify_apt(transport)
+    return f"{info.model}, serial number {info.serial_number}, firmware {info.firmware}"
+
+
+_PROBES = {"zaber": _probe_zaber, "grbl": identify_grbl, "apt": _probe_apt}
+
+
+def _stage(config: StageConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
+    """Return the stage of a configuration over transports opened by port."""
+    try:
+        settings = config.stage_settings()
+        if isinstance(config, ZaberConfig):
+            wire = transport(config.port)
+            axes = config.axes or _found_axes(wire, clock)
+            if config.microstep_um == USUAL_MICROSTEP_UM and config.port != SIMULATED:
+                _log.warning(
+                    "assuming %g um for a microstep: set microstep_um in a YAML file if the "
+                    "stage's data sheet says otherwise",
+                    USUAL_MICROSTEP_UM,
+                )
+            return ZaberStage(wire, axes, config.microstep_um, clock, settings)
+        if isinstance(config, GrblConfig):
+            return GrblStage(transport(config.port), config.axes, clock, settings)
+        channels = {
+            name: AptAxis(
+                transport(one.port), ACTUATORS[one.actuator], one.destination, one.channel
+            )
+            for name, one in config.axes.items()
+        }
+        return AptStage(channels, clock, settings)
+    except ValueError as error:
+        raise AppError(f"stage {config.protocol}: {error}") from error
+
+
+def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]]:
+    """Return every axis on a chain: by the rig's names where it is the rig, else by number."""
+    found = [
+        (device.address, axis)
+        for device in find_devices(transport, clock)
+        for axis in range(1, device.axis_count + 1)
+    ]
+    if not found:
+        raise TransportTimeoutError(transport.port, 0.5)
+    if set(found) == set(STAGE_AXES.values()):
+        return dict(STAGE_AXES)
+    return {f"{device}.{axis}": (device, axis) for device, axis in found}
+
+
+def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
+    """Open the camera that `spec` names: a kind, a colon and what tells it from others.
+
+    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `folder:DIR`, `simulated`. `backend`: of
+    pyusb, for a simulated bus.
+    Raises AppError for any other kind, or an error of the driver.
+    """
+    kind, _, rest = spec.partition(":")
+    if kind not in CAMERAS:
+        raise AppError(f"--camera {spec}: no such kind of camera; use {CAMERA_KINDS}")
+    return CAMERAS[kind](rest, clock, backend)
+
+
+def _ptp_camera(
+    clock: Clock,
+    backend: Any,
+    serial: str = "",
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    device = open_device(PTP_INTERFACE, serial=serial, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+
+
+def _open_ptp(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return _ptp_camera(clock, backend, serial)
+
+
+def _open_u3v(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return open_u3v(serial, backend=backend, clock=clock)
+
+
+def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
+    return FolderCamera(folder or ".", clock)
+
+
+def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
+    """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
+    bus = SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
+    return _ptp_camera(clock, bus, from_card=True)
+
+
+CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {
+    "ptp": _open_ptp,
+    "u3v": _open_u3v,
+    "folder": _open_folder,
+    "simulated": _open_simulated,
+}
+CAMERA_KINDS = "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, folder:DIR or simulated"
+SCENE_SIZE = (240, 320)
+
+
+def scene_simulator(clock: Clock, seed: int = 0) -> PtpCameraSimulator:
+    """Return a simulated camera with a plain lens before a built-in scene."""
+    sensor = Sensor(cfa="rggb")
+    noise, rng = sensor.noise, np.random.default_rng(seed)
+    view = open_scene("deep-occlusions", SCENE_SIZE, (1, 1)).light_field[0, 0]
+    tile = cfa_tile(sensor.cfa)
+    repeats = (-(-SCENE_SIZE[0] // tile.shape[0]), -(-SCENE_SIZE[1] // tile.shape[1]), 1)
+    colours = np.tile(tile, repeats)[: SCENE_SIZE[0], : SCENE_SIZE[1]]
+    readings = (view * colours).sum(axis=2)
+    return PtpCameraSimulator(
+        lambda exposure_s: noise.expose_dn(readings, exposure_s, 1.0, rng),
+        clock,
+        sensor.cfa_name,
+        noise.black_level_dn,
+        noise.white_level_dn,
+        exposures=THIRD_STOPS,
+    )

@@ -6,6 +6,7 @@ pixels are usable, with the imaging matrix beside them.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from emmc_rig.scene import open_scene
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
 from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress
+from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
 
 FRAMES, PSI, LIGHT_FIELD = "frames.h5", "psi.h5", "light_field.h5"
 
@@ -67,16 +69,16 @@ def read_capture(folder: Path) -> Capture:
     return Capture(readings, sigma, usable)
 
 
-def open_dictionary(spec: str | None, psi: ImagingMatrix) -> Dictionary:
+def open_dictionary(spec: str | None, views: tuple[int, int], binning: int) -> Dictionary:
     """Return a dictionary by file, or by the name of one that needs no training.
 
     None takes `lambertian`. Those made here have patches of 9 x 9 samples, or the nearest
     multiple of the pixels' k below.
     """
     if spec in (None, "lambertian", "dct"):
-        side = 9 // psi.binning * psi.binning or psi.binning
+        side = 9 // binning * binning or binning
         make = dct_dictionary if spec == "dct" else lambertian_dictionary
-        return make(psi.light_field_shape[:2], (side, side))
+        return make(views, (side, side))
     return Dictionary.load(spec)
 
 
@@ -105,7 +107,8 @@ def run_reconstruct(
     needs_dictionary = find_method(method).needs_dictionary
     capture = read_capture(folder)
     psi = ImagingMatrix.load(psi_path or folder / PSI)
-    dictionary = open_dictionary(dictionary_spec, psi) if needs_dictionary else None
+    views = psi.light_field_shape[:2]
+    dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
     result = reconstruct(
         method,
         psi,
@@ -140,5 +143,59 @@ def run_reconstruct(
         metrics["replicate_psnr_db"] = psnr_db(replicate_centre(true), true)
     save_hdf5(out / LIGHT_FIELD, result.light_field, {"method": result.method})
     export_pictures(out / "pictures", result.light_field, focus_disparities(result.light_field))
+    write_metrics(out, metrics)
+    return metrics
+
+
+def run_in_tiles(
+    folder: Path,
+    out: Path,
+    method: str,
+    tile: int,
+    psi_path: Path | None = None,
+    dictionary_spec: str | None = None,
+    settings: MethodSettings | None = None,
+    on_tile: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Reconstruct a folder's frames tile by tile into light_field.h5; return the metrics.
+
+    For captures that do not fit into memory: writes no pictures. The arguments are those of
+    `run_reconstruct`; tile: samples a side.
+    """
+    needs_dictionary = find_method(method).needs_dictionary
+    capture = read_capture(folder)
+    psi = SavedPsi(psi_path or folder / PSI)
+    views = psi.window(slice(0, psi.binning), slice(0, psi.binning)).light_field_shape[:2]
+    dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
+    started = time.perf_counter()
+    with h5py.File(out / LIGHT_FIELD, "w") as file:
+        dataset = file.create_dataset("light_field", (*views, *psi.size, 3), "f4")
+        dataset.attrs["method"] = method
+        results = reconstruct_in_tiles(
+            method,
+            psi,
+            capture.readings,
+            capture.noise_sigma,
+            dataset,
+            dictionary,
+            settings,
+            capture.usable,
+            tile,
+            on_tile=on_tile,
+        )
+    metrics = {
+        "method": method,
+        "status": "in tiles",
+        "advice": "",
+        "tiles": len(results),
+        "tile": tile,
+        "seconds": time.perf_counter() - started,
+        "parameters": results[0].parameters if results else {},
+        "noise_sigma": capture.noise_sigma,
+        "size": list(psi.size),
+        "psi_sha256": psi.checksum,
+        "command": command_line(),
+        "versions": versions(),
+    }
     write_metrics(out, metrics)
     return metrics

@@ -30,7 +30,7 @@ SL0_RIDGE = 1e-5
 class BPDNSettings(Settings):
     """Which solver, and when it stops; None lets noise and data choose."""
 
-    method: Method = "admm"
+    method: Method = "lars"
     penalty: float | None = Field(
         default=None, gt=0, description="eta, in units of readings times a sensed atom's norm"
     )

@@ -23,6 +23,7 @@ DEPENDENT = 1e-3
 DARKEST = 1e-6
 """Sensed atoms weaker than this, against the strongest, are dark and never chosen."""
 REFRESH = 25
+NEVER = 1e30
 POWER_STEPS = 40
 POWER_MARGIN = 1.02
 
@@ -497,6 +498,22 @@ def omp(atoms, data, most, tolerance, code):
     return used, left
 
 
+@njit(cache=True, fastmath=True, nogil=True)
+def _join_steps(correlation, slope, blocked, level, out):
+    """Set out (atom,) to the step at which each joins, if not blocked; return the least.
+
+    An atom joins at the level, which falls by the step, its correlation by step times slope.
+    """
+    least = np.float32(NEVER)
+    one, tiny = np.float32(1), np.float32(1e-9)
+    for j in range(out.size):
+        up = (level - correlation[j]) / max(one - slope[j], tiny)
+        down = (level + correlation[j]) / max(one + slope[j], tiny)
+        out[j] = min(up, down) + blocked[j]
+        least = min(least, out[j])
+    return least
+
+
 @njit(cache=True, nogil=True)
 def lars(atoms, data, eta, max_steps, code):
     """Follow the minimiser of eq. 8 from the largest penalty down to eta; return the steps.
@@ -509,7 +526,8 @@ def lars(atoms, data, eta, max_steps, code):
     code[:] = 0
     correlation = np.empty(count, np.float32)
     slope = np.empty(count, np.float32)
-    state = np.zeros(count, np.int8)
+    joins = np.empty(count, np.float32)
+    blocked = np.zeros(count, np.float32)
     lower = np.zeros((room + 1, room + 1))
     rows = np.empty((room + 1, length))
     chosen = np.empty(room + 1, np.int64)
@@ -534,10 +552,9 @@ def lars(atoms, data, eta, max_steps, code):
                 chosen[used] = joining
                 signs[used] = 1.0 if correlation[joining] > 0 else -1.0
                 weights[used] = 0.0
-                state[joining] = 1
                 used += 1
-            else:
-                state[joining] = -1
+            # Inside now, or never: it adds nothing to the atoms inside.
+            blocked[joining] = NEVER
         _solve(lower, used, signs, direction)
         toward[:] = 0
         for i in range(used):
@@ -546,15 +563,17 @@ def lars(atoms, data, eta, max_steps, code):
         reach = level - eta
         joining = NONE
         leaving = NONE
-        for j in range(count):
-            if state[j] == 0 and j != just_left:
-                for sign in (1.0, -1.0):
-                    closing = 1.0 - sign * slope[j]
-                    if closing > 1e-9:
-                        step = (level - sign * correlation[j]) / closing
-                        if step < reach:
-                            reach = max(step, 0.0)
-                            joining = j
+        if just_left != NONE:
+            blocked[just_left] = NEVER
+        nearest = _join_steps(correlation, slope, blocked, np.float32(level), joins)
+        if nearest < reach:
+            for j in range(count):
+                if joins[j] == nearest:
+                    joining = j
+                    break
+            reach = max(np.float64(nearest), 0.0)
+        if just_left != NONE:
+            blocked[just_left] = 0
         for i in range(used):
             if weights[i] * direction[i] < 0:
                 step = -weights[i] / direction[i]
@@ -575,7 +594,7 @@ def lars(atoms, data, eta, max_steps, code):
         just_left = NONE
         if leaving != NONE:
             just_left = chosen[leaving]
-            state[just_left] = 0
+            blocked[just_left] = 0
             used -= 1
             for i in range(leaving, used):
                 chosen[i], signs[i], weights[i] = chosen[i + 1], signs[i + 1], weights[i + 1]

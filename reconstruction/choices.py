@@ -1,4 +1,4 @@
-"""What the data choose where the settings do not: mu, the primal step and the light field to begin with."""
+"""What the data choose where the settings do not: mu, the primal step, where to begin."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.differences import norm_squared
 from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
@@ -38,9 +39,16 @@ def relative_mu(noise: float, spread: float, order: int) -> float:
     return max(SMALLEST_RELATIVE_MU, 0.68 * spread * noise**1.5)
 
 
-def choose_primal_step(contrast: float, mu: float, chroma_weight: float) -> float:
-    """Return gamma: the light field's contrast over mu, as `contrast` measures it."""
-    return 0.18 * contrast / mu / max(1.0, chroma_weight)
+def choose_primal_step(contrast: float, mu: float, chroma_weight: float, order: int = 1) -> float:
+    """Return gamma: the light field's contrast over mu, as `contrast` measures it.
+
+    For higher orders less, by the norms of their derivatives: the dual variable moves that much
+    the light field. Of factors 0.01, 0.03, 0.1 and 0.3 on crops of two real light fields, 0.1 to
+    0.3 led after 200 steps for K = 2 (here 0.32) and 0.03 to 0.1 for K = 3 (here 0.11).
+    """
+    endless = (None,) * 4
+    stretch = np.sqrt(norm_squared(order, endless) / norm_squared(1, endless))
+    return float(0.18 * contrast / mu / max(1.0, chroma_weight) / stretch)
 
 
 def contrast(guess: Array) -> float:

@@ -25,7 +25,6 @@ _CHUNK_BYTES = 1 << 20
 
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Luminance and two chrominances (opponent colour, RGB), orthonormal."""
-DISPARITIES = tuple(float(d) for d in np.arange(-2, 2.1, 0.5))
 _BLUR_PX, _CHROMA_BLUR_PX = 0.7, 1.0
 _SAME = 0.995
 
@@ -147,9 +146,9 @@ class Dictionary:
                         f"{path}: not a dictionary of this program (format {found!r}, "
                         f"needs {FORMAT!r}); `emmc-rig train` makes one"
                     )
-                atoms, kind = file["atoms"][()], file.attrs["kind"]
-                provenance = file["provenance"].asstr()[()]
-        except (OSError, RuntimeError, KeyError, AttributeError, TypeError) as fault:
+                atoms, kind = np.asarray(file["atoms"]), str(file.attrs["kind"])
+                provenance = np.asarray(file["provenance"]).item().decode("utf-8")
+        except (OSError, RuntimeError, KeyError, AttributeError, ValueError) as fault:
             raise DictionaryError(
                 f"{path}: damaged or cut short ({_one_line(fault)}); copy it again or train anew"
             ) from fault
@@ -222,7 +221,7 @@ def dct_dictionary(
 def lambertian_dictionary(
     views: tuple[int, int],
     patch: tuple[int, int],
-    disparities: Sequence[float] = DISPARITIES,
+    disparities: Sequence[float] | None = None,
     colours: int = 3,
 ) -> Dictionary:
     """Return textures on planes: texture(y - d (v - V // 2), x - d (u - U // 2)), in one colour.
@@ -235,7 +234,7 @@ def lambertian_dictionary(
     Args:
         views: rows and columns of views.
         patch: rows and columns of pixels.
-        disparities: of the planes; steps of half a pixel for 5x5 views.
+        disparities: of the planes; default `plane_disparities`.
         colours: 3, or 1 for the luminance alone.
 
     Raises:
@@ -243,9 +242,10 @@ def lambertian_dictionary(
             share nothing with the centre; other colours than 1 or 3; an axis of no samples.
     """
     _check_patch(views, patch, colours)
+    if disparities is None:
+        disparities = plane_disparities(views, patch)
     planes = np.unique(np.asarray(disparities, dtype=float))
-    reach = max(max(n // 2, 1) for n in views)
-    largest = max(patch) / reach
+    largest = max(patch) / _reach(views)
     if planes.size == 0 or not np.isfinite(planes).all() or np.abs(planes).max() > largest:
         raise DictionaryError(
             f"disparities {tuple(disparities)}: needs one or more, finite, within "
@@ -265,6 +265,22 @@ def lambertian_dictionary(
         ]
         sets += [_distinct([_flat(views, patch), *soft])] * 2
     return Dictionary.normalised(_coloured(sets), "lambertian")
+
+
+def plane_disparities(views: tuple[int, int], patch: tuple[int, int]) -> tuple[float, ...]:
+    """Return disparities in steps of a pixel in the outermost view, +-2 or what a patch can show.
+
+    An outermost view is to share half a patch with the centre. For 5x5 views of 9x9 pixels:
+    -2, -1.5, ... 2 pixels per view step.
+    """
+    step = 1 / _reach(views)
+    last = int(min(2 / step, max(patch) / 2))
+    return tuple(step * i for i in range(-last, last + 1))
+
+
+def _reach(views: tuple[int, int]) -> int:
+    """Return how many steps the outermost view is from the centre view."""
+    return max(max(views) // 2, 1)
 
 
 def _check_patch(views: tuple[int, int], patch: tuple[int, int], colours: int) -> None:
@@ -318,7 +334,7 @@ def _line(blur_px: float) -> Callable[[NDArray], NDArray]:
 
 def _offsets(reach_px: float, step_px: float) -> NDArray[np.float64]:
     last = int(reach_px / step_px)
-    return step_px * np.arange(-last, last + 1)
+    return np.arange(-last, last + 1, dtype=np.float64) * step_px
 
 
 def _ridges(

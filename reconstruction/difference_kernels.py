@@ -52,10 +52,9 @@ def gradient(light_field, stencils, colours, out):
                     line = out[index, v, u, y]
                     for tap in range(begin[index], begin[index + 1]):
                         dx, dy, du, dv = offset[tap]
-                        source = light_field[v + dv, u + du, y + dy]
-                        shift = dx * colours
+                        source = light_field[v + dv, u + du, y + dy][dx * colours :]
                         for x in range(inside):
-                            line[x] += factor[tap] * source[x + shift]
+                            line[x] += factor[tap] * source[x]
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -75,9 +74,9 @@ def adjoint(derivatives, stencils, colours, out):
                             continue
                         if _fits(out.shape, reach[index], v - dv, u - du, y - dy):
                             source = derivatives[index, v - dv, u - du, y - dy]
-                            shift = dx * colours
+                            moved = line[dx * colours :]
                             for x in range(inside):
-                                line[x + shift] += factor[tap] * source[x]
+                                moved[x] += factor[tap] * source[x]
 
 
 @njit(cache=True, fastmath=True)
@@ -91,14 +90,14 @@ def _differentiate(light_field, stencils, index, v, u, y, out):
     line = out.reshape(-1)
     for tap in range(begin[index], begin[index + 1]):
         dx, dy, du, dv = offset[tap]
-        source = light_field[v + dv, u + du, y + dy]
+        source = light_field[v + dv, u + du, y + dy][dx:]
         scale = factor[tap]
         if tap == begin[index]:
-            for x in range(line.size):
+            for x in range(source.size):
                 line[x] = scale * source[x]
         else:
-            for x in range(line.size - dx):
-                line[x] += scale * source[x + dx]
+            for x in range(source.size):
+                line[x] += scale * source[x]
     out[:, out.shape[1] - reach[index, 0] :] = 0
 
 
@@ -119,8 +118,9 @@ def _descend(light_field, dual, stencils, step, back, v, u, y, out):
             if _fits(dual.shape, reach[index], v - dv, u - du, y - dy):
                 source = dual[v - dv, u - du, y - dy, index]
                 scale = factor[tap]
-                for x in range(line.size - dx):
-                    line[x + dx] += scale * source[x]
+                moved = line[dx:]
+                for x in range(moved.size):
+                    moved[x] += scale * source[x]
     mix(back, out)
     row = light_field[v, u, y].reshape(-1)
     for x in range(line.size):

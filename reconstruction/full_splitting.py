@@ -123,7 +123,7 @@ def reconstruct_full_splitting(
     smooth = (psi.norm**2 + (rho * patch_term.norm if patch_term is not None else 0.0)) / 2
     differences = spread * norm_squared(order, psi.light_field_shape)
     guess = smooth_guess(psi, data, usable)
-    wanted = choose_primal_step(contrast(guess), max(mu, 1e-12), settings.chroma_weight)
+    wanted = choose_primal_step(contrast(guess), max(mu, 1e-12), settings.chroma_weight, order)
     sizes = step_sizes(smooth, differences, settings.gamma, settings.tau, wanted)
     begin = first_light_field(psi, guess, patch_term) if start is None else start
     light_field = np.array(begin, dtype=dtype)

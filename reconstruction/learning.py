@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import get_num_threads, njit
@@ -41,21 +42,26 @@ class LearningSettings(Settings):
     power_iterations: int = Field(
         default=2, ge=1, description="alternating projections of each atom's rank-1 update"
     )
-    fewest_uses: int = Field(default=1, ge=0, description="atoms used less are replaced")
+    least_use: float = Field(
+        default=0.1, ge=0, lt=1, description="atoms used less, of the mean use, are replaced"
+    )
     largest_coherence: float = Field(
-        default=0.99, gt=0, le=1, description="of two atoms nearer than this one is replaced"
+        default=0.98, gt=0, le=1, description="of two atoms nearer than this one is replaced"
     )
     seed: int = Field(default=0, ge=0)
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """One step: root mean square errors per sample after coding and after the atoms' update."""
+    """One step: atoms put anew, then errors per sample after coding and the atoms' update.
+
+    The errors are root mean squares; updated_rmse is None where the method does not evaluate it.
+    """
 
     step: int
-    coded_rmse: float
-    updated_rmse: float
     replaced: int
+    coded_rmse: float
+    updated_rmse: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +100,7 @@ def first_state(
     patches: (patch, sample). Raises DictionaryError for patches too few, of another size, not
     finite, or with too few that differ from the fixed atoms.
     """
-    _check(patches, settings, patch_shape)
+    check_patches(patches, settings, patch_shape)
     fixed = fixed_atoms(settings, patch_shape)
     wanted = settings.atoms - len(fixed)
     order = np.random.default_rng(settings.seed).permutation(len(patches))
@@ -123,21 +129,21 @@ def first_state(
 def ksvd_step(
     state: LearningState, patches: Array, settings: LearningSettings, fixed: int
 ) -> LearningState:
-    """Return the state after sparse coding, the update of every atom and replacements.
+    """Return the state after replacements, sparse coding, and the update of every atom.
 
     fixed: how many of the first atoms stay. A patch keeps its old code where the new one is no
-    better, so that the error never rises in the coding; it never rises in the update either.
+    better, so that the error never rises in the coding; it never rises in the update either. A
+    replaced atom leaves the codes that used it, so only a replacement may raise the error.
     """
+    state, replaced = _replace_atoms(state, patches, settings, fixed)
     indices, coefficients = batch_omp(state.atoms, patches, settings.sparsity)
     residuals = np.empty_like(patches)
     errors = _keep_better(state, patches, indices, coefficients, residuals)
     coded_rmse = float(np.sqrt(errors.sum() / patches.size))
     atoms = state.atoms.copy()
     _update_atoms(atoms, indices, coefficients, residuals, settings.power_iterations, fixed)
-    errors = _squares(residuals)
-    updated_rmse = float(np.sqrt(errors.sum() / patches.size))
-    replaced = _replace_atoms(atoms, indices, coefficients, residuals, errors, settings, fixed)
-    done = Iteration(len(state.history) + 1, coded_rmse, updated_rmse, replaced)
+    updated_rmse = float(np.sqrt(squared_norms(residuals).sum() / patches.size))
+    done = Iteration(len(state.history) + 1, replaced, coded_rmse, updated_rmse)
     return LearningState(atoms, indices, coefficients, (*state.history, done))
 
 
@@ -161,7 +167,7 @@ def learn_ksvd(
     Raises:
         DictionaryError: as `first_state`; or a `start` of other patches or settings.
     """
-    _check(patches, settings, patch_shape)
+    check_patches(patches, settings, patch_shape)
     state = start or first_state(patches, settings, patch_shape)
     shapes = (settings.atoms, patches.shape[1]), (len(patches), settings.sparsity)
     if (state.atoms.shape, state.indices.shape) != shapes:
@@ -174,16 +180,8 @@ def learn_ksvd(
     return state
 
 
-def without_unused(state: LearningState, fixed: int) -> LearningState:
-    """Return the state with the atoms that no patch uses left out, the fixed ones apart."""
-    uses = np.bincount(state.indices[state.indices >= 0], minlength=len(state.atoms))
-    kept = (uses > 0) | (np.arange(len(uses)) < fixed)
-    place = np.where(kept, np.cumsum(kept) - 1, NO_ATOM).astype(np.int32)
-    indices = np.where(state.indices >= 0, place[state.indices], NO_ATOM).astype(np.int32)
-    return replace(state, atoms=state.atoms[kept], indices=indices)
-
-
-def _check(patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]) -> None:
+def check_patches(patches: Array, settings: LearningSettings, patch_shape: tuple[int, ...]) -> None:
+    """Raise DictionaryError for patches that cannot be learnt from with these settings."""
     if patches.ndim != 2 or patches.shape[1] != np.prod(patch_shape):
         raise DictionaryError(
             f"training patches of shape {patches.shape}: needs (patch, {np.prod(patch_shape)})"
@@ -198,7 +196,7 @@ def _check(patches: Array, settings: LearningSettings, patch_shape: tuple[int, .
         raise DictionaryError(f"a sparsity of {settings.sparsity}, but {settings.atoms} atoms")
     if settings.flat_atoms and settings.atoms <= patch_shape[-1]:
         raise DictionaryError(f"{settings.atoms} atoms: more than the {patch_shape[-1]} flat ones")
-    if not np.isfinite(_squares(patches)).all():
+    if not np.isfinite(squared_norms(patches)).all():
         raise DictionaryError("training patches hold values that are not finite: leave them out")
 
 
@@ -215,6 +213,13 @@ def _residual(atoms, patch, indices, coefficients, out):
     for i in range(out.size):
         total += np.float64(out[i]) * out[i]
     return total
+
+
+@njit(cache=True, nogil=True)
+def _errors_of_rows(atoms, patches, indices, coefficients, errors):
+    spare = np.empty(patches.shape[1], patches.dtype)
+    for row in range(len(patches)):
+        errors[row] = _residual(atoms, patches[row], indices[row], coefficients[row], spare)
 
 
 @njit(cache=True, nogil=True)
@@ -261,7 +266,7 @@ def _keep_better(
     return errors
 
 
-def _squares(rows: Array) -> NDArray[np.float64]:
+def squared_norms(rows: Array) -> NDArray[np.float64]:
     """Return the squared norm of every row, summed in float64 in small parts."""
     parts = [
         np.einsum("ij,ij->i", part, part, dtype=np.float64)
@@ -329,39 +334,52 @@ def _update_atoms(
 
 
 def _replace_atoms(
-    atoms: Array,
-    indices: NDArray[np.int32],
-    coefficients: Array,
-    residuals: Array,
-    errors: NDArray[np.float64],
-    settings: LearningSettings,
-    fixed: int,
-) -> int:
-    """Put residuals of the worst patches in place of atoms little used or doubled; return count.
+    state: LearningState, patches: Array, settings: LearningSettings, fixed: int
+) -> tuple[LearningState, int]:
+    """Put what is left of the worst patches in place of poor atoms; return how many."""
+    used = state.indices >= 0
+    if not used.any():
+        return state, 0
+    uses = np.bincount(state.indices[used], minlength=len(state.atoms))
+    poor = poor_atoms(state.atoms, uses, settings, fixed)
+    if not poor.size:
+        return state, 0
+    errors = np.empty(len(patches))
 
-    A replaced atom leaves the codes that used it, which are then a little worse until the next
-    coding.
-    """
-    uses = np.bincount(indices[indices >= 0], minlength=len(atoms))
-    poor = uses < settings.fewest_uses
-    poor |= _doubled(atoms, uses, settings.largest_coherence)
+    def rows(band: tuple[int, int]) -> None:
+        part = slice(*band)
+        codes = state.indices[part], state.coefficients[part]
+        _errors_of_rows(state.atoms, patches[part], *codes, errors[part])
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        list(pool.map(rows, bands(len(patches))))
+    worst = np.argsort(-errors, kind="stable")[: len(poor)]
+    worst = worst[errors[worst] > 0]
+    poor = poor[: len(worst)]
+    atoms = state.atoms.copy()
+    for place, row in zip(poor, worst, strict=True):
+        taken = used[row]
+        left = (
+            patches[row] - state.coefficients[row, taken] @ state.atoms[state.indices[row, taken]]
+        )
+        atoms[place] = left / np.linalg.norm(left)
+    gone = np.isin(state.indices, poor)
+    indices = np.where(gone, np.int32(NO_ATOM), state.indices)
+    coefficients = np.where(gone, np.float32(0), state.coefficients)
+    return LearningState(atoms, indices, coefficients, state.history), len(poor)
+
+
+def poor_atoms(
+    atoms: Array, uses: NDArray[Any], settings: LearningSettings, fixed: int
+) -> NDArray[np.intp]:
+    """Return the places of atoms hardly used, and of those a more used one makes superfluous."""
+    poor = uses < settings.least_use * uses.mean()
+    poor |= doubled_atoms(atoms, uses, settings.largest_coherence)
     poor[:fixed] = False
-    places = np.flatnonzero(poor)
-    if not places.size:
-        return 0
-    worst = np.argsort(errors, kind="stable")[::-1][: len(places)]
-    places = places[: len(worst)]
-    spoilt = np.isin(indices, places)
-    indices[spoilt] = NO_ATOM
-    coefficients[spoilt] = 0
-    norms = np.sqrt(errors[worst])
-    for place, row, norm in zip(places, worst, norms, strict=True):
-        if norm > 0:
-            atoms[place] = residuals[row] / norm
-    return len(places)
+    return np.flatnonzero(poor)
 
 
-def _doubled(atoms: Array, uses: NDArray[np.int64], largest_coherence: float) -> NDArray[np.bool_]:
+def doubled_atoms(atoms: Array, uses: NDArray[Any], largest_coherence: float) -> NDArray[np.bool_]:
     """Say of every atom whether a more used one (of equals the earlier) is nearly the same."""
     rank = np.empty(len(atoms), np.int64)
     rank[np.argsort(-uses, kind="stable")] = np.arange(len(atoms))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,3 +36,8 @@ class Reconstruction:
     objective: tuple[tuple[int, float], ...]
     seconds: float
     parameters: dict[str, float]
+
+    def without_light_field(self) -> Reconstruction:
+        """Return the result with an empty light field, to keep many."""
+        empty = np.empty((0, 0, 0, 0, 3), dtype=np.float32)
+        return replace(self, light_field=empty)

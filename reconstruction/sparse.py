@@ -54,7 +54,7 @@ class SparseSettings(Settings):
 
     stride: int = Field(default=5, ge=1, description="samples between patches")
     flat_favour: float = Field(
-        default=30.0, ge=1, description="flat atoms cost this many times less than others"
+        default=8.0, ge=1, description="flat atoms cost this many times less than others"
     )
     aggregation: Literal["flat", "hann"] = "flat"
     solver: bpdn.BPDNSettings = Field(default_factory=bpdn.BPDNSettings)

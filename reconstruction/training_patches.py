@@ -112,11 +112,11 @@ def training_patches(
     count = settings.count * settings.candidates_per_patch
     edges = np.linspace(0, count, len(scenes) + 1).astype(np.int64)
     energies = np.empty(count)
-    kind: tuple[int, ...] = ()
+    kind = (0, 0, 0)
     for number, scene in enumerate(scenes):
         light_field = scene()
-        found = (*light_field.shape[:2], light_field.shape[4])
-        kind = kind or found
+        found = light_field.shape[0], light_field.shape[1], light_field.shape[4]
+        kind = kind if number else found
         _check(light_field, number, found, kind, settings)
         filled = edges[number]
         for batch in _candidates(light_field, number, edges, settings):
@@ -147,8 +147,8 @@ def training_patches(
 def _check(
     light_field: Array,
     number: int,
-    found: tuple[int, ...],
-    kind: tuple[int, ...],
+    found: tuple[int, int, int],
+    kind: tuple[int, int, int],
     settings: PatchSettings,
 ) -> None:
     height, width = light_field.shape[2:4]

@@ -1,16 +1,22 @@
-"""4D total variation with the exact data step: min 1/2 |Psi L - I|^2 + mu TV(L).
+"""DV_K and patches with the exact data step, by default total variation: the paper's eq. 9.
 
-TV is the paper's colour-coupled spatio-angular DV_1 (Section VI-B, K = 1), with one liberty: the
+min 1/2 |Psi L - I|^2 + mu DV_K(L) + rho/2 sum W |L - M|^2, the last being what a collection of
+patches asks for (see `patch_term`), if one is given. DV_K is the paper's colour-coupled
+spatio-angular differential (Section VI-B; K = 1: total variation), with one liberty: the
 differences are measured in opponent colours (luminance and two chrominances, orthonormal), and
 those of the chrominances count `chroma_weight` times. Colours vary less than brightness, so this
-resolves what mask and CFA leave ambiguous; a weight of 1 is the paper's DV_1 exactly.
+resolves what mask and CFA leave ambiguous; a weight of 1 is the paper's DV_K exactly.
 
 The algorithm is over-relaxed primal-dual splitting (Condat 2013, algorithm 3.1) with the proximal
-step of the whole data term, z - Psi^T (Psi Psi^T + 1/gamma)^-1 (Psi z - I), one small block per
-pixel; the paper's eq. 10-13 take its gradient instead and need thousands of steps.
+step of frames and patches together: with a = 1/gamma + rho W and q what the dual variable descends
+to, z = (q / gamma + rho W M) / a, then z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I), one small block
+per pixel. The paper's eq. 10-13 (`full_splitting`) take gradients instead.
 
 Bytes of one step, float32, for N = v u y x c values, one stored colour of three and s shots:
-light field read and written 2 x 4N, dual variable read and written 2 x 16N, weights s x 4N/3.
+light field read and written 2 x 4N, dual variable read and written 2 x 16N, weights s x 4N/3; with
+patches their target read, 4N. Of DV_2 the dual variable is 10/4 as large, of DV_3 20/4, and a
+light field more is written, 4N; they are bound by operations, 2 x 36 and 2 x 120 multiplications
+and additions per value.
 """
 
 from __future__ import annotations
@@ -99,6 +105,8 @@ def reconstruct_tv(
     """
     settings = settings or TVSettings()
     started = clock()
+    if settings.rho == 0:
+        patch_term = None
     check(psi, frames, noise_sigma, usable, patch_term, start)
     if usable is None:
         usable = np.ones(psi.frames_shape, dtype=bool)
@@ -162,7 +170,7 @@ def _sweep(
     total = 1 / gamma + pull
     inverse = psi.solver(np.where(problem.usable, total, np.inf)).inverse
     fit = kernels.Data(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
-    if problem.patch_term is not None and problem.rho > 0:
+    if problem.patch_term is not None:
         share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
         pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
         fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))

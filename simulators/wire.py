@@ -1,15 +1,26 @@
-"""Wires to simulated firmware: one in memory, one a pseudo-terminal that pyserial can open."""
+"""Wires to simulated firmware: in memory, on a pseudo-terminal that pyserial can open, on TCP."""
 
 import os
 import select
+import socket
 import threading
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, suppress
+from pathlib import Path
+from typing import Any, Protocol, Self
 
 from drivers.clock import Clock
-from drivers.errors import PortGoneError, TransportTimeoutError
+from drivers.errors import (
+    GarbledReplyError,
+    PortGoneError,
+    PortNotFoundError,
+    TransportTimeoutError,
+)
+from drivers.transport import QUIET_LIMIT
 
 READ_SIZE = 4096
+TICK_S = 0.002
+"""How often a server looks for what fell due by itself."""
 
 
 class Firmware(Protocol):
@@ -20,13 +31,26 @@ class Firmware(Protocol):
         """Whether the wire has been pulled."""
         ...
 
+    @property
+    def plugs(self) -> int:
+        """How often the wire has been plugged in."""
+        ...
+
     def feed(self, data: bytes) -> bytes:
-        """Take bytes from the host and return the bytes that answer them, if any."""
+        """Take bytes from the host; return those that fell due for the host by now."""
+        ...
+
+    def due(self) -> bytes:
+        """Return the bytes that fell due for the host by now."""
+        ...
+
+    def next_due_s(self) -> float | None:
+        """Return when something may next fall due, if anything will."""
         ...
 
 
 class MemoryTransport:
-    """A `drivers.transport.Transport` that ends in firmware; timing out costs simulated time."""
+    """A `drivers.transport.Transport` that ends in firmware; waiting costs simulated time."""
 
     port = "simulator"
 
@@ -36,6 +60,7 @@ class MemoryTransport:
         self._timeout_s = timeout_s
         self._lock = threading.RLock()
         self._unread = bytearray()
+        self._plugs = firmware.plugs
         self._closed = False
 
     @property
@@ -52,51 +77,129 @@ class MemoryTransport:
     def read_until(self, terminator: bytes) -> bytes:
         """Return bytes up to and including `terminator`; or raise `TransportTimeoutError`."""
         with self._lock:
+            deadline_s = self._clock.now_s() + self._timeout_s
             self._require_open()
-            end = self._unread.find(terminator)
-            if end < 0:
-                self._clock.sleep(self._timeout_s)
-                raise TransportTimeoutError(self.port, self._timeout_s, bytes(self._unread))
-            end += len(terminator)
-            message = bytes(self._unread[:end])
-            del self._unread[:end]
-            return message
+            while (end := self._unread.find(terminator)) < 0:
+                self._wait(deadline_s)
+            return self._take(end + len(terminator))
+
+    def read_exactly(self, count: int) -> bytes:
+        """Return the next `count` bytes; or raise `TransportTimeoutError`."""
+        with self._lock:
+            deadline_s = self._clock.now_s() + self._timeout_s
+            self._require_open()
+            while len(self._unread) < count:
+                self._wait(deadline_s)
+            return self._take(count)
+
+    def waiting(self) -> int:
+        """Return how many bytes can be read at once; raises `PortGoneError`."""
+        with self._lock:
+            self._require_open()
+            self._unread += self._firmware.due()
+            return len(self._unread)
 
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
         with self._lock:
             self._require_open()
+            self._firmware.due()
             self._unread.clear()
+
+    def discard_until_quiet(self) -> None:
+        """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
+        with self._lock:
+            for _ in range(QUIET_LIMIT):
+                self.discard_input()
+                try:
+                    last = self.read_exactly(1)
+                except TransportTimeoutError:
+                    return
+            raise GarbledReplyError(last, f"{self.port} never falls silent")
+
+    def reopen(self) -> None:
+        """Open the wire again; raises `PortNotFoundError` while it is pulled."""
+        with self._lock:
+            if self._firmware.unplugged:
+                raise PortNotFoundError(self.port)
+            self._unread.clear()
+            self._plugs = self._firmware.plugs
+            self._closed = False
 
     def close(self) -> None:
         """Let go of the wire; closing twice is allowed."""
         self._closed = True
 
+    def _wait(self, deadline_s: float) -> None:
+        """Let time pass until something may have arrived; raises at the deadline."""
+        arrived = self._firmware.due()
+        self._unread += arrived
+        self._require_open()
+        if arrived:
+            return
+        now_s = self._clock.now_s()
+        next_s = self._firmware.next_due_s()
+        if next_s is None or not now_s < next_s < deadline_s:
+            self._clock.sleep(max(deadline_s - now_s, 0.0))
+            arrived = self._firmware.due()
+            self._unread += arrived
+            if not arrived:
+                raise TransportTimeoutError(self.port, self._timeout_s, bytes(self._unread))
+        else:
+            self._clock.sleep(next_s - now_s)
+
+    def _take(self, count: int) -> bytes:
+        message = bytes(self._unread[:count])
+        del self._unread[:count]
+        return message
+
     def _require_open(self) -> None:
-        if self._closed or self._firmware.unplugged:
+        if self._closed or self._firmware.unplugged or self._firmware.plugs != self._plugs:
             raise PortGoneError(self.port)
 
 
-class PtyServer:
-    """Serves firmware on a pseudo-terminal, in a thread, while its `with` block lasts.
+class _Server(ABC):
+    """Serves firmware in a thread while its `with` block lasts.
 
-    `port` is the name to open. Pulling the plug (`firmware.unplugged`) closes it under the
-    reader's feet. POSIX only.
+    `port` is the name to open. Pulling the plug closes it under the reader's feet; plugging in
+    again opens a new one.
     """
 
     def __init__(self, firmware: Firmware) -> None:
-        self._firmware = firmware
         self.port = ""
-
-    def __enter__(self) -> "PtyServer":
-        # Windows has no pseudo-terminals; the wire in memory must import there too.
-        import tty
-
-        self._device, self._line = os.openpty()
-        tty.setraw(self._line)
-        self.port = os.ttyname(self._line)
+        self._firmware = firmware
         self._wake_read, self._wake_write = os.pipe()
-        self._thread = threading.Thread(target=self._serve, name=f"pty {self.port}", daemon=True)
+        self._opened = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port can be opened now."""
+        return self._opened
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Make the port exist and note its name."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Make the port go away."""
+
+    @abstractmethod
+    def _sources(self) -> list[Any]:
+        """Return what to wait on for bytes from the host."""
+
+    @abstractmethod
+    def _read(self, source: Any) -> bytes:
+        """Return bytes from the host, none when there are none after all."""
+
+    @abstractmethod
+    def _write(self, data: bytes) -> None:
+        """Send bytes to the host, if there is one."""
+
+    def __enter__(self) -> Self:
+        self._open()
+        self._opened = True
+        self._thread = threading.Thread(target=self._serve, name=f"serve {self.port}", daemon=True)
         self._thread.start()
         return self
 
@@ -108,13 +211,113 @@ class PtyServer:
 
     def _serve(self) -> None:
         try:
-            while not self._firmware.unplugged:
-                ready, _, _ = select.select([self._device, self._wake_read], [], [])
+            while True:
+                self._follow_plug()
+                sources = self._sources() if self._opened else []
+                ready, _, _ = select.select([*sources, self._wake_read], [], [], TICK_S)
                 if self._wake_read in ready:
                     return
-                answer = self._firmware.feed(os.read(self._device, READ_SIZE))
-                while answer:
-                    answer = answer[os.write(self._device, answer) :]
+                answer = b""
+                for source in ready:
+                    data = self._read(source)
+                    if data:
+                        answer += self._firmware.feed(data)
+                self._follow_plug()
+                answer += self._firmware.due()
+                if self._opened and answer:
+                    self._write(answer)
         finally:
-            os.close(self._device)
-            os.close(self._line)
+            if self._opened:
+                self._close()
+
+    def _follow_plug(self) -> None:
+        plugged = not self._firmware.unplugged
+        if self._opened and not plugged:
+            self._opened = False
+            self._close()
+        elif plugged and not self._opened:
+            self._open()
+            self._opened = True
+
+
+class PtyServer(_Server):
+    """Serves firmware on a pseudo-terminal; its name changes after an unplug, as a USB port's may.
+
+    `link` is a path that always leads to it, as /dev/serial/by-id does. POSIX only.
+    """
+
+    def __init__(self, firmware: Firmware, link: Path | None = None) -> None:
+        super().__init__(firmware)
+        self._link = link
+
+    def _open(self) -> None:
+        # Windows has no pseudo-terminals; the wire in memory must import there too.
+        import tty
+
+        self._device, self._line = os.openpty()
+        tty.setraw(self._line)
+        self.port = os.ttyname(self._line)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self.port)
+
+    def _close(self) -> None:
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        os.close(self._device)
+        os.close(self._line)
+
+    def _sources(self) -> list[Any]:
+        return [self._device]
+
+    def _read(self, source: Any) -> bytes:
+        return os.read(self._device, READ_SIZE)
+
+    def _write(self, data: bytes) -> None:
+        while data:
+            data = data[os.write(self._device, data) :]
+
+
+class TcpServer(_Server):
+    """Serves firmware on TCP, to one client at a time; `port` is a URL that pyserial opens."""
+
+    def __init__(self, firmware: Firmware, host: str = "127.0.0.1", number: int = 0) -> None:
+        super().__init__(firmware)
+        self.address = (host, number)
+        self._client: socket.socket | None = None
+
+    def _open(self) -> None:
+        self._listener = socket.create_server(self.address)
+        self.address = self._listener.getsockname()[:2]
+        self.port = f"socket://{self.address[0]}:{self.address[1]}"
+
+    def _close(self) -> None:
+        self._hang_up()
+        self._listener.close()
+
+    def _sources(self) -> list[Any]:
+        return [self._listener] if self._client is None else [self._client]
+
+    def _read(self, source: Any) -> bytes:
+        if source is self._listener:
+            self._client, _ = self._listener.accept()
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return b""
+        data = b""
+        with suppress(ConnectionError):
+            data = source.recv(READ_SIZE)
+        if not data:
+            self._hang_up()
+        return data
+
+    def _write(self, data: bytes) -> None:
+        if self._client is not None:
+            try:
+                self._client.sendall(data)
+            except ConnectionError:
+                self._hang_up()
+
+    def _hang_up(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None

@@ -1,85 +1,32 @@
 """Firmware of a chain of Zaber devices: ASCII commands in, replies out, axes that take time.
 
-Simplified: a stop and a new move halt the axis at once; homing is one move onto the switch at 0
-and sets the counter there; settings are not kept over a power cycle; commands longer than the
-packet size are accepted. Source of the messages: Zaber ASCII Protocol Manual.
+Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
+at 0 and sets the counter there; settings are not kept over a power cycle; commands longer than
+the packet size are accepted. Source of the messages: Zaber ASCII Protocol Manual.
 """
 
 import math
 import re
-import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from drivers.clock import Clock
-from drivers.zaber_codec import SPEED_SCALE, lrc
-from simulators.faults import Faults
-from simulators.wire import MemoryTransport
+from drivers.zaber_codec import FLAG_MEANINGS, SPEED_SCALE, lrc
+from simulators.firmware import SimulatedController
+from simulators.motion import AxisSpec, End, Motion, Motor
+
+__all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
 
 ACCELERATION_SCALE = SPEED_SCALE / 1e4
 PACKET_SIZE = 80
-FLAGS_BY_SEVERITY = ("FS", "WR", "WH", "NI")
-FAULTS = ("drop_command", "drop_reply", "garble_reply", "stall", "unplug")
+DEVICE_ID = 50_081
+FIRMWARE = "7.38"
+FIRST_SERIAL_NUMBER = 73_001
+DRIVER_OFF = "FH"
 
 _COMMAND = re.compile(rb"/([^:]*)(?::([0-9A-Fa-f]{2}))?")
 
-
-@dataclass(frozen=True)
-class AxisSpec:
-    """A lead-screw axis: 0 is the home switch, `start_um` where it stands at power-up.
-
-    `backlash_um` is the play of the nut: moving up it sits on the screw's own position, moving
-    down it lags that much above.
-    """
-
-    travel_um: float = 25_400.0
-    microstep_um: float = 0.047625
-    max_speed_um_s: float = 7_000.0
-    acceleration_um_s2: float = 200_000.0
-    start_um: float = 3_210.0
-    backlash_um: float = 3.0
-
-
 BENCH_AXES = {(device, axis): AxisSpec() for device in (1, 2) for axis in (1, 2)}
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A move from rest to rest with constant acceleration up to a top speed."""
-
-    start_um: float
-    end_um: float
-    start_s: float
-    speed_um_s: float
-    acceleration_um_s2: float
-
-    @property
-    def peak_um_s(self) -> float:
-        """Fastest speed reached; a short move never reaches its top speed."""
-        distance_um = abs(self.end_um - self.start_um)
-        return min(self.speed_um_s, math.sqrt(distance_um * self.acceleration_um_s2))
-
-    @property
-    def duration_s(self) -> float:
-        """Time from rest to rest."""
-        distance_um = abs(self.end_um - self.start_um)
-        if distance_um == 0:
-            return 0.0
-        return distance_um / self.peak_um_s + self.peak_um_s / self.acceleration_um_s2
-
-    def position_um(self, now_s: float) -> float:
-        """Return where the motor is."""
-        elapsed_s = min(max(now_s - self.start_s, 0.0), self.duration_s)
-        left_s = self.duration_s - elapsed_s
-        ramp_s = self.peak_um_s / self.acceleration_um_s2
-        distance_um = abs(self.end_um - self.start_um)
-        if elapsed_s < ramp_s:
-            covered_um = self.acceleration_um_s2 * elapsed_s**2 / 2
-        elif left_s < ramp_s:
-            covered_um = distance_um - self.acceleration_um_s2 * left_s**2 / 2
-        else:
-            covered_um = self.peak_um_s * (elapsed_s - ramp_s / 2)
-        return self.start_um + math.copysign(covered_um, self.end_um - self.start_um)
 
 
 class _RefusedError(Exception):
@@ -87,143 +34,153 @@ class _RefusedError(Exception):
 
 
 class _Axis:
-    """One motor: its true position, its step counter and its flags."""
+    """One motor with its settings and its flags."""
 
     def __init__(self, spec: AxisSpec, clock: Clock) -> None:
         self.spec = spec
         self.flags = {"WR", "WH"}
+        self.driver_enabled = True
+        self.drift_um = 0.0
         self.settings = {
             "maxspeed": round(spec.max_speed_um_s / spec.microstep_um * SPEED_SCALE),
+            "limit.approach.maxspeed": round(
+                spec.max_speed_um_s / 2 / spec.microstep_um * SPEED_SCALE
+            ),
             "accel": round(spec.acceleration_um_s2 / spec.microstep_um * ACCELERATION_SCALE),
             "limit.min": 0,
             "limit.max": math.floor(spec.travel_um / spec.microstep_um),
         }
         self._clock = clock
-        self._motor_um = spec.start_um
-        self._nut_um = spec.start_um
-        self._counter_origin_um = spec.start_um
-        self._motion: Motion | None = None
+        self.motor = Motor(spec, clock)
         self._homing = False
-        self._blocked = False
 
     def advance(self) -> bool:
         """Bring the axis to the present; return whether a move ended since the last time."""
-        if self._motion is None:
+        end = self.motor.advance()
+        if end is None:
             return False
-        now_s = self._clock.now_s()
-        self._motor_um = self._motion.position_um(now_s)
-        self._nut_um = min(
-            max(self._nut_um, self._motor_um), self._motor_um + self.spec.backlash_um
-        )
-        if now_s < self._motion.start_s + self._motion.duration_s:
-            return False
-        self._motion = None
-        if self._blocked:
+        if end in (End.STALLED, End.AT_END_OF_TRAVEL):
             self.flags |= {"FS", "WR"}
-        elif self._homing:
-            self._counter_origin_um = 0.0
+        elif end is End.ARRIVED and self._homing:
+            self.motor.count_from_here()
             self.flags -= {"WR", "WH"}
+        self.motor.drift(self.drift_um)
+        self.drift_um = 0.0
         return True
 
     @property
     def busy(self) -> bool:
-        return self._motion is not None
-
-    @property
-    def nut_um(self) -> float:
-        return self._nut_um
+        return self.motor.moving
 
     @property
     def counter(self) -> int:
         """Position in microsteps from where the counter believes 0 to be."""
-        return round((self._motor_um - self._counter_origin_um) / self.spec.microstep_um)
+        return round(self.motor.counted_um / self.spec.microstep_um)
 
     def move_abs(self, target: int, stalls: bool) -> None:
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise _RefusedError("BADDATA")
-        self._go(self._counter_origin_um + target * self.spec.microstep_um, False, stalls)
+        self._begin(False)
+        speed_um_s, acceleration_um_s2 = self._pace()
+        self.motor.go(target * self.spec.microstep_um, speed_um_s, acceleration_um_s2, stalls)
 
     def home(self, stalls: bool) -> None:
-        self._go(0.0, True, stalls)
+        self._begin(True)
+        speed_um_s, acceleration_um_s2 = self._pace()
+        approach = self.settings["limit.approach.maxspeed"] / SPEED_SCALE
+        speed_um_s = min(speed_um_s, approach * self.spec.microstep_um)
+        if stalls:
+            self.motor.go(self.motor.counted_um / 2, speed_um_s, acceleration_um_s2, stalls)
+        else:
+            self.motor.seek(0.0, speed_um_s, acceleration_um_s2)
 
     def stop(self) -> None:
-        if self._motion is not None:
-            self._motion = None
+        if self.motor.moving:
+            self.motor.brake(self._pace()[1])
             self.flags.add("NI")
 
+    def cut_power(self) -> None:
+        """What the emergency stop does: the motor stands and its driver is off."""
+        self.motor.halt()
+        self.driver_enabled = False
+        self.flags |= {DRIVER_OFF, "WR"}
+
+    def enable(self) -> None:
+        self.driver_enabled = True
+        self.flags.discard(DRIVER_OFF)
+
     def clear_warnings(self) -> None:
-        self.flags = {flag for flag in self.flags if flag.startswith("W")}
+        kept = ("W", DRIVER_OFF)
+        self.flags = {flag for flag in self.flags if flag.startswith(kept)} - {"WM"}
 
     def restarted(self) -> "_Axis":
         """Return the axis as it comes up after power was lost where it is now."""
         self.advance()
-        axis = _Axis(replace(self.spec, start_um=self._motor_um), self._clock)
-        axis._nut_um = self._nut_um
-        return axis
+        return _Axis(replace(self.spec, start_um=self.motor.true_um), self._clock)
 
-    def _go(self, target_um: float, homing: bool, stalls: bool) -> None:
-        interrupts = self.busy
+    def _pace(self) -> tuple[float, float]:
+        """Return speed and acceleration in um/s and um/s^2."""
+        return (
+            self.settings["maxspeed"] * self.spec.microstep_um / SPEED_SCALE,
+            self.settings["accel"] * self.spec.microstep_um / ACCELERATION_SCALE,
+        )
+
+    def _begin(self, homing: bool) -> None:
+        if not self.driver_enabled:
+            raise _RefusedError("DRIVERDISABLED")
+        interrupts = self.motor.moving
         self.clear_warnings()
         if interrupts:
             self.flags.add("NI")
-        end_um = min(max(target_um, 0.0), self.spec.travel_um)
-        self._blocked = stalls or end_um != target_um
         self._homing = homing
-        self._motion = Motion(
-            start_um=self._motor_um,
-            end_um=(self._motor_um + end_um) / 2 if stalls else end_um,
-            start_s=self._clock.now_s(),
-            speed_um_s=self.settings["maxspeed"] * self.spec.microstep_um / SPEED_SCALE,
-            acceleration_um_s2=self.settings["accel"] * self.spec.microstep_um / ACCELERATION_SCALE,
-        )
 
 
 class _Device:
     """One controller: its axes, numbered from 1, and its own settings."""
 
-    def __init__(self, axes: list[_Axis]) -> None:
+    def __init__(self, address: int, axes: list[_Axis]) -> None:
         self.axes = axes
         self.settings = {"comm.checksum": 1, "comm.alert": 0}
         self.constants = {
-            "comm.packet.size.max": PACKET_SIZE,
-            "system.axiscount": len(axes),
+            "comm.packet.size.max": str(PACKET_SIZE),
+            "system.axiscount": str(len(axes)),
+            "system.serial": str(FIRST_SERIAL_NUMBER + address),
+            "device.id": str(DEVICE_ID),
+            "version": FIRMWARE,
         }
 
 
-class ZaberChain:
+class ZaberChain(SimulatedController):
     """Devices on one chain, keyed by (device address, axis number).
 
-    Faults, armed with `faults.inject`: `drop_command` and `drop_reply` lose one message,
-    `garble_reply` flips a bit of one, `stall` blocks the next move half way, `unplug` pulls the
-    cable at the next byte.
+    Faults as `SimulatedController`'s, and `emergency_stop`: the power of every motor is cut at
+    the next command.
     """
 
     def __init__(self, clock: Clock, axes: Mapping[tuple[int, int], AxisSpec] = BENCH_AXES) -> None:
-        self.faults = Faults(FAULTS)
-        self._clock = clock
+        super().__init__(clock, ("emergency_stop",))
+        addresses = sorted({device for device, _ in axes})
         self._devices = {
-            address: _Device([_Axis(axes[key], clock) for key in sorted(axes) if key[0] == address])
-            for address in sorted({device for device, _ in axes})
+            address: _Device(
+                address, [_Axis(axes[key], clock) for key in sorted(axes) if key[0] == address]
+            )
+            for address in addresses
         }
-        self._lock = threading.Lock()
-        self._unplugged = False
         self._unread = bytearray()
-
-    def transport(self, timeout_s: float = 0.5) -> MemoryTransport:
-        """Return a wire in memory that ends in this chain."""
-        return MemoryTransport(self, self._clock, timeout_s)
-
-    @property
-    def unplugged(self) -> bool:
-        """Whether the cable has been pulled."""
-        return self._unplugged
 
     def position_um(self, device: int, axis: int) -> float:
         """Return where the axis really is, whatever its counter says: um from the home switch."""
         with self._lock:
             one = self._devices[device].axes[axis - 1]
             one.advance()
-            return one.nut_um
+            return one.motor.nut_um
+
+    def displace(self, device: int, axis: int, distance_um: float) -> None:
+        """Push an axis that stands; its encoder notices."""
+        with self._lock:
+            one = self._devices[device].axes[axis - 1]
+            one.motor.drift(distance_um)
+            one.flags.add("WM")
 
     def power_cycle(self) -> None:
         """Switch the chain off and on: the axes stay where they are and forget where that is."""
@@ -231,48 +188,40 @@ class ZaberChain:
             for device in self._devices.values():
                 device.axes = [axis.restarted() for axis in device.axes]
 
-    def feed(self, data: bytes) -> bytes:
-        """Take bytes from the host and return the replies, and alerts that fell due, if any."""
-        with self._lock:
-            if self._unplugged or self.faults.strikes("unplug"):
-                self._unplugged = True
-                return b""
-            self._unread += data.replace(b"\r", b"\n")
-            *lines, rest = self._unread.split(b"\n")
-            self._unread = bytearray(rest)
-            return b"".join(self._answer(bytes(line)) for line in lines)
+    def _receive(self, data: bytes) -> None:
+        self._unread += data.replace(b"\r", b"\n")
+        *lines, rest = self._unread.split(b"\n")
+        self._unread = bytearray(rest)
+        for line in lines:
+            self._answer(bytes(line))
 
-    def _answer(self, line: bytes) -> bytes:
-        answer = b"".join(self._due_alerts())
-        match = _COMMAND.fullmatch(line[max(line.find(b"/"), 0) :])
-        if match is None or self.faults.strikes("drop_command"):
-            return answer
-        body, checksum = match.groups()
-        if checksum is not None and int(checksum, 16) != lrc(body):
-            return answer
-        address, axis_number, message_id, words = _parse(body.decode("ascii", "replace"))
-        for device_address, device in self._devices.items():
-            if address in (0, device_address):
-                reply = self._reply(device, device_address, axis_number, message_id, words)
-                answer += self._on_the_wire(reply)
-        return answer
-
-    def _due_alerts(self) -> list[bytes]:
-        alerts = []
+    def _advance(self) -> None:
         for address, device in self._devices.items():
             for number, axis in enumerate(device.axes, start=1):
                 if axis.advance() and device.settings["comm.alert"]:
                     text = f"{address:02d} {number} IDLE {_flag([axis])}"
-                    alerts.append(_encode("!", text, device))
-        return alerts
+                    self._send(_encode("!", text, device))
 
-    def _on_the_wire(self, reply: bytes) -> bytes:
-        if self.faults.strikes("drop_reply"):
-            return b""
-        if self.faults.strikes("garble_reply"):
-            middle = len(reply) // 2
-            return reply[:middle] + bytes([reply[middle] ^ 1]) + reply[middle + 1 :]
-        return reply
+    def _next_event_s(self) -> float | None:
+        ends_s = [axis.motor.ends_s for device in self._devices.values() for axis in device.axes]
+        return min((one for one in ends_s if one is not None), default=None)
+
+    def _answer(self, line: bytes) -> None:
+        self._advance()
+        match = _COMMAND.fullmatch(line[max(line.find(b"/"), 0) :])
+        if match is None or self._dropped(line):
+            return
+        if self.faults.strikes("emergency_stop", line):
+            for device in self._devices.values():
+                for axis in device.axes:
+                    axis.cut_power()
+        body, checksum = match.groups()
+        if checksum is not None and int(checksum, 16) != lrc(body):
+            return
+        address, axis_number, message_id, words = _parse(body.decode("ascii", "replace"))
+        for device_address, device in self._devices.items():
+            if address in (0, device_address):
+                self._send(self._reply(device, device_address, axis_number, message_id, words))
 
     def _reply(
         self,
@@ -305,7 +254,7 @@ class ZaberChain:
 
     def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         for axis in axes:
-            axis.home(self.faults.strikes("stall"))
+            axis.home(self._stalls(axis))
         return "0"
 
     def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -314,12 +263,26 @@ class ZaberChain:
         amount = _integer(words[1])
         for axis in axes:
             origin = axis.counter if words[0] == "rel" else 0
-            axis.move_abs(origin + amount, self.faults.strikes("stall"))
+            axis.move_abs(origin + amount, self._stalls(axis))
         return "0"
+
+    def _stalls(self, axis: _Axis) -> bool:
+        """Arm on the axis the faults that its next move meets; return whether it stalls."""
+        if self.faults.strikes("drift", self._command):
+            axis.drift_um = self.drift_um
+        axis.motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
+        return self.faults.strikes("stall", self._command)
 
     def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         for axis in axes:
             axis.stop()
+        return "0"
+
+    def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+        if words != ["enable"]:
+            raise _RefusedError("BADCOMMAND")
+        for axis in axes:
+            axis.enable()
         return "0"
 
     def _warnings(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -351,7 +314,7 @@ class ZaberChain:
             raise _RefusedError("BADCOMMAND")
         setting, value = words[0], _integer(words[1])
         if setting in axes[0].settings:
-            if setting in ("maxspeed", "accel") and value < 1:
+            if not setting.startswith("limit.m") and value < 1:
                 raise _RefusedError("BADDATA")
             for axis in axes:
                 axis.settings[setting] = value
@@ -370,6 +333,7 @@ class ZaberChain:
         "home": _home,
         "move": _move,
         "stop": _stop,
+        "driver": _driver,
         "warnings": _warnings,
         "get": _get,
         "set": _set,
@@ -380,7 +344,7 @@ def _parse(body: str) -> tuple[int, int, int | None, list[str]]:
     """Return device, axis, message id and the words of a command; numbers left out are 0."""
     words = body.split()
     numbers = []
-    while words and len(numbers) < 3 and words[0].isdigit():
+    while words and len(numbers) < 3 and words[0].isdecimal():
         numbers.append(int(words.pop(0)))
     message_id = numbers[2] if len(numbers) == 3 else None
     device, axis = [*numbers[:2], 0, 0][:2]
@@ -396,7 +360,7 @@ def _integer(word: str) -> int:
 
 def _flags(axes: list[_Axis]) -> list[str]:
     raised = {flag for axis in axes for flag in axis.flags}
-    return [flag for flag in FLAGS_BY_SEVERITY if flag in raised]
+    return [flag for flag in FLAG_MEANINGS if flag in raised]
 
 
 def _flag(axes: list[_Axis]) -> str:

@@ -1,4 +1,4 @@
-"""What all tests share: which optional checks this machine can run."""
+"""What all tests share: options, and which optional checks this machine can run."""
 
 import os
 from pathlib import Path
@@ -6,17 +6,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption(
+        "--stage", help="a real stage for tests marked hardware: zaber:/dev/ttyUSB0, or a YAML file"
+    )
+    parser.addoption("--camera", help="a real camera for tests marked hardware: ptp:SERIAL")
+    parser.addoption(
+        "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
+    )
+
+
+def pytest_collection_modifyitems(config, items):
     folder = os.environ.get("EMMC_LIGHTFIELDS")
-    if folder and Path(folder).is_dir():
-        return
-    reason = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
+    skips = {}
+    if not (folder and Path(folder).is_dir()):
+        skips["real_data"] = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
     for item in items:
-        if "real_data" in item.keywords:
-            item.add_marker(pytest.mark.skip(reason=reason))
+        for marker, reason in skips.items():
+            if marker in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=reason))
+        if "hardware" in item.keywords:
+            device = "camera" if "camera_kind" in item.fixturenames else "stage"
+            if not config.getoption(f"--{device}"):
+                reason = f"no real {device}: name one with --{device}"
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(scope="session")
@@ -34,3 +51,24 @@ def random_psi():
         return ImagingMatrix(weights, colour, binning)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def coded_psi():
+    """Return a function that makes a small Psi of a random colour mask near the sensor."""
+
+    def made(cfa="rggb", binning=1, shots=1, size=(6, 8), views=(2, 3), dtype=np.float32):
+        pattern = {"kind": "random_rgbw", "seed": 0}
+        camera = Camera.model_validate(
+            {
+                "title": "test",
+                "views": views,
+                "sensor": {"cfa": cfa, "binning": binning},
+                "masks": {"m": {"distance_mm": 0.24, "cell_um": 24.0, "pattern": pattern}},
+                "more_shots_step_um": {"m": (72, 48)},
+            }
+        )
+        psi = build_imaging_matrix(camera.with_shots(shots), size)
+        return ImagingMatrix(psi.weights.astype(dtype), psi.colour, binning, psi.camera_json)
+
+    return made

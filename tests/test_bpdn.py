@@ -242,6 +242,6 @@ def test_the_default_settings_reach_the_objective_of_ten_thousand_plain_steps_to
     for share in (0.002, 0.05):
         eta = share * np.abs(atoms @ data).max()
         reached = objective(atoms, data, eta, plain_admm(atoms, data, eta, 0.3 * eta, 10_000))
-        code = solve_bpdn(atoms, data, settings=BPDNSettings(penalty=eta))
+        code = solve_bpdn(atoms, data, settings=BPDNSettings(method="admm", penalty=eta))
         assert objective(atoms, data, eta, code.weights) <= reached * (1 + 1e-3)
         assert code.steps < 200

@@ -9,7 +9,13 @@ import pytest
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.reconstruct import load_settings, open_dictionary, read_capture, run_reconstruct
+from emmc_rig.reconstruct import (
+    load_settings,
+    open_dictionary,
+    read_capture,
+    run_in_tiles,
+    run_reconstruct,
+)
 from emmc_rig.simulate import simulate
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError, ReconstructionError
@@ -78,17 +84,24 @@ def test_settings_come_from_yaml_and_a_misspelt_key_names_the_nearest(tmp_path):
         load_settings(path)
 
 
-def test_dictionaries_come_by_name_or_file(random_psi, tmp_path):
-    psi = random_psi(views=(5, 5), size=(24, 24))
-    assert open_dictionary(None, psi).kind == "lambertian"
-    made = open_dictionary("dct", psi)
+def test_dictionaries_come_by_name_or_file(tmp_path):
+    assert open_dictionary(None, (5, 5), 1).kind == "lambertian"
+    made = open_dictionary("dct", (5, 5), 1)
     assert made.patch_shape == (5, 5, 9, 9, 3)
     made.save(tmp_path / "own.h5")
-    np.testing.assert_array_equal(open_dictionary(str(tmp_path / "own.h5"), psi).atoms, made.atoms)
-    binned = random_psi(views=(5, 5), size=(24, 24), binning=2)
-    assert open_dictionary("dct", binned).patch_shape[2:4] == (8, 8)
+    loaded = open_dictionary(str(tmp_path / "own.h5"), (5, 5), 1)
+    np.testing.assert_array_equal(loaded.atoms, made.atoms)
+    assert open_dictionary("dct", (5, 5), 2).patch_shape[2:4] == (8, 8)
     with pytest.raises(DictionaryError, match="no such file"):
-        open_dictionary("nowhere.h5", psi)
+        open_dictionary("nowhere.h5", (5, 5), 1)
+
+
+def test_tiles_give_the_light_field_of_the_whole(frames, tmp_path):
+    metrics = run_in_tiles(frames, tmp_path, "tv", 1000)
+    whole = load_hdf5(tmp_path / "light_field.h5")
+    assert metrics["tiles"] == 1
+    assert run_in_tiles(frames, tmp_path, "tv", 20)["tiles"] == 6
+    np.testing.assert_allclose(load_hdf5(tmp_path / "light_field.h5"), whole, atol=1e-4)
 
 
 def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):

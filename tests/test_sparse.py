@@ -45,7 +45,7 @@ def scene():
 
 def settings(method: Any = "lars", **more: Any):
     solver = BPDNSettings(method=method, smallest_penalty=1e-4, atoms=8)
-    return SparseSettings(stride=6, solver=solver, **more)
+    return SparseSettings(stride=6, solver=solver, flat_favour=1, **more)
 
 
 @pytest.mark.parametrize(
@@ -63,6 +63,21 @@ def test_patches_of_few_atoms_come_back(random_psi, scene, method, shots, stored
     assert psnr_db(result.light_field, truth) > 40
     assert result.status == "converged"
     assert result.parameters["patches"] == 20
+
+
+def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
+    """The penalty shrinks coefficients by the same amount: a longer atom loses less by it."""
+    dictionary = random_atoms()
+    truth = np.broadcast_to(np.array([0.8, 0.5, 0.2], np.float32), (*VIEWS, 12, 12, 3))
+    psi = random_psi(1, VIEWS, (12, 12), stored=3)
+    losses = []
+    for favour in (1, 8):
+        chosen = SparseSettings(
+            stride=6, flat_favour=favour, solver=BPDNSettings(method="lars", smallest_penalty=0.05)
+        )
+        found = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, chosen).light_field
+        losses.append(np.abs(found.mean(axis=(0, 1, 2, 3)) - [0.8, 0.5, 0.2]).max())
+    assert losses[1] < 0.3 * losses[0]
 
 
 def test_pixels_that_sum_samples_are_resolved(random_psi, scene):

@@ -10,8 +10,10 @@ import serial
 from drivers.errors import (
     CommandRefusedError,
     DriverError,
+    EmergencyStopError,
     GarbledReplyError,
     LimitExceededError,
+    LostPositionError,
     MoveTimeoutError,
     NotHomedError,
     PortBusyError,
@@ -30,7 +32,7 @@ from drivers.stage import (
     needs_approach,
 )
 from drivers.transport import SerialTransport, Transport
-from drivers.zaber import ZaberStage
+from drivers.zaber import ZaberStage, find_devices
 from simulators.clock import ManualClock
 from simulators.wire import MemoryTransport, PtyServer
 from simulators.zaber import BENCH_AXES, AxisSpec, Motion, ZaberChain
@@ -252,6 +254,7 @@ def test_an_interrupt_during_a_move_stops_every_axis_that_moves(stage, bench, mo
     with pytest.raises(KeyboardInterrupt):
         stage.move_to_um({"mask_x": 20_000.0, "aperture_y": 20_000.0})
     assert len(bench.stops_sent()) == 2
+    ManualClock.sleep(bench.clock, 2 * SPEC.max_speed_um_s / SPEC.acceleration_um_s2)
     stopped_um = [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)]
     ManualClock.sleep(bench.clock, 60.0)
     assert [bench.chain.position_um(1, 1), bench.chain.position_um(2, 2)] == stopped_um
@@ -327,6 +330,7 @@ def test_a_reply_to_another_message_is_not_taken_for_ours(stale):
     clock = ManualClock()
     chain = ZaberChain(clock)
     stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
+    stage.home()
     feed = chain.feed
     chain.feed = lambda data: with_checksum(stale) + feed(data)
     assert stage.position_um("mask_x") == 0.0
@@ -449,10 +453,17 @@ def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch
 def test_bytes_of_an_incomplete_answer_wait_for_the_rest():
     class Halves:
         unplugged = False
+        plugs = 1
         answers = iter([b"@01 1 10 OK", b" IDLE -- 0\r\n"])
 
         def feed(self, data):
             return next(self.answers)
+
+        def due(self):
+            return b""
+
+        def next_due_s(self):
+            return None
 
     transport = MemoryTransport(Halves(), ManualClock())
     transport.write(b"/\n")
@@ -461,6 +472,87 @@ def test_bytes_of_an_incomplete_answer_wait_for_the_rest():
     assert caught.value.partial == b"@01 1 10 OK"
     transport.write(b"/\n")
     assert transport.read_until(b"\n") == b"@01 1 10 OK IDLE -- 0\r\n"
+
+
+def test_an_emergency_stop_is_named_and_homing_enables_the_motors_again(stage, bench):
+    strike_at_first(bench, "emergency_stop", " move ")
+    with pytest.raises((EmergencyStopError, CommandRefusedError)) as caught:
+        stage.move_to_um({"mask_x": 5000.0})
+    assert "release the" in str(caught.value)
+    with pytest.raises(EmergencyStopError, match="make the bench safe") as caught:
+        stage.wait_until_settled(["mask_x"])
+    assert caught.value.reply == "FH"
+    with pytest.raises(NotHomedError):
+        stage.move_to_um({"mask_x": 5000.0})
+    stage.home()
+    stage.move_to_um({"mask_x": 5000.0})
+
+
+def test_an_axis_that_was_pushed_has_lost_its_position(stage, bench):
+    stage.move_to_um({"mask_x": 700.0})
+    bench.chain.displace(1, 1, 25.0)
+    with pytest.raises(LostPositionError, match="displaced while it stood still"):
+        stage.move_to_um({"mask_x": 800.0})
+    with pytest.raises(NotHomedError):
+        stage.position_um("mask_x")
+    stage.home(["mask_x"])
+    stage.move_to_um({"mask_x": 800.0})
+    assert bench.chain.position_um(1, 1) == pytest.approx(800.0, abs=MICROSTEP_UM)
+
+
+def test_a_target_that_the_firmware_refuses_is_not_success(stage, bench):
+    bench.chain.feed(b"/1 1 set limit.max 20000\n")
+    with pytest.raises(CommandRefusedError, match="check units and limits") as caught:
+        stage.move_to_um({"mask_x": 5000.0})
+    assert (caught.value.axis, caught.value.reply) == ("mask_x", "BADDATA")
+    assert caught.value.command.startswith("move abs ")
+    assert bench.chain.position_um(1, 1) == pytest.approx(0.0, abs=SPEC.backlash_um)
+
+
+def test_firmware_without_checksums_is_read_twice(bench):
+    feed = bench.chain.feed
+    answers = []
+
+    def no_checksum(data):
+        if b"comm.checksum" in data:
+            data = data.replace(b"comm.checksum", b"comm.chexksum").partition(b":")[0] + b"\n"
+        answer = feed(data)
+        answers.append(answer)
+        return answer.partition(b":")[0] + b"\r\n" if answer else answer
+
+    bench.chain.feed = no_checksum
+    stage = bench.stage()
+    stage.home(["mask_x"])
+    answers.clear()
+    assert stage.position_um("mask_x") == 0.0
+    assert len(answers) == 2
+
+
+def test_devices_are_found_with_their_axes(bench):
+    found = find_devices(bench.transport, bench.clock)
+    assert [(one.address, one.axis_count) for one in found] == [(1, 2), (2, 2)]
+    assert found[0].serial_number != found[1].serial_number
+    assert found[0].firmware == "7.38"
+
+
+def test_two_devices_with_one_address_are_told_apart_by_nobody():
+    clock = ManualClock()
+    first, second = ZaberChain(clock, {(1, 1): SPEC}), ZaberChain(clock, {(1, 1): SPEC})
+    feed = first.feed
+    first.feed = lambda data: feed(data) + second.feed(data)
+    with pytest.raises(GarbledReplyError, match="renumber them"):
+        find_devices(first.transport(), clock)
+
+
+def test_homing_is_given_time_for_its_own_slower_speed(make_bench):
+    bench = make_bench({(1, 1): replace(SPEC, start_um=25_000.0)})
+    bench.chain.feed(b"/1 1 set limit.approach.maxspeed 10000\n")
+    stage = bench.stage(axes={"mask_x": (1, 1)})
+    start_s = bench.clock.now_s()
+    stage.home()
+    # 25 mm at 10000 / 1.6384 microsteps/s take 86 s
+    assert bench.clock.now_s() - start_s == pytest.approx(86.0, abs=1.0)
+    assert stage.is_homed("mask_x")
 
 
 def test_every_driver_error_is_one_line():

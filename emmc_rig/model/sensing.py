@@ -107,6 +107,24 @@ class ImagingMatrix:
             raise SensingError(f"{what} of shape {array.shape} given, Psi needs {shape}")
         return np.asarray(array, dtype=self.weights.dtype)
 
+    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+        """Return Psi of some rows and columns of samples, contiguous in memory.
+
+        Raises SensingError when the slices cut a pixel.
+        """
+        for part, whole in zip((rows, columns), self.size, strict=True):
+            first, last, _ = part.indices(whole)
+            if first % self.binning or last % self.binning:
+                raise SensingError(
+                    f"a window from {first} to {last} cuts pixels of {self.binning} samples"
+                )
+        return ImagingMatrix(
+            np.ascontiguousarray(self.weights[:, :, :, rows, :, columns]),
+            None if self.colour is None else np.ascontiguousarray(self.colour[:, rows, columns]),
+            self.binning,
+            self.camera_json,
+        )
+
     def forward(self, light_field: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c)."""
         light_field = self._checked(light_field, self.light_field_shape, "a light field")

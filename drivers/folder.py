@@ -1,0 +1,132 @@
+"""A camera that replays the RAW files of a folder in order, as if it were taking them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_frame
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
+from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+
+
+class FolderCamera:
+    """The RAW files of a folder, in the order of their names (2 comes before 10).
+
+    All must have the first one's shape and colours. The exposure of a recording cannot be chosen:
+    asking for the one that the next frame has is accepted, so that a sequence can be run again.
+    Raises `FolderCameraError` when there is no file, and after the last one.
+    """
+
+    gain: float = 1.0
+    gain_limits: Limits = (1.0, 1.0)
+
+    def __init__(self, folder: Path | str, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.folder = Path(folder)
+        self._clock = clock
+        try:
+            self._left = sorted(
+                (
+                    path
+                    for path in self.folder.iterdir()
+                    if path.suffix.lower() in RAW_SUFFIXES and path.is_file()
+                ),
+                key=lambda path: _natural(path.name),
+                reverse=True,
+            )
+        except OSError as fault:
+            raise FolderCameraError(str(folder), f"it cannot be read ({fault.strerror})") from fault
+        self._count = len(self._left)
+        first = self._read()
+        self._next: RawFrame | None = first
+        self.shape: tuple[int, int] = first.mosaic.shape
+        self.cfa = first.cfa
+        told = first.metadata
+        self.identity = CameraIdentity(
+            told.get("maker", ""), told.get("model", ""), told.get("serial", "")
+        )
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of the next frame; raises `CameraSettingError` where its file does not say."""
+        exposure_s = self._peek().exposure_s
+        if exposure_s is None:
+            raise CameraSettingError("exposure", "is not stated in the recording")
+        return exposure_s
+
+    @property
+    def exposure_limits_s(self) -> Limits:
+        """The next frame's exposure, twice."""
+        return self.exposure_s, self.exposure_s
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Accept the next frame's exposure.
+
+        Raises `ValueError` unless positive, `CameraSettingError` for another.
+        """
+        if not exposure_s > 0:
+            raise ValueError(f"the exposure of {exposure_s:g} s is not positive")
+        recorded_s = self._peek().exposure_s
+        if recorded_s is not None and abs(recorded_s / exposure_s - 1) > EXPOSURE_AGREEMENT:
+            raise CameraSettingError(
+                "exposure",
+                f"was {recorded_s:g} s when this was recorded, not {exposure_s:g} s: "
+                "replay it with the plan of the recording",
+            )
+
+    def set_gain(self, gain: float) -> None:
+        """Accept a gain of 1; raises as `set_exposure_s`."""
+        if not gain > 0:
+            raise ValueError(f"the gain {gain:g} is not positive")
+        if gain != 1:
+            raise CameraSettingError("gain", "of a recording is fixed")
+
+    def snap(self) -> RawFrame:
+        """Return the next frame; raises `FolderCameraError` or `RawFrameError`.
+
+        A file that is refused is passed over: the next call goes on after it.
+        """
+        try:
+            frame = self._peek()
+        finally:
+            self._next = None
+            name = self._left.pop().name if self._left else ""
+        return replace(
+            frame,
+            host_time_s=self._clock.now_s(),
+            metadata={**frame.metadata, "name": name},
+        )
+
+    def close(self) -> None:
+        """Forget the frames that are left."""
+        self._left, self._next = [], None
+
+    def _peek(self) -> RawFrame:
+        """Return the next frame and keep it."""
+        if self._next is None:
+            self._next = check_frame(self._read(self.shape), self.cfa)
+        return self._next
+
+    def _read(self, shape: tuple[int, int] | None = None) -> RawFrame:
+        if not self._left:
+            reason = (
+                f"all its {self._count} frames were replayed"
+                if self._count
+                else "it holds no RAW file"
+            )
+            raise FolderCameraError(str(self.folder), reason)
+        path = self._left[-1]
+        try:
+            return decode_raw(path.read_bytes(), shape)
+        except OSError as fault:
+            raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault
+        except RawFrameError as fault:
+            raise RawFrameError(f"{path.name}: {fault.reason}") from fault
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which the numbers in names sort as numbers."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)]

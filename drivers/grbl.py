@@ -1,0 +1,470 @@
+"""Grbl 1.1 stages: named axes of one controller, moved by jogs in machine coordinates."""
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+
+from drivers import grbl_codec as codec
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import (
+    AxisFaultError,
+    CommandRefusedError,
+    GarbledReplyError,
+    LimitSwitchError,
+    LostPositionError,
+    StalledError,
+    TransportTimeoutError,
+)
+from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
+from drivers.transport import Transport
+
+_log = logging.getLogger(__name__)
+
+QUERY_ATTEMPTS = 3
+LINES_TOLERATED = 200
+"""Lines read for one answer; `$$` has about forty."""
+EXCHANGE_LIMIT_S = 2.0
+BOOT_S = 4.0
+"""Opening the port resets an Arduino, which answers after its boot loader."""
+REPORTS_UNTIL_OFFSET = 40
+"""Grbl tells the work offset in every 30th report at the latest ("Interface", WCO)."""
+POLL_S = 0.05
+AXIS_LETTERS = "XYZABC"
+REPORT_STEP_UM = 1.0
+"""Reports have three decimals of a millimetre."""
+ALL_AXES = "every axis"
+REFUSAL_ADVICE = {
+    5: "switch homing on ($22=1) and wire its limit switches",
+    8: "it is busy, wait until it stands",
+    9: "home it",
+    13: "close the safety door",
+    15: "check the travel ($130 to $132) and the limits",
+    22: "check the speed",
+}
+FAULTS_BY_ALARM: Mapping[int, type[AxisFaultError]] = {
+    1: LimitSwitchError,
+    3: LostPositionError,
+    8: LimitSwitchError,
+    9: StalledError,
+}
+ALARMS_UNTIL_RESET = {1, 2}
+"""After these Grbl answers nothing but a reset ("Interface", Alarm message)."""
+POSITION_KEPT = 2
+
+
+class GrblStage(HostStage):
+    """Axes of one controller, `axes` mapping names to letters; positions are machine positions.
+
+    The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
+    not tell whether it was homed, so every axis must be homed after connecting. Homing some of
+    the axes needs firmware that homes them one by one (option H of `$I`). Construction waits up
+    to `boot_s` for the controller to start; it moves nothing. Raises `TransportTimeoutError` when
+    it does not answer.
+    Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        axes: Mapping[str, str],
+        clock: Clock = SYSTEM_CLOCK,
+        settings: StageSettings = DEFAULT_SETTINGS,
+        boot_s: float = BOOT_S,
+    ) -> None:
+        super().__init__(axes, (transport,), clock, settings)
+        for letter in axes.values():
+            if letter not in AXIS_LETTERS:
+                raise ValueError(f"axis letter {letter!r}: use one of {', '.join(AXIS_LETTERS)}")
+        self._transport = transport
+        self._letters = dict(axes)
+        self._boot_s = boot_s
+        self._start_up()
+
+    def speed_um_s(self, axis: str) -> float:
+        """Return the speed of a move; it is the host's to choose, up to the axis's `$110`."""
+        self._require_axis(axis)
+        return self._move_speeds_um_s[axis]
+
+    def stop(self, axes=None) -> None:
+        """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
+        self._choose(axes)
+        self._stop_axis(self._axes[0])
+        if self._controller.status().state == "Run":
+            self._controller.send(codec.FEED_HOLD)
+        super().stop(axes)
+
+    def _configure(self) -> None:
+        self._controller = _Controller(self._transport, self._clock, self._distrust_all)
+        self._controller.wait_for_boot(self._boot_s)
+        self._options = self._controller.command("$I").get("OPT", "").split(",")[0]
+        self._controller.command("$$")
+        self._distrust_all("it was not homed since it was connected")
+        self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
+        for axis in self._axes:
+            step_um = 1e3 / self._positive(codec.STEPS_PER_MM, axis)
+            check_tolerance(axis, self._settings.tolerance_um, step_um + REPORT_STEP_UM)
+
+    def _read(self, axis: str) -> Reading:
+        status, position_mm = self._controller.machine_position_mm()
+        index = self._index(axis)
+        if index >= len(position_mm):
+            raise _no_such_axis(axis, "?", f"{len(position_mm)} axes")
+        moving = status.state not in ("Idle", "Alarm")
+        return Reading(position_mm[index] * 1e3, status.state != "Alarm", moving)
+
+    def _start_home(self, axes: tuple[str, ...]) -> None:
+        lines = ["$H"]
+        if set(axes) != set(self._axes):
+            if "H" not in self._options:
+                raise CommandRefusedError(
+                    "$H", "no option H", ", ".join(axes), "this firmware homes all axes together"
+                )
+            lines = [f"$H{self._letters[axis]}" for axis in axes]
+        self._controller.leave_alarm()
+        self._controller.start_homing(lines)
+
+    def _is_homing(self, axis: str) -> bool:
+        return self._controller.is_homing()
+
+    def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
+        """Send one jog, so fast that no axis leaves its own speed and all arrive together."""
+        distances_um = {axis: abs(um - start_um[axis]) for axis, um in targets_um.items()}
+        slowest_s = max(um / self.speed_um_s(axis) for axis, um in distances_um.items())
+        length_um = math.hypot(*distances_um.values())
+        speed_um_s = length_um / slowest_s if slowest_s else self.speed_um_s(next(iter(targets_um)))
+        targets_mm = {self._letters[axis]: um / 1e3 for axis, um in targets_um.items()}
+        line = codec.jog(targets_mm, speed_um_s * 60 / 1e3)
+        self._controller.command(line, ", ".join(targets_um))
+
+    def _stop_axis(self, axis: str) -> None:
+        """Cancel the jog, which keeps the position; homing can only be reset, which loses it."""
+        if self._controller.homes:
+            self._controller.abandon_homing()
+        else:
+            self._controller.send(codec.JOG_CANCEL)
+
+    def _is_moving(self, axis: str) -> bool:
+        status = self._controller.status()
+        if status.state in ("Run", "Jog", "Home") or (status.state, status.substate) == ("Hold", 1):
+            return True
+        if status.state != "Idle":
+            self._controller.raise_alarm()
+            raise AxisFaultError(axis, f"the controller is in the state {status.state}")
+        return False
+
+    def _travel_um(self, axis: str) -> tuple[float, float]:
+        """Return the travel, short of the switch by as much as homing pulled off."""
+        travel_um = self._positive(codec.TRAVEL, axis) * 1e3
+        settings = self._controller.settings
+        pull_off_um = settings.get(codec.HOMING_PULL_OFF, 0.0) * 1e3
+        homes_downwards = int(settings.get(codec.HOMING_DIRECTIONS, 0)) >> self._index(axis) & 1
+        if not homes_downwards:
+            return -travel_um, -pull_off_um
+        if "Z" in self._options:
+            return pull_off_um, travel_um
+        return -travel_um + pull_off_um, 0.0
+
+    def _apply_speed(self, axis: str, speed_um_s: float) -> None:
+        self._move_speeds_um_s[axis] = speed_um_s
+
+    def _top_speed_um_s(self, axis: str) -> float:
+        return self._positive(codec.MAX_RATE, axis) / 60 * 1e3
+
+    def _homing_speed_um_s(self, axis: str) -> float:
+        seek_um_s = self._controller.settings.get(codec.HOMING_SEEK, 0.0) / 60 * 1e3
+        top_um_s = self._top_speed_um_s(axis)
+        return min(seek_um_s, top_um_s) if seek_um_s > 0 else top_um_s
+
+    def _index(self, axis: str) -> int:
+        return AXIS_LETTERS.index(self._letters[axis])
+
+    def _positive(self, first: int, axis: str) -> float:
+        number = first + self._index(axis)
+        value = self._controller.settings.get(number, 0.0)
+        if not value > 0:
+            raise _no_such_axis(axis, "$$", f"${number}={value:g}")
+        return value
+
+    def _distrust_all(self, why: str) -> None:
+        self._distrust(self._axes, why)
+
+
+class _Controller:
+    """Lines and real-time commands to one Grbl, and what it says by itself.
+
+    `on_lost` is called with the reason whenever the position became unknown.
+    """
+
+    def __init__(self, transport: Transport, clock: Clock, on_lost: Callable[[str], None]) -> None:
+        self.settings: dict[int, float] = {}
+        self._transport = transport
+        self._clock = clock
+        self._on_lost = on_lost
+        self._alarm: codec.Alarm | None = None
+        self._restarted = False
+        self._homing_lines: list[str] = []
+        self._rests = False
+        self._offset_mm: tuple[float, ...] | None = None
+
+    @property
+    def homes(self) -> bool:
+        """Whether homing was started and has not ended."""
+        return bool(self._homing_lines)
+
+    def send(self, command: bytes) -> None:
+        """Send a real-time command, which has no answer."""
+        self._transport.write(command)
+
+    def status(self) -> codec.Status:
+        """Ask for a report, a few times if need be.
+
+        Raises an `AxisFaultError` when the controller restarted, or was stopped by an alarm so
+        severe that it no longer reports.
+        """
+        for attempt in range(1, QUERY_ATTEMPTS + 1):
+            try:
+                with self._transport.lock:
+                    self._take_waiting()
+                    self._transport.write(codec.STATUS_QUERY)
+                    status = self._read_status()
+                self._raise_restart()
+                return status
+            except (TransportTimeoutError, GarbledReplyError) as error:
+                self._drain()
+                self.raise_alarm()
+                self._raise_restart()
+                if attempt == QUERY_ATTEMPTS:
+                    error.about(command="?")
+                    raise
+                _log.warning("attempt %d of '?' failed: %s", attempt, error)
+        raise AssertionError("unreachable")
+
+    def machine_position_mm(self) -> tuple[codec.Status, tuple[float, ...]]:
+        """Return a report and MPos, from WPos and the work offset where that is all it tells."""
+        unit = codec.MM_PER_INCH if self.settings.get(codec.REPORT_INCHES) else 1.0
+        for _ in range(REPORTS_UNTIL_OFFSET):
+            status = self.status()
+            if status.offset is not None:
+                self._offset_mm = tuple(one * unit for one in status.offset)
+            if status.machine is not None:
+                return status, tuple(one * unit for one in status.machine)
+            if status.work is not None and self._offset_mm is not None:
+                pairs = zip(status.work, self._offset_mm, strict=False)
+                return status, tuple(work * unit + offset for work, offset in pairs)
+        raise GarbledReplyError(b"", "no report tells the work offset").about(command="?")
+
+    def command(self, line: str, axis: str = "the controller") -> dict[str, str]:
+        """Send a line once and return the feedback before its `ok`, by kind.
+
+        When the answer does not come, what still arrives is taken off the wire first, so that a
+        late `ok` is not taken for the next line's.
+        """
+        feedback: dict[str, str] = {}
+        try:
+            with self._transport.lock:
+                self._take_waiting()
+                self._transport.write(codec.encode_line(line))
+                started_s = self._clock.now_s()
+                for _ in range(LINES_TOLERATED):
+                    message = self._read_message()
+                    if isinstance(message, codec.Ok):
+                        self._raise_restart()
+                        return feedback
+                    if isinstance(message, codec.Refusal):
+                        raise _refused(line, message, axis)
+                    if isinstance(message, codec.Feedback):
+                        feedback[message.kind] = message.text
+                    self.raise_alarm()
+                    if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
+                        break
+                raise GarbledReplyError(b"", "no ok among what came")
+        except (TransportTimeoutError, GarbledReplyError) as error:
+            self._drain()
+            self.raise_alarm()
+            error.about(axis=axis, command=line)
+            raise
+
+    def start_homing(self, lines: list[str]) -> None:
+        """Send the homing commands; each is answered when it is done."""
+        with self._transport.lock:
+            self._take_waiting()
+            self._rests = False
+            self._homing_lines = list(lines)
+            for line in lines:
+                self._transport.write(codec.encode_line(line))
+
+    def is_homing(self) -> bool:
+        """Wait for the next line, and return whether homing goes on.
+
+        It ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
+        of rest that no `ok` follows means that homing never began, or that nobody knows how it
+        ended.
+        """
+        if not self._homing_lines:
+            return False
+        line = self._homing_lines[0]
+        with self._transport.lock:
+            try:
+                message = self._read_message()
+            except TransportTimeoutError:
+                if self._rests:
+                    self._homing_lines.clear()
+                    raise LostPositionError(ALL_AXES, "homing ended without an answer").about(
+                        command=line
+                    ) from None
+                self._transport.write(codec.STATUS_QUERY)
+                return True
+            except GarbledReplyError as error:
+                _log.warning("dropped: %s", error)
+                return True
+            if isinstance(message, codec.Refusal):
+                self._homing_lines.clear()
+                raise _refused(line, message, ALL_AXES)
+            self._note(message)
+            self.raise_alarm()
+            self._raise_restart()
+        return bool(self._homing_lines)
+
+    def abandon_homing(self) -> None:
+        """Reset a controller that homes, which stops it wherever it is."""
+        self._homing_lines.clear()
+        self._on_lost("its homing was stopped")
+        self._transport.write(codec.SOFT_RESET)
+
+    def leave_alarm(self) -> None:
+        """Reset a controller that waits for it, or is held; it stands, so nothing is lost."""
+        self._homing_lines.clear()
+        try:
+            state = self.status().state
+        except (TransportTimeoutError, AxisFaultError):
+            state = ""
+        waits = self._alarm is not None and self._alarm.code in ALARMS_UNTIL_RESET
+        if waits or state not in ("Idle", "Alarm"):
+            self._reset()
+        self._alarm, self._restarted = None, False
+
+    def wait_for_boot(self, boot_s: float) -> None:
+        """Return when the controller answers; one that stays silent is reset once."""
+        try:
+            self.wait_for_status(boot_s)
+        except (TransportTimeoutError, GarbledReplyError):
+            self._reset()
+            self.wait_for_status(boot_s)
+        self._alarm, self._restarted = None, False
+
+    def raise_alarm(self) -> None:
+        """Raise the alarm that was received, if any; it stays until the next homing."""
+        if self._alarm is None:
+            return
+        self._homing_lines.clear()
+        alarm = self._alarm
+        fault = FAULTS_BY_ALARM.get(alarm.code, AxisFaultError)
+        error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})")
+        error.loses_position = alarm.code != POSITION_KEPT
+        if error.loses_position:
+            self._on_lost(alarm.meaning)
+        raise error.about(reply=f"ALARM:{alarm.code}")
+
+    def _raise_restart(self) -> None:
+        if self._restarted:
+            self._restarted = False
+            self._homing_lines.clear()
+            raise LostPositionError(ALL_AXES, "the controller restarted")
+
+    def wait_for_status(self, boot_s: float) -> None:
+        """Return when it answers and stands; one that moves on is left to be found out later."""
+        deadline_s = self._clock.now_s() + boot_s
+        while True:
+            try:
+                self._alarm, self._restarted = None, False
+                if self.status().state in ("Idle", "Alarm") or self._clock.now_s() >= deadline_s:
+                    return
+                self._clock.sleep(POLL_S)
+            except AxisFaultError as fault:
+                _log.debug("while starting: %s", fault)
+            except (TransportTimeoutError, GarbledReplyError):
+                if self._clock.now_s() >= deadline_s:
+                    raise
+
+    def _reset(self) -> None:
+        with self._transport.lock:
+            self._transport.write(codec.SOFT_RESET)
+            self._drain()
+        self._alarm, self._restarted = None, False
+
+    def _read_status(self) -> codec.Status:
+        started_s = self._clock.now_s()
+        for _ in range(LINES_TOLERATED):
+            message = self._read_message()
+            if isinstance(message, codec.Status):
+                return message
+            if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
+                break
+        raise GarbledReplyError(b"", "no report among what came")
+
+    def _drain(self) -> None:
+        """Take everything off the wire until nothing comes any more."""
+        with self._transport.lock:
+            for _ in range(LINES_TOLERATED):
+                try:
+                    self._note(self._read_message())
+                except TransportTimeoutError:
+                    self._transport.discard_input()
+                    return
+                except GarbledReplyError as error:
+                    _log.warning("dropped: %s", error)
+            self._transport.discard_until_quiet()
+
+    def _take_waiting(self) -> None:
+        """Take off the wire what came unasked."""
+        for _ in range(LINES_TOLERATED):
+            if not self._transport.waiting():
+                return
+            try:
+                self._note(self._read_message())
+            except (TransportTimeoutError, GarbledReplyError) as error:
+                _log.warning("dropped: %s", error)
+                self._transport.discard_input()
+
+    def _note(self, message: codec.Message | None) -> None:
+        """Remember what an unasked message says about homing."""
+        if isinstance(message, codec.Ok) and self._homing_lines:
+            self._homing_lines.pop(0)
+        elif isinstance(message, codec.Status):
+            self._rests = message.state in ("Idle", "Alarm")
+
+    def _read_message(self) -> codec.Message | None:
+        """Read one line, and take note of an alarm, a restart or a setting."""
+        message = codec.decode_line(self._transport.read_until(codec.TERMINATOR))
+        if isinstance(message, codec.Alarm):
+            _log.warning("alarm %d: %s", message.code, message.meaning)
+            self._alarm = message
+        elif isinstance(message, codec.Banner):
+            self._restarted = True
+            self._on_lost("the controller restarted")
+        elif isinstance(message, codec.Setting):
+            self.settings[message.number] = message.value
+        elif message is not None and not isinstance(message, codec.Ok | codec.Status):
+            _log.debug("%r", message)
+        return message
+
+
+def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK, boot_s: float = BOOT_S) -> str:
+    """Return version and options of the Grbl on a port; moves nothing, and resets nothing.
+
+    Raises `TransportTimeoutError` or `GarbledReplyError` when no Grbl is there.
+    """
+    controller = _Controller(transport, clock, _log.info)
+    controller.wait_for_status(boot_s)
+    told = controller.command("$I")
+    return f"version {told.get('VER', 'unknown')}, options {told.get('OPT', 'unknown')}"
+
+
+def _refused(line: str, refusal: codec.Refusal, axis: str) -> CommandRefusedError:
+    advice = REFUSAL_ADVICE.get(refusal.code, "see Grbl's table of errors")
+    reply = f"error:{refusal.code} ({refusal.meaning})"
+    return CommandRefusedError(line, reply, axis, advice)
+
+
+def _no_such_axis(axis: str, command: str, reply: str) -> CommandRefusedError:
+    return CommandRefusedError(command, reply, axis, "this controller has no such axis")

@@ -1,0 +1,251 @@
+"""Pixel formats of machine-vision cameras: their codes, and unpacking to a uint16 mosaic.
+
+Source: EMVA Pixel Format Naming Convention 2.4: a code's bits 16 to 23 are the bits that a pixel
+takes up; "p" formats fill bytes from the lowest bit on, the older "Packed" ones (GigE Vision 1.2)
+keep the high bits of two pixels in whole bytes, with their low bits in the byte between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+Array = np.ndarray
+
+CFA = {"Mono": "mono", "BayerRG": "rggb", "BayerGR": "grbg", "BayerGB": "gbrg", "BayerBG": "bggr"}
+
+CODES = {
+    "Mono": {
+        "16": 0x01100007,
+        "12p": 0x010C0047,
+        "12Packed": 0x010C0006,
+        "12": 0x01100005,
+        "10p": 0x010A0046,
+        "10Packed": 0x010C0004,
+        "10": 0x01100003,
+        "8": 0x01080001,
+    },
+    "BayerGR": {
+        "16": 0x0110002E,
+        "12p": 0x010C0057,
+        "12Packed": 0x010C002A,
+        "12": 0x01100010,
+        "10p": 0x010A0056,
+        "10Packed": 0x010C0026,
+        "10": 0x0110000C,
+        "8": 0x01080008,
+    },
+    "BayerRG": {
+        "16": 0x0110002F,
+        "12p": 0x010C0059,
+        "12Packed": 0x010C002B,
+        "12": 0x01100011,
+        "10p": 0x010A0058,
+        "10Packed": 0x010C0027,
+        "10": 0x0110000D,
+        "8": 0x01080009,
+    },
+    "BayerGB": {
+        "16": 0x01100030,
+        "12p": 0x010C0055,
+        "12Packed": 0x010C002C,
+        "12": 0x01100012,
+        "10p": 0x010A0054,
+        "10Packed": 0x010C0028,
+        "10": 0x0110000E,
+        "8": 0x0108000A,
+    },
+    "BayerBG": {
+        "16": 0x01100031,
+        "12p": 0x010C0053,
+        "12Packed": 0x010C002D,
+        "12": 0x01100013,
+        "10p": 0x010A0052,
+        "10Packed": 0x010C0029,
+        "10": 0x0110000F,
+        "8": 0x0108000B,
+    },
+}
+"""By colours, then by depth and packing: deepest first, and the smaller of two equally deep."""
+
+
+@dataclass(frozen=True)
+class PixelFormat:
+    """How pixels are stored: `cfa` as in `RawFrame`, `bits` that carry light, and the packing."""
+
+    name: str
+    code: int
+    cfa: str
+    bits: int
+    packing: str
+
+    @property
+    def stored_bits(self) -> int:
+        """How many bits a pixel takes up."""
+        return self.code >> 16 & 0xFF
+
+    @property
+    def white_dn(self) -> int:
+        """Largest value that a pixel can hold."""
+        return (1 << self.bits) - 1
+
+    def row_bytes(self, width: int) -> int:
+        """How many bytes `width` pixels take up."""
+        return (width * self.stored_bits + 7) // 8
+
+
+def _formats() -> tuple[PixelFormat, ...]:
+    found = []
+    for depth in next(iter(CODES.values())):
+        bits = int("".join(letter for letter in depth if letter.isdigit()))
+        packing = depth.removeprefix(str(bits))
+        for colours, codes in CODES.items():
+            found.append(PixelFormat(colours + depth, codes[depth], CFA[colours], bits, packing))
+    return tuple(found)
+
+
+FORMATS = _formats()
+"""Every format that can be unpacked; the deepest come first."""
+BY_NAME = {form.name: form for form in FORMATS}
+BY_CODE = {form.code: form for form in FORMATS}
+
+
+def image_bytes(form: PixelFormat, shape: tuple[int, int], padding: int = 0) -> int:
+    """Return how many bytes an image of `(y, x)` pixels takes, each row padded by so many bytes.
+
+    Without padding a row begins at the very next bit.
+    """
+    rows, columns = shape
+    if padding:
+        return rows * (form.row_bytes(columns) + padding)
+    return form.row_bytes(rows * columns)
+
+
+def unpack(
+    data: bytes | bytearray | memoryview,
+    form: PixelFormat,
+    shape: tuple[int, int],
+    padding: int = 0,
+) -> Array:
+    """Return the uint16 `(y, x)` pixels in the first bytes of `data`; see `image_bytes`.
+
+    Raises `ValueError` where `data` is too short.
+    """
+    needed = image_bytes(form, shape, padding)
+    if len(data) < needed:
+        raise ValueError(f"{len(data)} bytes are fewer than the {needed} of the image")
+    packed = np.frombuffer(data, np.uint8, needed)
+    pixels = np.empty(shape, np.uint16)
+    if not padding:
+        _unpack_flat(packed, form, pixels.reshape(-1))
+        return pixels
+    row_bytes = form.row_bytes(shape[1])
+    for line, row in zip(packed.reshape(shape[0], row_bytes + padding), pixels, strict=True):
+        _unpack_flat(line[:row_bytes], form, row)
+    return pixels
+
+
+def _unpack_flat(packed: Array, form: PixelFormat, pixels: Array) -> None:
+    group_bytes, group_pixels, kernel = KERNELS[form.stored_bits, form.bits, form.packing]
+    groups = len(pixels) // group_pixels
+    kernel(packed, pixels[: groups * group_pixels])
+    rest = len(pixels) - groups * group_pixels
+    if rest:
+        last = np.zeros(group_bytes, np.uint8)
+        tail = packed[groups * group_bytes :]
+        last[: len(tail)] = tail
+        group = np.empty(group_pixels, np.uint16)
+        kernel(last, group)
+        pixels[-rest:] = group[:rest]
+
+
+@njit(cache=True, nogil=True)
+def widen(packed: Any, pixels: Any) -> None:
+    """Set pixels from one byte each."""
+    for i in range(pixels.size):
+        pixels[i] = packed[i]
+
+
+@njit(cache=True, nogil=True)
+def join_bytes(packed: Any, pixels: Any) -> None:
+    """Set pixels from two bytes each, the low one first."""
+    for i in range(pixels.size):
+        pixels[i] = np.uint16(packed[2 * i]) | (np.uint16(packed[2 * i + 1]) << np.uint16(8))
+
+
+@njit(cache=True, nogil=True)
+def unpack_12p(packed: Any, pixels: Any) -> None:
+    """Set two pixels from every three bytes, lowest bits first."""
+    four = np.uint16(4)
+    for i in range(pixels.size // 2):
+        a, b, c = (
+            np.uint16(packed[3 * i]),
+            np.uint16(packed[3 * i + 1]),
+            np.uint16(packed[3 * i + 2]),
+        )
+        pixels[2 * i] = a | ((b & np.uint16(15)) << np.uint16(8))
+        pixels[2 * i + 1] = (b >> four) | (c << four)
+
+
+@njit(cache=True, nogil=True)
+def unpack_12_packed(packed: Any, pixels: Any) -> None:
+    """Set two pixels from every three bytes: high, both low halves, high."""
+    four, low = np.uint16(4), np.uint16(15)
+    for i in range(pixels.size // 2):
+        a, b, c = (
+            np.uint16(packed[3 * i]),
+            np.uint16(packed[3 * i + 1]),
+            np.uint16(packed[3 * i + 2]),
+        )
+        pixels[2 * i] = (a << four) | (b & low)
+        pixels[2 * i + 1] = (c << four) | (b >> four)
+
+
+@njit(cache=True, nogil=True)
+def unpack_10p(packed: Any, pixels: Any) -> None:
+    """Set four pixels from every five bytes, lowest bits first."""
+    for i in range(pixels.size // 4):
+        a, b, c, d, e = (
+            np.uint16(packed[5 * i]),
+            np.uint16(packed[5 * i + 1]),
+            np.uint16(packed[5 * i + 2]),
+            np.uint16(packed[5 * i + 3]),
+            np.uint16(packed[5 * i + 4]),
+        )
+        pixels[4 * i] = a | ((b & np.uint16(3)) << np.uint16(8))
+        pixels[4 * i + 1] = (b >> np.uint16(2)) | ((c & np.uint16(15)) << np.uint16(6))
+        pixels[4 * i + 2] = (c >> np.uint16(4)) | ((d & np.uint16(63)) << np.uint16(4))
+        pixels[4 * i + 3] = (d >> np.uint16(6)) | (e << np.uint16(2))
+
+
+@njit(cache=True, nogil=True)
+def unpack_10_packed(packed: Any, pixels: Any) -> None:
+    """Set two pixels from every three bytes: high, both low pairs of bits, high."""
+    two, low = np.uint16(2), np.uint16(3)
+    for i in range(pixels.size // 2):
+        a, b, c = (
+            np.uint16(packed[3 * i]),
+            np.uint16(packed[3 * i + 1]),
+            np.uint16(packed[3 * i + 2]),
+        )
+        pixels[2 * i] = (a << two) | (b & low)
+        pixels[2 * i + 1] = (c << two) | ((b >> np.uint16(4)) & low)
+
+
+Kernel = Callable[[Array, Array], None]
+
+KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
+    (8, 8, ""): (1, 1, widen),
+    (16, 10, ""): (2, 1, join_bytes),
+    (16, 12, ""): (2, 1, join_bytes),
+    (16, 16, ""): (2, 1, join_bytes),
+    (12, 12, "p"): (3, 2, unpack_12p),
+    (12, 12, "Packed"): (3, 2, unpack_12_packed),
+    (10, 10, "p"): (5, 4, unpack_10p),
+    (12, 10, "Packed"): (3, 2, unpack_10_packed),
+}
+"""By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""

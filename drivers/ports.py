@@ -1,0 +1,147 @@
+"""Serial ports: which there are, which one is meant, who holds it, and how to be allowed to use it.
+
+A port is named in one of four ways: by its device (`/dev/ttyUSB0`), by a pattern
+(`/dev/serial/by-id/*FTDI*`), by the serial number of its USB adapter (`usb:AB0JQ4XY`), or by a URL
+that pyserial knows (`socket://192.168.0.9:4001`). Patterns and serial numbers find the port again
+when it comes back under another name.
+"""
+
+import glob
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from serial.tools import list_ports
+
+from drivers.errors import PortNotFoundError
+
+UDEV_RULE = "99-emmc-rig.rules"
+BY_SERIAL_NUMBER = "usb:"
+PROTOCOLS_BY_USB_ID = {
+    (0x0403, 0xFAF0): "apt",
+    (0x2939, None): "zaber",
+    (0x2341, None): "grbl",
+    (0x2A03, None): "grbl",
+    (0x1A86, None): "grbl",
+}
+"""What usually answers behind a USB vendor and product; other adapters may carry anything."""
+COMMAND_LINE_SHOWN = 60
+
+
+@dataclass(frozen=True)
+class PortInfo:
+    """One serial port of this computer; what its USB adapter does not tell is None or ""."""
+
+    device: str
+    description: str
+    vendor_id: int | None
+    product_id: int | None
+    serial_number: str
+    manufacturer: str
+
+    @property
+    def guess(self) -> str:
+        """The protocol that usually answers here, "" where anything may."""
+        if self.vendor_id is None:
+            return ""
+        exact = PROTOCOLS_BY_USB_ID.get((self.vendor_id, self.product_id))
+        return exact or PROTOCOLS_BY_USB_ID.get((self.vendor_id, None), "")
+
+
+def list_serial_ports() -> list[PortInfo]:
+    """Return the serial ports of this computer, by name."""
+    return [
+        PortInfo(
+            device=port.device,
+            description=port.description or "",
+            vendor_id=port.vid,
+            product_id=port.pid,
+            serial_number=port.serial_number or "",
+            manufacturer=port.manufacturer or "",
+        )
+        for port in sorted(list_ports.comports(), key=lambda port: port.device)
+    ]
+
+
+def find_port(wanted: str) -> str:
+    """Return the device (or URL) that `wanted` means now; see the top of this module.
+
+    Raises `PortNotFoundError` when nothing, or more than one port, answers to it.
+    """
+    if "://" in wanted:
+        return wanted
+    if wanted.startswith(BY_SERIAL_NUMBER):
+        number = wanted.removeprefix(BY_SERIAL_NUMBER)
+        found = [port.device for port in list_serial_ports() if port.serial_number == number]
+    elif glob.has_magic(wanted):
+        found = sorted(glob.glob(wanted))
+    else:
+        return wanted
+    if not found:
+        raise PortNotFoundError(wanted)
+    if len(found) > 1:
+        raise PortNotFoundError(wanted, f"means more than one: {', '.join(found)}")
+    return found[0]
+
+
+def usb_serial_number(device: str) -> str:
+    """Return the serial number of the USB adapter behind a device, "" where it has none."""
+    real = os.path.realpath(device)
+    for port in list_serial_ports():
+        if os.path.realpath(port.device) == real:
+            return port.serial_number
+    return ""
+
+
+def holder_of(device: str) -> str:
+    """Return "program (pid N)" of a process that has the device open, "" when nobody can be seen.
+
+    Looks for a lock on the device in /proc/locks, which shows those of every user, then for the
+    device among the open files of the processes that this user may inspect. Linux only.
+    """
+    pid = next(_pids_with_lock(device), None) or next(_pids_with_open_file(device), None)
+    return "" if pid is None else f"{_program(pid)} (pid {pid})"
+
+
+def udev_rule_path() -> Path:
+    """Return where the udev rule lies that lets a user open the devices of the bench."""
+    return Path(__file__).with_name(UDEV_RULE)
+
+
+def _pids_with_lock(device: str) -> Iterator[int]:
+    """Lines of /proc/locks: `1: FLOCK ADVISORY WRITE pid major:minor:inode start end`."""
+    try:
+        status = os.stat(device)
+        lines = Path("/proc/locks").read_text().splitlines()
+    except OSError:
+        return
+    place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    for line in lines:
+        fields = [field for field in line.split() if field != "->"]
+        if len(fields) > 5 and fields[5] == place and fields[4].isdigit() and fields[4] != "0":
+            yield int(fields[4])
+
+
+def _pids_with_open_file(device: str) -> Iterator[int]:
+    real = os.path.realpath(device)
+    for process in glob.iglob("/proc/[0-9]*"):
+        with suppress(OSError):  # a process of another user, or one that has just ended
+            numbers = os.listdir(f"{process}/fd")
+            if any(os.readlink(f"{process}/fd/{number}") == real for number in numbers):
+                yield int(os.path.basename(process))
+
+
+def _program(pid: int) -> str:
+    """Return the command line of a process, as far as it fits, or "a process"."""
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        command = b" ".join(words).decode("utf-8", "replace").strip()
+        command = command or Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        command = ""
+    printable = "".join(c if c.isprintable() else " " for c in command)
+    if len(printable) > COMMAND_LINE_SHOWN:
+        printable = printable[:COMMAND_LINE_SHOWN] + "..."
+    return printable or "a process"

@@ -1,0 +1,673 @@
+"""PTP still cameras: sessions, captures, downloads in parts, and the camera that gives RAW frames.
+
+Source: ISO 15740 (PIMA 15740:2000), clauses 10 (operations), 11 (responses), 12 (events) and
+13 (properties).
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import PurePosixPath
+from typing import Protocol
+
+from drivers import ptp_codec as codec
+from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import (
+    CameraBusyError,
+    CameraClosedError,
+    CameraSettingError,
+    CaptureError,
+    CardFullError,
+    DownloadError,
+    DriverError,
+    PtpFormatError,
+    PtpRefusedError,
+    UsbStalledError,
+    UsbTimeoutError,
+)
+from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
+from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+
+_log = logging.getLogger(__name__)
+
+SESSION = 1
+OPEN_ATTEMPTS = 3
+LAST_TRANSACTION = 0xFFFFFFFE
+MOST_DATASET_BYTES = 1 << 24
+STALE_EVENTS_TOLERATED = 64
+NO_WAIT_S = 0.001
+MOST_NEW_OBJECTS = 64
+LONGEST_EXPOSURE_S = 3600.0
+"""What a camera that states nonsense can make the driver wait."""
+
+EXPOSURE_UNIT_S = 1e-4
+EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
+"""Bulb and time, by which no exposure can be asked for."""
+ISO_SPECIALS = frozenset((0xFFFF,))
+"""Automatic."""
+
+REFUSALS = {
+    Code.SESSION_NOT_OPEN: "open the camera again",
+    Code.OPERATION_NOT_SUPPORTED: "this camera cannot do it over PTP; look in its menus for a "
+    "mode like PTP, PC remote or tethering",
+    Code.INVALID_HANDLE: "the picture is gone from the card",
+    Code.PROPERTY_NOT_SUPPORTED: "set it on the camera itself",
+    Code.STORE_READ_ONLY: "unlock the card",
+    Code.WRITE_PROTECTED: "the picture is protected, unprotect it on the camera",
+    Code.ACCESS_DENIED: "turn its mode dial to M, and wake it up",
+    Code.STORE_NOT_AVAILABLE: "insert a card",
+    Code.INVALID_PROPERTY_VALUE: "choose another value; its mode dial may limit them",
+}
+SEE_MANUAL = "switch it off and on, then try again; see its manual"
+
+Parameters = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PtpSettings:
+    """How patient the driver is, and how much it fetches at a time.
+
+    busy_limit_s: how long "busy" is believed. capture_limit_s: from the end of the exposure until
+    the picture is on the card. pair_limit_s: how long to wait for a RAW file once the camera says
+    that it is done. attempts: how often a part is fetched again after a fault.
+    """
+
+    busy_limit_s: float = 10.0
+    busy_poll_s: float = 0.1
+    capture_limit_s: float = 20.0
+    pair_limit_s: float = 2.0
+    event_poll_s: float = 0.5
+    part_bytes: int = 1 << 22
+    attempts: int = 3
+
+
+class PtpTransport(Protocol):
+    """What carries PTP: see `drivers.ptp_usb.PtpUsb`."""
+
+    name: str
+
+    def exchange(
+        self,
+        command: Message,
+        data: bytes | None,
+        sink: Callable[[memoryview], object],
+        most: int,
+        timeout_s: float = 0.0,
+    ) -> Message:
+        """Send a command and return the response; what comes with it goes to `sink`."""
+        ...
+
+    def event(self, timeout_s: float) -> Message | None:
+        """Return the next event, None when none came in time."""
+        ...
+
+    def recover(self, transaction: int) -> None:
+        """Make a clean start after an exchange that did not end."""
+        ...
+
+    def reset(self) -> None:
+        """Close whatever session the camera believes to be open."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        ...
+
+
+class PtpSession:
+    """An open session with a camera; `info` is what it said of itself.
+
+    An exchange that breaks off, Ctrl-C included, is cleared away before the next one. Any thread
+    may call; `lock` is held for one exchange, and by a camera for a whole capture.
+    """
+
+    def __init__(
+        self,
+        transport: PtpTransport,
+        clock: Clock = SYSTEM_CLOCK,
+        settings: PtpSettings | None = None,
+    ) -> None:
+        self.lock = threading.RLock()
+        self.name = transport.name
+        self.clock = clock
+        self.settings = settings or PtpSettings()
+        self._transport = transport
+        self._transaction = 0
+        self._broken = False
+        self._owed = False
+        self._closed = False
+        try:
+            self._open()
+            self.info = codec.DeviceInfo.decode(self.fetch(Operation.GET_DEVICE_INFO))
+        except BaseException:
+            transport.close()
+            raise
+
+    def close(self) -> None:
+        """End the session and let go of the camera, there or not; closing twice is allowed."""
+        with self.lock:
+            if self._closed:
+                return
+            try:
+                # It may be unplugged or off: then there is no session to end.
+                with suppress(DriverError):
+                    self.request(Operation.CLOSE_SESSION, patient=False)
+            finally:
+                self._closed = True
+                self._transport.close()
+
+    def can(self, operation: Operation) -> bool:
+        """Whether the camera says that it knows the operation."""
+        return operation in self.info.operations
+
+    def request(
+        self,
+        operation: Operation,
+        *parameters: int,
+        data: bytes | None = None,
+        sink: Callable[[memoryview], object] = lambda piece: None,
+        most: int = MOST_DATASET_BYTES,
+        patient: bool = True,
+    ) -> Parameters:
+        """Make one exchange and return the response's parameters; "busy" is asked again.
+
+        Raises `CameraBusyError`, `CardFullError`, `PtpRefusedError`, or an error of the
+        transport. Not `patient`: busy at once.
+        """
+        started_s = self.clock.now_s()
+        while True:
+            response = self._exchange(operation, parameters, data, sink, most)
+            if response.code == Code.OK:
+                return response.parameters
+            if response.code == Code.STORE_FULL:
+                raise CardFullError(self.name)
+            if response.code != Code.BUSY:
+                raise _refused(operation, response.code)
+            waited_s = self.clock.now_s() - started_s
+            if not patient or waited_s >= self.settings.busy_limit_s:
+                raise CameraBusyError(_shown(operation), waited_s)
+            self.clock.sleep(self.settings.busy_poll_s)
+
+    def fetch(self, operation: Operation, *parameters: int, patient: bool = True) -> bytes:
+        """Make one exchange and return the data that came; raises as `request`."""
+        received = io.BytesIO()
+        self.request(operation, *parameters, sink=received.write, patient=patient)
+        return received.getvalue()
+
+    def handles(self, patient: bool = True) -> tuple[int, ...]:
+        """Return the handles of everything on the cards."""
+        data = self.fetch(Operation.GET_OBJECT_HANDLES, codec.EVERYTHING, 0, 0, patient=patient)
+        return codec.decode_handles(data)
+
+    def object_info(self, handle: int) -> ObjectInfo:
+        """Return what an object is."""
+        return ObjectInfo.decode(self.fetch(Operation.GET_OBJECT_INFO, handle))
+
+    def storages(self) -> tuple[codec.StorageInfo, ...]:
+        """Return the cards in the camera."""
+        ids = codec.decode_handles(self.fetch(Operation.GET_STORAGE_IDS))
+        return tuple(
+            codec.StorageInfo.decode(self.fetch(Operation.GET_STORAGE_INFO, storage))
+            for storage in ids
+        )
+
+    def delete(self, handle: int) -> None:
+        """Delete an object from the card."""
+        self.request(Operation.DELETE_OBJECT, handle, 0)
+
+    def describe(self, code: int) -> codec.PropertyDescription | None:
+        """Return what a property is and may become, None where the camera has none such."""
+        if code not in self.info.properties:
+            return None
+        return codec.decode_description(self.fetch(Operation.GET_PROPERTY_DESCRIPTION, code))
+
+    def read(self, described: codec.PropertyDescription) -> codec.Value:
+        """Return a property's present value."""
+        data = self.fetch(Operation.GET_PROPERTY, described.code)
+        return codec.decode_value(described.data_type, data)
+
+    def write(self, described: codec.PropertyDescription, value: codec.Value) -> codec.Value:
+        """Set a property and return what the camera made of it."""
+        data = codec.encode_value(described.data_type, value)
+        self.request(Operation.SET_PROPERTY, described.code, data=data)
+        return self.read(described)
+
+    def capture(
+        self, exposure_s: float, accept: Callable[[ObjectInfo], bool], all_of_it: bool = False
+    ) -> Capture:
+        """Release the shutter and return the first new object that is accepted.
+
+        Folders are passed over. An event that never comes is made up for by looking at the card.
+        `all_of_it`: wait until the camera says that it is done, for the other files of the same
+        exposure. Raises `CaptureError`, `CardFullError`, or as `request` does.
+        """
+        with self.lock:
+            self._forget_events()
+            seen = set(self.handles())
+            self.request(Operation.INITIATE_CAPTURE, 0, 0)
+            self._owed = True
+            taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
+            self._owed = False
+            return taken
+
+    def download(
+        self,
+        handle: int,
+        info: ObjectInfo,
+        on_progress: Callable[[int, int], object] = lambda done, size: None,
+    ) -> bytes:
+        """Return the bytes of an object, in parts where the camera can.
+
+        A part that breaks off is asked for again, `settings.attempts` times without progress.
+        `on_progress` gets bytes done and in all. Raises `DownloadError`, or as `request` does.
+        """
+        with self.lock:
+            if info.size != codec.EVERYTHING and self.can(Operation.GET_PARTIAL_OBJECT):
+                return self._download_parts(handle, info, on_progress)
+            return self._download_whole(handle, info, on_progress)
+
+    def _open(self) -> None:
+        """Open the session, whatever state an earlier program left the camera in."""
+        for attempt in range(OPEN_ATTEMPTS):
+            last = attempt == OPEN_ATTEMPTS - 1
+            try:
+                response = self._exchange(
+                    Operation.OPEN_SESSION, (SESSION,), None, lambda piece: None, 0, transaction=0
+                )
+            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+                if last:
+                    raise
+                _log.info("%s: opening it again after: %s", self.name, error)
+                continue
+            if response.code == Code.OK:
+                return
+            if response.code == Code.BUSY and not last:
+                self.clock.sleep(self.settings.busy_poll_s)
+            elif response.code == Code.SESSION_ALREADY_OPEN and not last:
+                _log.info("%s: closing the session that somebody left open", self.name)
+                self._end_foreign_session()
+            else:
+                raise _refused(Operation.OPEN_SESSION, response.code)
+
+    def _end_foreign_session(self) -> None:
+        try:
+            self.request(Operation.CLOSE_SESSION)
+        except PtpRefusedError:
+            self._transport.reset()
+
+    def _exchange(
+        self,
+        operation: Operation,
+        parameters: Parameters,
+        data: bytes | None,
+        sink: Callable[[memoryview], object],
+        most: int,
+        transaction: int | None = None,
+    ) -> Message:
+        with self.lock:
+            if self._closed:
+                raise CameraClosedError(self.name)
+            if self._broken:
+                self._transport.recover(self._transaction)
+            if transaction is None:
+                transaction = self._transaction % LAST_TRANSACTION + 1
+            self._transaction = transaction
+            command = Message(codec.Kind.COMMAND, operation, self._transaction, parameters)
+            self._broken = True
+            response = self._transport.exchange(command, data, sink, most)
+            self._broken = False
+            return response
+
+    def _forget_events(self) -> None:
+        """Read events away; one picture too late must not pass for the next."""
+        wait_s = self.settings.pair_limit_s if self._owed else NO_WAIT_S
+        for _ in range(STALE_EVENTS_TOLERATED):
+            if self._transport.event(wait_s) is None:
+                return
+
+    def _await_objects(
+        self,
+        seen: set[int],
+        transaction: int,
+        exposure_s: float,
+        accept: Callable[[ObjectInfo], bool],
+        all_of_it: bool,
+    ) -> Capture:
+        settings, clock = self.settings, self.clock
+        exposed_s = clock.now_s() + min(exposure_s, LONGEST_EXPOSURE_S)
+        deadline_s = exposed_s + settings.capture_limit_s
+        found: tuple[int, ObjectInfo] | None = None
+        others: list[tuple[int, ObjectInfo]] = []
+        done = False
+        while (now_s := clock.now_s()) < deadline_s and not (found and (done or not all_of_it)):
+            event = self._transport.event(min(settings.event_poll_s, deadline_s - now_s))
+            if event is None and clock.now_s() < exposed_s:
+                continue
+            new = self._new_objects(event, seen)
+            if len(new) > MOST_NEW_OBJECTS:
+                raise CaptureError(f"{len(new)} new objects at once", "open the camera again")
+            for handle in new:
+                seen.add(handle)
+                info = self.object_info(handle)
+                if info.format == Format.FOLDER:
+                    continue
+                if found is None and accept(info):
+                    found = handle, info
+                    deadline_s = min(deadline_s, clock.now_s() + settings.pair_limit_s)
+                else:
+                    others.append((handle, info))
+            if event is None:
+                continue
+            if event.code == EventCode.STORE_FULL:
+                raise CardFullError(self.name)
+            if event.code == EventCode.CAPTURE_COMPLETE and event.transaction in (
+                0,
+                transaction,
+                codec.EVERYTHING,
+            ):
+                done = True
+                grace_s = settings.pair_limit_s
+                deadline_s = min(deadline_s, max(clock.now_s(), exposed_s) + grace_s)
+        if found is not None:
+            return Capture(*found, tuple(others))
+        if others:
+            names = ", ".join(info.name for _, info in others)
+            raise CaptureError(
+                f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
+            )
+        raise CaptureError(
+            f"nothing new on the card after {clock.now_s() - exposed_s + exposure_s:.3g} s",
+            "check focus (switch it to manual), mode dial and card",
+        )
+
+    def _new_objects(self, event: Message | None, seen: set[int]) -> list[int]:
+        if event is None or event.code == EventCode.CAPTURE_COMPLETE:
+            try:
+                return [handle for handle in self.handles(patient=False) if handle not in seen]
+            except CameraBusyError:
+                return []
+        if event.code == EventCode.OBJECT_ADDED and event.parameters:
+            return [handle for handle in event.parameters[:1] if handle not in seen]
+        return []
+
+    def _download_parts(
+        self, handle: int, info: ObjectInfo, on_progress: Callable[[int, int], object]
+    ) -> bytes:
+        received = io.BytesIO()
+        failures = 0
+        while (done := received.tell()) < info.size:
+            wanted = min(self.settings.part_bytes, info.size - done)
+            reason = "the camera sent nothing"
+            try:
+                told = self.request(
+                    Operation.GET_PARTIAL_OBJECT,
+                    handle,
+                    done,
+                    wanted,
+                    sink=received.write,
+                    most=wanted,
+                )
+                came = received.tell() - done
+                if told and told[0] != came:
+                    reason = f"{came} bytes came of the {told[0]} that it says it sent"
+                    received.seek(done)
+            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+                # Nobody knows whether what came before the fault is in its place.
+                reason = str(error)
+                received.seek(done)
+            if received.tell() > done:
+                failures = 0
+            else:
+                failures += 1
+                _log.info("%s: fetching %s again: %s", self.name, info.name, reason)
+                if failures >= self.settings.attempts:
+                    raise DownloadError(info.name, done, info.size, reason)
+            on_progress(received.tell(), info.size)
+        received.truncate()
+        return received.getvalue()
+
+    def _download_whole(
+        self, handle: int, info: ObjectInfo, on_progress: Callable[[int, int], object]
+    ) -> bytes:
+        known = info.size != codec.EVERYTHING
+        most = info.size if known else codec.EVERYTHING
+        for attempt in range(1, self.settings.attempts + 1):
+            received = io.BytesIO()
+
+            def take(piece: memoryview, received: io.BytesIO = received) -> None:
+                received.write(piece)
+                on_progress(received.tell(), info.size if known else received.tell())
+
+            try:
+                self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
+            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+                reason = str(error)
+                _log.info("%s: fetching %s again: %s", self.name, info.name, error)
+            else:
+                if not known or received.tell() == info.size:
+                    return received.getvalue()
+                reason = "the camera sent no more"
+            if attempt == self.settings.attempts:
+                raise DownloadError(info.name, received.tell(), info.size, reason)
+        raise AssertionError("unreachable")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A new object on the card, and the others of the same exposure."""
+
+    handle: int
+    info: ObjectInfo
+    others: tuple[tuple[int, ObjectInfo], ...] = ()
+
+
+def is_raw(info: ObjectInfo) -> bool:
+    """Whether an object is a RAW file: by its format for DNG, else by its name."""
+    suffix = PurePosixPath(info.name.lower()).suffix
+    return info.format == Format.DNG or suffix in RAW_SUFFIXES
+
+
+class PtpCamera:
+    """A still camera set to RAW (or RAW with JPEG) and manual exposure.
+
+    PTP does not tell how large a RAW frame is: where `shape` is not given, asking for it before
+    the first frame exposes one. Every frame must have that shape and its colours. `from_card`:
+    delete each picture from the card once it has arrived; otherwise the card fills up.
+    `on_progress` gets the bytes of a picture done and in all.
+    """
+
+    def __init__(
+        self,
+        session: PtpSession,
+        shape: tuple[int, int] | None = None,
+        cfa: str | None = None,
+        from_card: bool = False,
+        on_progress: Callable[[int, int], object] = lambda done, size: None,
+    ) -> None:
+        self.session = session
+        self.on_progress = on_progress
+        self._shape = shape
+        self._cfa = cfa
+        self._from_card = from_card
+        try:
+            info = session.info
+            if not session.can(Operation.INITIATE_CAPTURE):
+                raise _refused(Operation.INITIATE_CAPTURE, Code.OPERATION_NOT_SUPPORTED)
+            self.identity = CameraIdentity(info.maker, info.model, info.serial, info.version)
+            self._exposure = session.describe(Property.EXPOSURE_TIME)
+            self._iso = session.describe(Property.EXPOSURE_INDEX)
+            self._exposure_units = _number(self._exposure, EXPOSURE_SPECIALS)
+            self._iso_now = _number(self._iso, ISO_SPECIALS)
+        except BaseException:
+            session.close()
+            raise
+
+    def __enter__(self) -> PtpCamera:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame; exposes one if there was none yet."""
+        if self._shape is None:
+            self.snap()
+        assert self._shape is not None
+        return self._shape
+
+    @property
+    def cfa(self) -> str:
+        """Colour phase or tile name of a frame; exposes one if there was none yet."""
+        if self._cfa is None:
+            self.snap()
+        assert self._cfa is not None
+        return self._cfa
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of the next frame, as the camera states it."""
+        if self._exposure_units is None:
+            raise CameraSettingError("exposure", "is not told over PTP: see the frames' own")
+        return self._exposure_units * EXPOSURE_UNIT_S
+
+    @property
+    def exposure_limits_s(self) -> Limits:
+        """Shortest and longest exposure; equal where it cannot be chosen."""
+        if self._exposure is None or not self._exposure.writable:
+            return self.exposure_s, self.exposure_s
+        low, high = codec.limits(self._exposure, EXPOSURE_SPECIALS)
+        return low * EXPOSURE_UNIT_S, high * EXPOSURE_UNIT_S
+
+    @property
+    def gain(self) -> float:
+        """Gain of the next frame: ISO over the lowest ISO."""
+        return 1.0 if not self._iso_now else self._iso_now / self._base_iso
+
+    @property
+    def gain_limits(self) -> Limits:
+        """Lowest and highest gain; equal where it cannot be chosen."""
+        if self._iso is None or not self._iso.writable:
+            return self.gain, self.gain
+        low, high = codec.limits(self._iso, ISO_SPECIALS)
+        return low / self._base_iso, high / self._base_iso
+
+    @property
+    def battery_percent(self) -> float | None:
+        """Charge of the battery, None where the camera does not say."""
+        described = self.session.describe(Property.BATTERY_LEVEL)
+        return _number(described)
+
+    def details(self) -> dict[str, str]:
+        """Return what else the camera says of itself, by name."""
+        battery = self.battery_percent
+        cards = ", ".join(
+            f"{card.free_bytes / 1e9:.3g} of {card.capacity_bytes / 1e9:.3g} GB free"
+            for card in self.session.storages()
+        )
+        return {
+            "battery": "not told" if battery is None else f"{battery:g} %",
+            "cards": cards or "none",
+            "downloads": "in parts" if self.session.can(Operation.GET_PARTIAL_OBJECT) else "whole",
+        }
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Choose the exposure of the frames that follow: the nearest that the camera has.
+
+        Raises `ValueError` unless positive, `CameraSettingError` outside the limits, or an error
+        of the session.
+        """
+        check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
+        if self._exposure is not None and self._exposure.writable:
+            target = exposure_s / EXPOSURE_UNIT_S
+            self._exposure_units = self._set(self._exposure, target, EXPOSURE_SPECIALS)
+
+    def set_gain(self, gain: float) -> None:
+        """Choose the gain of the frames that follow: the nearest ISO; raises as the exposure."""
+        check_setting("gain", gain, self.gain_limits)
+        if self._iso is not None and self._iso.writable:
+            self._iso_now = self._set(self._iso, gain * self._base_iso, ISO_SPECIALS)
+
+    def snap(self) -> RawFrame:
+        """Expose and return one frame; raises `RawFrameError` or an error of the session.
+
+        The frame's exposure is the file's own where it states one: PTP only knows 0.1 ms.
+        """
+        session = self.session
+        with session.lock:
+            exposure_s = None if self._exposure_units is None else self.exposure_s
+            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=self._from_card)
+            data = session.download(taken.handle, taken.info, self.on_progress)
+            arrived_s = session.clock.now_s()
+            frame = decode_raw(data, self._shape)
+            check_frame(frame, self._cfa, exposure_s, EXPOSURE_UNIT_S)
+            self._shape, self._cfa = frame.mosaic.shape, frame.cfa
+            if self._from_card:
+                for handle in (taken.handle, *(other for other, _ in taken.others)):
+                    session.delete(handle)
+        return replace(
+            frame,
+            exposure_s=frame.exposure_s or exposure_s,
+            gain=self.gain,
+            camera_time_s=_camera_time_s(taken.info.captured),
+            host_time_s=arrived_s,
+            metadata={**frame.metadata, "name": taken.info.name},
+        )
+
+    def close(self) -> None:
+        """End the session and let go of the camera; closing twice is allowed."""
+        self.session.close()
+
+    @property
+    def _base_iso(self) -> float:
+        return codec.limits(self._iso, ISO_SPECIALS)[0] if self._iso else 1
+
+    def _set(
+        self, described: codec.PropertyDescription, target: float, special: frozenset[int]
+    ) -> int | None:
+        value = codec.nearest(described, target, special)
+        try:
+            made = self.session.write(described, value)
+        except ValueError as error:
+            raise CameraSettingError(f"property {described.code:#06x}", str(error)) from error
+        return made if isinstance(made, int) and made > 0 else None
+
+
+def _number(
+    described: codec.PropertyDescription | None, special: frozenset[int] = frozenset()
+) -> int | None:
+    """Return a property's value where it is a number that means one."""
+    value = described.current if described is not None else None
+    return value if isinstance(value, int) and value > 0 and value not in special else None
+
+
+def _camera_time_s(text: str) -> float | None:
+    """Return a PTP date (YYYYMMDDThhmmss, camera's own time zone) in seconds since 1970."""
+    try:
+        moment = datetime.strptime(text[:15], "%Y%m%dT%H%M%S")
+    except ValueError:
+        return None
+    return moment.replace(tzinfo=UTC).timestamp()
+
+
+def _shown(operation: int) -> str:
+    try:
+        return Operation(operation).name.lower().replace("_", " ")
+    except ValueError:
+        return f"operation {operation:#06x}"
+
+
+def _refused(operation: Operation, code: int) -> PtpRefusedError:
+    try:
+        known = Code(code)
+    except ValueError:
+        return PtpRefusedError(_shown(operation), code, f"{code:#06x}", SEE_MANUAL)
+    answer = known.name.lower().replace("_", " ")
+    return PtpRefusedError(_shown(operation), code, answer, REFUSALS.get(known, SEE_MANUAL))

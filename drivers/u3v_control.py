@@ -1,0 +1,170 @@
+"""Control channel of a USB3 Vision camera: its memory, read and written in bounded time.
+
+Commands go out one by one, each with a request id; only reads are repeated when an answer is lost,
+since a write may have taken effect. Source: GenCP 1.1; USB3 Vision 1.0, control interface.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import threading
+from collections.abc import Callable
+from itertools import cycle
+
+from drivers import u3v_codec as codec
+from drivers.clock import Clock
+from drivers.errors import (
+    U3vBusyError,
+    U3vFormatError,
+    U3vRefusedError,
+    UsbStalledError,
+    UsbTimeoutError,
+)
+from drivers.usb import UsbPipe
+
+_log = logging.getLogger(__name__)
+
+READ_ATTEMPTS = 3
+BUSY_LIMIT_S = 30.0
+"""Longest that a camera may ask for by pending acknowledges, for one command."""
+FOREIGN_MESSAGES_TOLERATED = 64
+PENDING_TOLERATED = 4096
+FIRST_TIMEOUT_S = 1.0
+TIMEOUTS_S = (0.5, 10.0)
+"""Bounds on the response time that the camera states."""
+DATA_SIZES = (8, 1 << 15)
+"""Bounds on the data of one command, whatever lengths the camera states."""
+
+
+_MENDABLE = (UsbTimeoutError, UsbStalledError, U3vFormatError)
+
+
+class U3vControl:
+    """A `drivers.genapi.Port` over the two bulk pipes of the control interface."""
+
+    def __init__(self, name: str, command: UsbPipe, answer: UsbPipe, clock: Clock) -> None:
+        self.name = name
+        self._command = command
+        self._answer = answer
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._request_ids = cycle(codec.REQUEST_IDS)
+        self._timeout_s = FIRST_TIMEOUT_S
+        self._read_size = self._write_size = codec.TEXT_SIZE
+
+    def learn_sizes(self, sbrm: int) -> None:
+        """Take time limit and greatest lengths from the camera's registers."""
+        response_s = self.integer(codec.ABRM_RESPONSE_TIME_MS, 4) / 1000
+        command = self.integer(sbrm + codec.SBRM_COMMAND_SIZE, 4) - codec.WRITE_OVERHEAD
+        answer = self.integer(sbrm + codec.SBRM_ACKNOWLEDGE_SIZE, 4) - codec.HEADER_SIZE
+        self._timeout_s = _bounded(2 * response_s, *TIMEOUTS_S)
+        self._write_size = int(_bounded(command, *DATA_SIZES))
+        self._read_size = int(_bounded(answer, *DATA_SIZES))
+
+    def integer(self, address: int, length: int) -> int:
+        """Return a register; those of the standard are little endian."""
+        return int.from_bytes(self.read(address, length), "little")
+
+    def text(self, address: int) -> str:
+        """Return a text register of the standard's."""
+        return codec.text(self.read(address, codec.TEXT_SIZE))
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return `length` bytes; raises a `DriverError`."""
+        parts = []
+        for at in range(0, length, self._read_size):
+            size = min(self._read_size, length - at)
+            parts.append(self._read(address + at, size))
+        return b"".join(parts)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Store `data`; raises a `DriverError`, after which it may be stored or not."""
+        for at in range(0, len(data), self._write_size):
+            self._write(address + at, data[at : at + self._write_size])
+
+    def _read(self, address: int, length: int) -> bytes:
+        what = f"to read {length} bytes at {address:#x}"
+        for attempt in range(1, READ_ATTEMPTS + 1):
+            try:
+                data = self._exchange(
+                    what,
+                    codec.READMEM_ACK,
+                    lambda request_id: codec.encode_read(request_id, address, length),
+                    length,
+                )
+                if len(data) != length:
+                    raise U3vFormatError(data, f"{len(data)} bytes instead of {length}")
+                return data
+            except _MENDABLE as error:
+                _log.warning("%s: attempt %d %s failed: %s", self.name, attempt, what, error)
+                self._recover(error)
+                if attempt == READ_ATTEMPTS:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _write(self, address: int, data: bytes) -> None:
+        what = f"to write {data[:8].hex()} at {address:#x}"
+        try:
+            answer = self._exchange(
+                what,
+                codec.WRITEMEM_ACK,
+                lambda request_id: codec.encode_write(request_id, address, data),
+                4,
+            )
+            # Old cameras leave the count out.
+            if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(data)):
+                raise U3vFormatError(answer, f"not all {len(data)} bytes were written")
+        except _MENDABLE as error:
+            self._recover(error)
+            raise
+
+    def _recover(self, error: Exception) -> None:
+        """Make the pipes usable again, and forget what is still in them."""
+        if isinstance(error, UsbStalledError):
+            self._command.clear_halt()
+            self._answer.clear_halt()
+        self._answer.drain()
+
+    def _exchange(
+        self, what: str, expected: int, encode: Callable[[int], bytes], data_size: int
+    ) -> bytes:
+        with self._lock:
+            request_id = next(self._request_ids)
+            self._command.write(encode(request_id), self._timeout_s)
+            raw, message = self._await(what, request_id, data_size)
+        if message.status:
+            meaning, advice = codec.STATUS.get(message.status, codec.UNKNOWN_STATUS)
+            raise U3vRefusedError(what, message.status, meaning, advice)
+        if message.command != expected:
+            raise U3vFormatError(raw, f"{message.command:#06x} answers something else")
+        return message.data
+
+    def _await(self, what: str, request_id: int, data_size: int) -> tuple[bytes, codec.Acknowledge]:
+        """Return the answer to a request; late answers to others are passed over."""
+        started_s = self._clock.now_s()
+        deadline_s = started_s + self._timeout_s
+        foreign = pending = 0
+        while foreign < FOREIGN_MESSAGES_TOLERATED and pending < PENDING_TOLERATED:
+            now_s = self._clock.now_s()
+            if now_s >= deadline_s:
+                raise UsbTimeoutError(self.name, deadline_s - started_s)
+            raw = self._answer.read(codec.HEADER_SIZE + data_size, deadline_s - now_s)
+            message = codec.decode_acknowledge(raw) if raw else None
+            if message is None or message.request_id != request_id:
+                foreign += 1
+                continue
+            if message.command != codec.PENDING_ACK:
+                return raw, message
+            pending += 1
+            now_s = self._clock.now_s()
+            if now_s - started_s >= BUSY_LIMIT_S:
+                raise U3vBusyError(what, now_s - started_s)
+            deadline_s = now_s + self._timeout_s + min(message.pending_s, BUSY_LIMIT_S)
+        if pending:
+            raise U3vBusyError(what, self._clock.now_s() - started_s)
+        raise U3vFormatError(b"", f"no answer to request {request_id} among {foreign} messages")
+
+
+def _bounded(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)

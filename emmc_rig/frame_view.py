@@ -1,0 +1,111 @@
+"""What a frame looks like: figures, a preview, a histogram for the terminal; nothing is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.text import Text
+
+from drivers.raw import RawFrame
+
+LETTERS = {"r": "red", "g": "green", "b": "blue"}
+STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
+BLOCKS = " ▁▂▃▄▅▆▇█"
+BINS = 64
+LONGEST_PREVIEW_PX = 1600
+
+Array = NDArray[np.floating]
+
+
+def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
+    """Return the mosaic's pixels by colour, views `(y, x)` one for every place in the tile.
+
+    A tile that is not Bayer counts as grey.
+    """
+    mosaic = frame.mosaic
+    if len(frame.cfa) != 4 or set(frame.cfa) != set(LETTERS):
+        return {"grey": [mosaic]}
+    planes: dict[str, list[NDArray[np.uint16]]] = {name: [] for name in LETTERS.values()}
+    for index, letter in enumerate(frame.cfa):
+        planes[LETTERS[letter]].append(mosaic[index // 2 :: 2, index % 2 :: 2])
+    return planes
+
+
+@dataclass(frozen=True)
+class FrameFigures:
+    """Of one frame: per colour the level of its 99.9th percentile, 1 at white; and the whole's.
+
+    saturated: share of pixels at the white level. focus: energy of the differences between
+    neighbours of one colour over that of the picture; the larger, the sharper, for one scene.
+    """
+
+    brightest: dict[str, float]
+    saturated: float
+    focus: float
+
+
+def frame_figures(frame: RawFrame) -> FrameFigures:
+    """Return the figures of a frame."""
+    black = float(frame.black_level_dn.mean())
+    span = max(1.0, frame.white_level_dn - black)
+    planes = colour_planes(frame)
+    brightest = {
+        name: max((float(np.percentile(plane, 99.9)) - black) / span for plane in parts)
+        for name, parts in planes.items()
+    }
+    sharpest = planes.get("green", planes.get("grey", []))[0].astype(np.float32) - np.float32(black)
+    energy = float(np.mean(sharpest**2))
+    changes = float(np.mean(np.diff(sharpest, axis=0) ** 2) + np.mean(np.diff(sharpest) ** 2))
+    saturated = float(np.mean(frame.mosaic >= frame.white_level_dn))
+    return FrameFigures(brightest, saturated, changes / energy if energy else 0.0)
+
+
+def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]:
+    """Return how many pixels of each colour lie in `bins` steps from black to white."""
+    black = float(frame.black_level_dn.mean())
+    limits = (black, max(black + 1, frame.white_level_dn + 1))
+    return {
+        name: np.sum([np.histogram(part, bins, limits)[0] for part in parts], axis=0)
+        for name, parts in colour_planes(frame).items()
+    }
+
+
+def histogram_text(counts: dict[str, NDArray[np.int64]]) -> Text:
+    """Return a line of blocks for each colour, on a logarithmic scale: one pixel still shows."""
+    text = Text()
+    for name, row in counts.items():
+        heights = np.log1p(row) / max(1e-9, float(np.log1p(row.max())))
+        steps = np.ceil(heights * (len(BLOCKS) - 1)).astype(int)
+        line = "".join(BLOCKS[step] for step in steps)
+        text.append(f"{name:>6} ", "dim").append(line, STYLES[name]).append("|\n", "dim")
+    return text
+
+
+def preview(frame: RawFrame) -> NDArray[np.uint8]:
+    """Return a picture of the frame, (y, x) or (y, x, BGR), brightness as exposed, sRGB gamma.
+
+    A Bayer tile becomes one pixel, its greens averaged; no white balance.
+    """
+    planes = colour_planes(frame)
+    if "grey" in planes:
+        linear = planes["grey"][0].astype(np.float32)
+    else:
+        rows = min(part.shape[0] for parts in planes.values() for part in parts)
+        columns = min(part.shape[1] for parts in planes.values() for part in parts)
+        linear = np.stack(
+            [
+                np.mean([part[:rows, :columns] for part in planes[name]], axis=0, dtype=np.float32)
+                for name in ("blue", "green", "red")
+            ],
+            axis=-1,
+        )
+    black = float(frame.black_level_dn.mean())
+    linear = np.clip((linear - black) / max(1.0, frame.white_level_dn - black), 0, 1)
+    scale = LONGEST_PREVIEW_PX / max(linear.shape[:2])
+    if scale < 1:
+        linear = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * coded).astype(np.uint8)

@@ -1,0 +1,83 @@
+"""Checkpoints of a training: the state after a step, in one file that is whole or absent."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+
+from reconstruction.errors import DictionaryError
+from reconstruction.learning import Iteration, LearningState
+from reconstruction.online import OnlineState
+from reconstruction.separable import SeparableState
+
+State = LearningState | OnlineState | SeparableState
+S = TypeVar("S", LearningState, OnlineState, SeparableState)
+FORMAT = "emmc-rig training checkpoint 1"
+
+
+def save_checkpoint(path: Path, state: State, purpose: Mapping[str, object]) -> None:
+    """Write a state; `purpose`, plain data, says what it is a training of.
+
+    Raises DictionaryError when it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with h5py.File(partial, "w") as file:
+            file.attrs["format"] = FORMAT
+            file["purpose"] = json.dumps(purpose)
+            file["history"] = json.dumps([asdict(done) for done in state.history])
+            for field in fields(state):
+                if field.name != "history":
+                    file.create_dataset(
+                        field.name, data=getattr(state, field.name), chunks=True, fletcher32=True
+                    )
+        os.replace(partial, path)
+    except OSError as fault:
+        raise DictionaryError(f"{path}: cannot be written ({_one_line(fault)})") from fault
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) -> S:
+    """Read a state of the class `kind`, saved with the same purpose.
+
+    Raises DictionaryError: not there, damaged, or of another training; it names what differs.
+    """
+    if not path.is_file():
+        raise DictionaryError(f"{path}: no checkpoint to resume from; train without --resume")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise DictionaryError(f"{path}: not a checkpoint of a training by this program")
+            found = json.loads(_text(file, "purpose"))
+            history = tuple(Iteration(**done) for done in json.loads(_text(file, "history")))
+            wanted = json.loads(json.dumps(purpose))
+            differing = [k for k in wanted if found.get(k) != wanted[k]]
+            if differing:
+                told = ", ".join(f"{k} {found.get(k)} (now {wanted[k]})" for k in differing)
+                raise DictionaryError(
+                    f"{path}: of a training with {told}: resume with the same, or delete it"
+                )
+            names = [field.name for field in fields(kind) if field.name != "history"]
+            arrays = {name: np.asarray(file[name]) for name in names}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as fault:
+        raise DictionaryError(
+            f"{path}: damaged or cut short ({_one_line(fault)}); delete it and train anew"
+        ) from fault
+    return kind(**arrays, history=history)
+
+
+def _text(file: h5py.File, name: str) -> str:
+    value = np.asarray(file[name]).item()
+    return value.decode("utf-8")
+
+
+def _one_line(fault: Exception) -> str:
+    return " ".join(str(fault).split())

@@ -1,0 +1,378 @@
+"""Firmware of a Thorlabs APT controller (KDC101, or a rack of bays): binary messages in and out.
+
+Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
+at the lower end and one up by the offset, where the counter is zero; parameters are not kept over
+a power cycle. A controller takes the bits "A" for downwards, as KDC101 do.
+Source of the messages: Thorlabs, "APT Controllers Host-Controller Communications Protocol".
+"""
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from drivers import apt_codec as codec
+from drivers.apt_codec import Id, Message, StatusBit
+from drivers.clock import Clock
+from drivers.errors import GarbledReplyError
+from simulators.firmware import SimulatedController
+from simulators.motion import AxisSpec, End, Motor
+
+COUNTS_PER_UM = 34.304
+Z825 = AxisSpec(
+    travel_um=25_600.0,
+    microstep_um=1 / COUNTS_PER_UM,
+    max_speed_um_s=2_300.0,
+    acceleration_um_s2=4_000.0,
+    start_um=3_210.0,
+    backlash_um=3.0,
+)
+HOME_OFFSET_UM = 300.0
+HOME_SPEED_UM_S = 1_000.0
+UPDATE_EVERY_S = 0.1
+UPDATES_WITHOUT_ACKNOWLEDGEMENT = 50
+MODEL = b"KDC101\0\0"
+SERIAL_NUMBER = 27_000_001
+FIRMWARE = (3, 0, 2, 0)
+OUT_OF_RANGE = 8
+"""Code of a complaint about a target; the document leaves the numbers to the server's help."""
+
+
+@dataclass
+class _Bay:
+    """One motor channel."""
+
+    motor: Motor
+    maximum: int
+    acceleration: int
+    home_velocity: int
+    home_offset: int = round(HOME_OFFSET_UM * COUNTS_PER_UM)
+    backlash: int = 0
+    enabled: bool = True
+    homed: bool = False
+    homing: str = ""
+    motion_error: bool = False
+    drift_um: float = 0.0
+
+
+class AptController(SimulatedController):
+    """One controller; `bays` maps addresses (0x50 for a unit on USB) to what each drives.
+
+    Faults as `SimulatedController`'s, and `motor_unplugged`: the motor's cable comes loose at
+    the next message. `swapped` mixes up destination and source, as some TDC001 do.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        bays: Mapping[int, AxisSpec] | None = None,
+        swapped: bool = False,
+    ) -> None:
+        super().__init__(clock, ("motor_unplugged",))
+        self.swapped = swapped
+        self._specs = dict(bays or {codec.USB_UNIT: Z825})
+        self._unread = bytearray()
+        self._updates_s: float | None = None
+        self._updates_left = 0
+        self._start()
+
+    def position_um(self, address: int = codec.USB_UNIT) -> float:
+        """Return where the axis really is: um above its home position."""
+        with self._lock:
+            self._advance()
+            return self._bays[address].motor.nut_um - HOME_OFFSET_UM
+
+    def power_cycle(self) -> None:
+        """Switch off and on: the axes stay where they are and forget where that is."""
+        with self._lock:
+            for address, bay in self._bays.items():
+                bay.motor.advance()
+                self._specs[address] = replace(self._specs[address], start_um=bay.motor.true_um)
+            self._unread.clear()
+            self._updates_s = None
+            self._start()
+
+    def _start(self) -> None:
+        self._bays = {
+            address: _Bay(
+                Motor(spec, self._clock),
+                maximum=round(codec.velocity_units(spec.max_speed_um_s, COUNTS_PER_UM)),
+                acceleration=round(
+                    codec.acceleration_units(spec.acceleration_um_s2, COUNTS_PER_UM)
+                ),
+                home_velocity=round(codec.velocity_units(HOME_SPEED_UM_S, COUNTS_PER_UM)),
+            )
+            for address, spec in self._specs.items()
+        }
+        self._motor_unplugged = False
+
+    def _receive(self, data: bytes) -> None:
+        self._unread += data
+        while len(self._unread) >= codec.HEADER_SIZE:
+            try:
+                length = codec.data_length(bytes(self._unread[: codec.HEADER_SIZE]))
+            except GarbledReplyError:
+                del self._unread[0]
+                continue
+            if len(self._unread) < codec.HEADER_SIZE + length:
+                return
+            raw = bytes(self._unread[: codec.HEADER_SIZE + length])
+            del self._unread[: codec.HEADER_SIZE + length]
+            self._take(raw)
+
+    def _take(self, raw: bytes) -> None:
+        self._advance()
+        if self._dropped(raw):
+            return
+        self._motor_unplugged |= self.faults.strikes("motor_unplugged", raw)
+        message = codec.decode(raw)
+        handle = self._handlers.get(message.id)
+        if handle is None:
+            return
+        for address in self._meant(message.destination):
+            handle(self, address, self._bays[address], message)
+
+    def _meant(self, destination: int) -> list[int]:
+        """Return the bays that a message is for; one unit alone answers to every address."""
+        if destination in self._bays:
+            return [destination]
+        return list(self._bays) if len(self._bays) == 1 or destination == codec.RACK else []
+
+    def _advance(self) -> None:
+        for address, bay in self._bays.items():
+            while (end := bay.motor.advance()) is not None:
+                self._end_move(address, bay, end)
+        self._update()
+
+    def _next_event_s(self) -> float | None:
+        ends_s = [bay.motor.ends_s for bay in self._bays.values()]
+        times_s = [one for one in (*ends_s, self._updates_s) if one is not None]
+        return min(times_s, default=None)
+
+    def _end_move(self, address: int, bay: _Bay, end: End) -> None:
+        bay.motor.drift(bay.drift_um)
+        bay.drift_um = 0.0
+        if end is End.STALLED:
+            bay.motion_error, bay.enabled, bay.homing = True, False, ""
+        elif bay.homing == "seeking" and end is End.ARRIVED:
+            bay.homing = "leaving"
+            bay.motor.count_from_here(-bay.home_offset / COUNTS_PER_UM)
+            bay.motor.go(0.0, self._home_speed_um_s(bay), self._acceleration_um_s2(bay))
+        elif bay.homing == "leaving":
+            bay.homing, bay.homed = "", True
+            self._say(address, Id.MOT_MOVE_HOMED, 1)
+        elif end is End.BRAKED:
+            bay.homing = ""
+            self._say_status(address, bay, Id.MOT_MOVE_STOPPED)
+        else:
+            self._say_status(address, bay, Id.MOT_MOVE_COMPLETED)
+
+    def _update(self) -> None:
+        """Send the status that was subscribed to, as long as somebody acknowledges it."""
+        now_s = self._clock.now_s()
+        while self._updates_s is not None and self._updates_s <= now_s:
+            if self._updates_left == 0:
+                self._updates_s = None
+                return
+            self._updates_left -= 1
+            self._updates_s += UPDATE_EVERY_S
+            for address, bay in self._bays.items():
+                self._say_status(address, bay, Id.MOT_GET_DCSTATUSUPDATE)
+
+    def _status(self, bay: _Bay) -> codec.MotorStatus:
+        bits = StatusBit.POWER_OK
+        velocity_um_s = bay.motor.velocity_um_s()
+        if bay.motor.moving:
+            bits |= StatusBit.MOVING_A if velocity_um_s < 0 else StatusBit.MOVING_B
+        at = bay.motor.true_um
+        if at <= 0:
+            bits |= StatusBit.LIMIT_SWITCH_A
+        if at >= bay.motor.spec.travel_um:
+            bits |= StatusBit.LIMIT_SWITCH_B
+        for condition, bit in (
+            (not self._motor_unplugged, StatusBit.CONNECTED),
+            (bay.homing != "", StatusBit.HOMING),
+            (bay.homed, StatusBit.HOMED),
+            (not bay.motor.moving, StatusBit.SETTLED),
+            (bay.motion_error, StatusBit.MOTION_ERROR),
+            (bay.enabled, StatusBit.ENABLED),
+        ):
+            bits |= bit if condition else StatusBit(0)
+        position = round(bay.motor.counted_um * COUNTS_PER_UM)
+        return codec.MotorStatus(1, position, round(velocity_um_s / 1e3 * 2.048), int(bits))
+
+    def _speed_um_s(self, bay: _Bay) -> float:
+        return bay.maximum / codec.velocity_units(1.0, COUNTS_PER_UM)
+
+    def _home_speed_um_s(self, bay: _Bay) -> float:
+        return bay.home_velocity / codec.velocity_units(1.0, COUNTS_PER_UM)
+
+    def _acceleration_um_s2(self, bay: _Bay) -> float:
+        return bay.acceleration / codec.acceleration_units(1.0, COUNTS_PER_UM)
+
+    def _say(
+        self, address: int, message_id: Id, param1: int = 0, param2: int = 0, data=None
+    ) -> None:
+        destination, source = (address, codec.HOST) if self.swapped else (codec.HOST, address)
+        self._send(codec.encode(message_id, destination, param1, param2, data, source))
+
+    def _say_status(self, address: int, bay: _Bay, message_id: Id) -> None:
+        self._say(address, message_id, data=codec.encode_status(self._status(bay)))
+
+    def _complain(self, address: int, message_id: int, notes: str) -> None:
+        text = notes.encode("ascii").ljust(64, b"\0")
+        data = struct.pack("<HH64s", message_id, OUT_OF_RANGE, text)
+        self._say(address, Id.HW_RICHRESPONSE, data=data)
+
+    def _go(self, address: int, bay: _Bay, target: int, message_id: int) -> None:
+        if not bay.enabled or self._motor_unplugged:
+            self._complain(address, message_id, "channel disabled or motor not connected")
+            return
+        bay.homing = ""
+        if self.faults.strikes("drift", self._command):
+            bay.drift_um = self.drift_um
+        bay.motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
+        bay.motor.go(
+            target / COUNTS_PER_UM,
+            self._speed_um_s(bay),
+            self._acceleration_um_s2(bay),
+            self.faults.strikes("stall", self._command),
+        )
+
+    def _info(self, address: int, bay: _Bay, message: Message) -> None:
+        data = struct.pack(
+            "<I8sH4B60sHHH", SERIAL_NUMBER, MODEL, 16, *FIRMWARE, b"\0" * 60, 1, 0, len(self._bays)
+        )
+        self._say(address, Id.HW_GET_INFO, data=data)
+
+    def _start_updates(self, address: int, bay: _Bay, message: Message) -> None:
+        self._updates_s = self._clock.now_s() + UPDATE_EVERY_S
+        self._updates_left = UPDATES_WITHOUT_ACKNOWLEDGEMENT
+
+    def _stop_updates(self, address: int, bay: _Bay, message: Message) -> None:
+        self._updates_s = None
+
+    def _acknowledge(self, address: int, bay: _Bay, message: Message) -> None:
+        self._updates_left = UPDATES_WITHOUT_ACKNOWLEDGEMENT
+
+    def _enable(self, address: int, bay: _Bay, message: Message) -> None:
+        bay.enabled = message.param2 == codec.ENABLE
+        if bay.enabled:
+            bay.motion_error = False
+
+    def _is_enabled(self, address: int, bay: _Bay, message: Message) -> None:
+        state = codec.ENABLE if bay.enabled else codec.DISABLE
+        self._say(address, Id.MOD_GET_CHANENABLESTATE, message.param1, state)
+
+    def _position(self, address: int, bay: _Bay, message: Message) -> None:
+        position = round(bay.motor.counted_um * COUNTS_PER_UM)
+        self._say(address, Id.MOT_GET_POSCOUNTER, data=codec.encode_position(1, position))
+
+    def _set_velocity(self, address: int, bay: _Bay, message: Message) -> None:
+        parameters = codec.decode_velocity(message)
+        bay.maximum = max(1, parameters.maximum)
+        bay.acceleration = max(1, parameters.acceleration)
+
+    def _get_velocity(self, address: int, bay: _Bay, message: Message) -> None:
+        parameters = codec.VelocityParameters(1, 0, bay.acceleration, bay.maximum)
+        self._say(address, Id.MOT_GET_VELPARAMS, data=codec.encode_velocity(parameters))
+
+    def _get_jog(self, address: int, bay: _Bay, message: Message) -> None:
+        step = round(100 * COUNTS_PER_UM)
+        data = struct.pack("<HHiiiiH", 1, 2, step, 0, bay.acceleration, bay.maximum, 2)
+        self._say(address, Id.MOT_GET_JOGPARAMS, data=data)
+
+    def _set_backlash(self, address: int, bay: _Bay, message: Message) -> None:
+        (_, bay.backlash) = struct.unpack("<Hi", message.data or b"\0" * 6)
+
+    def _get_backlash(self, address: int, bay: _Bay, message: Message) -> None:
+        data = codec.encode_position(1, bay.backlash)
+        self._say(address, Id.MOT_GET_GENMOVEPARAMS, data=data)
+
+    def _set_home(self, address: int, bay: _Bay, message: Message) -> None:
+        parameters = codec.decode_home(message)
+        bay.home_velocity = max(1, parameters.velocity)
+        bay.home_offset = parameters.offset
+
+    def _get_home(self, address: int, bay: _Bay, message: Message) -> None:
+        data = struct.pack("<HHHii", 1, 2, 1, bay.home_velocity, bay.home_offset)
+        self._say(address, Id.MOT_GET_HOMEPARAMS, data=data)
+
+    def _home(self, address: int, bay: _Bay, message: Message) -> None:
+        if not bay.enabled or self._motor_unplugged:
+            self._complain(address, message.id, "channel disabled or motor not connected")
+            return
+        bay.homed, bay.homing = False, "seeking"
+        speed_um_s, acceleration_um_s2 = self._home_speed_um_s(bay), self._acceleration_um_s2(bay)
+        if self.faults.strikes("stall", self._command):
+            bay.motor.go(bay.motor.counted_um / 2, speed_um_s, acceleration_um_s2, stalls=True)
+        else:
+            bay.motor.seek(0.0, speed_um_s, acceleration_um_s2)
+
+    def _move_absolute(self, address: int, bay: _Bay, message: Message) -> None:
+        if message.data is not None and len(message.data) == 6:
+            self._go(address, bay, struct.unpack("<Hi", message.data)[1], message.id)
+
+    def _move_relative(self, address: int, bay: _Bay, message: Message) -> None:
+        if message.data is not None and len(message.data) == 6:
+            here = round(bay.motor.counted_um * COUNTS_PER_UM)
+            self._go(address, bay, here + struct.unpack("<Hi", message.data)[1], message.id)
+
+    def _move_for_ever(self, address: int, bay: _Bay, message: Message) -> None:
+        far = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
+        self._go(address, bay, far if message.param2 == 2 else -far, message.id)
+
+    def _stop(self, address: int, bay: _Bay, message: Message) -> None:
+        if bay.motor.ends_s is None:
+            self._say_status(address, bay, Id.MOT_MOVE_STOPPED)
+        elif message.param2 == codec.STOP_PROFILED:
+            bay.motor.brake(self._acceleration_um_s2(bay))
+        else:
+            bay.motor.halt()
+            bay.homing = ""
+            self._say_status(address, bay, Id.MOT_MOVE_STOPPED)
+
+    def _give_status(self, address: int, bay: _Bay, message: Message) -> None:
+        self._say_status(address, bay, Id.MOT_GET_DCSTATUSUPDATE)
+
+    def _give_stepper_status(self, address: int, bay: _Bay, message: Message) -> None:
+        status = self._status(bay)
+        data = struct.pack("<HiiI", 1, status.position, status.position, status.bits)
+        self._say(address, Id.MOT_GET_STATUSUPDATE, data=data)
+
+    def _give_status_bits(self, address: int, bay: _Bay, message: Message) -> None:
+        data = struct.pack("<HI", 1, self._status(bay).bits)
+        self._say(address, Id.MOT_GET_STATUSBITS, data=data)
+
+    def _get_pid(self, address: int, bay: _Bay, message: Message) -> None:
+        data = struct.pack("<HIIIIH", 1, 435, 195, 993, 195, 15)
+        self._say(address, Id.MOT_GET_DCPIDPARAMS, data=data)
+
+    def _get_lights(self, address: int, bay: _Bay, message: Message) -> None:
+        self._say(address, Id.MOT_GET_AVMODES, data=struct.pack("<HH", 1, 11))
+
+    _handlers: Mapping[int, Callable[..., None]] = {
+        Id.HW_REQ_INFO: _info,
+        Id.HW_START_UPDATEMSGS: _start_updates,
+        Id.HW_STOP_UPDATEMSGS: _stop_updates,
+        Id.MOT_ACK_DCSTATUSUPDATE: _acknowledge,
+        Id.MOD_SET_CHANENABLESTATE: _enable,
+        Id.MOD_REQ_CHANENABLESTATE: _is_enabled,
+        Id.MOT_REQ_POSCOUNTER: _position,
+        Id.MOT_SET_VELPARAMS: _set_velocity,
+        Id.MOT_REQ_VELPARAMS: _get_velocity,
+        Id.MOT_REQ_JOGPARAMS: _get_jog,
+        Id.MOT_SET_GENMOVEPARAMS: _set_backlash,
+        Id.MOT_REQ_GENMOVEPARAMS: _get_backlash,
+        Id.MOT_SET_HOMEPARAMS: _set_home,
+        Id.MOT_REQ_HOMEPARAMS: _get_home,
+        Id.MOT_MOVE_HOME: _home,
+        Id.MOT_MOVE_ABSOLUTE: _move_absolute,
+        Id.MOT_MOVE_RELATIVE: _move_relative,
+        Id.MOT_MOVE_VELOCITY: _move_for_ever,
+        Id.MOT_MOVE_STOP: _stop,
+        Id.MOT_REQ_STATUSUPDATE: _give_stepper_status,
+        Id.MOT_REQ_DCSTATUSUPDATE: _give_status,
+        Id.MOT_REQ_STATUSBITS: _give_status_bits,
+        Id.MOT_REQ_DCPIDPARAMS: _get_pid,
+        Id.MOT_REQ_AVMODES: _get_lights,
+    }

@@ -1,0 +1,165 @@
+"""What all simulated controllers share: cable, lock, time, and faults on the wire."""
+
+import heapq
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from drivers.clock import Clock
+from simulators.faults import Faults
+from simulators.wire import MemoryTransport
+
+WIRE_FAULTS = (
+    "drop_command",
+    "lose_command_byte",
+    "drop_reply",
+    "lose_reply_byte",
+    "garble_reply",
+    "late_reply",
+    "duplicate_reply",
+    "unplug",
+)
+MOTION_FAULTS = ("stall", "drift", "busy_forever")
+
+
+class Occasion(NamedTuple):
+    """What a fault's condition is given: the command under way, and the reply to it, if any."""
+
+    command: bytes
+    reply: bytes = b""
+
+
+class SimulatedController(ABC):
+    """Firmware on the end of a wire.
+
+    Faults, armed with `faults.inject`: `drop_command` and `drop_reply` lose one message,
+    `lose_command_byte` and `lose_reply_byte` the byte in its middle, `garble_reply` flips a bit
+    there (another one each time), `late_reply` holds it back for `late_by_s`, `duplicate_reply`
+    sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
+    next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
+    move, after `busy_forever` an axis says for ever that it moves. `fed` counts how often the host
+    wrote.
+    """
+
+    def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
+        self.faults = Faults((*WIRE_FAULTS, *MOTION_FAULTS, *faults), clock)
+        self.late_by_s = 0.7
+        self.drift_um = 40.0
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._plugged = True
+        self._plugs = 1
+        self._command = b""
+        self._outbox: list[tuple[float, int, bytes]] = []
+        self._sent = 0
+        self._garbled = 0
+        self.fed = 0
+
+    @abstractmethod
+    def power_cycle(self) -> None:
+        """Switch off and on: the axes stay where they are and forget where that is."""
+
+    @abstractmethod
+    def _receive(self, data: bytes) -> None:
+        """Take bytes from the host, in pieces of any size, and answer with `_send`."""
+
+    @abstractmethod
+    def _advance(self) -> None:
+        """Bring the firmware to the present; what it says by itself it says with `_send`."""
+
+    @abstractmethod
+    def _next_event_s(self) -> float | None:
+        """Return when the firmware's own state will next change, if it will."""
+
+    def transport(self, timeout_s: float = 0.5) -> MemoryTransport:
+        """Return a wire in memory that ends in this firmware."""
+        return MemoryTransport(self, self._clock, timeout_s)
+
+    @property
+    def unplugged(self) -> bool:
+        """Whether the cable has been pulled."""
+        return not self._plugged
+
+    @property
+    def plugs(self) -> int:
+        """How often the cable has been plugged in; a port opened before the last is dead."""
+        return self._plugs
+
+    def unplug(self) -> None:
+        """Pull the cable of the port; the power stays on."""
+        with self._lock:
+            self._plugged = False
+
+    def replug(self, power_lost: bool = False) -> None:
+        """Plug the cable in again, after a loss of power too if `power_lost`."""
+        with self._lock:
+            self._plugged = True
+            self._plugs += 1
+            self._outbox.clear()
+            if power_lost:
+                self.power_cycle()
+
+    def feed(self, data: bytes) -> bytes:
+        """Take bytes from the host; return those that fell due for the host by now."""
+        with self._lock:
+            if not self._plugged or self.faults.strikes("unplug", Occasion(data)):
+                self._plugged = False
+                return b""
+            if self.faults.strikes("lose_command_byte", Occasion(data)):
+                data = _without_middle(data)
+            self.fed += 1
+            self._advance()
+            self._receive(data)
+            return self._due()
+
+    def due(self) -> bytes:
+        """Return the bytes that fell due for the host by now."""
+        with self._lock:
+            if not self._plugged:
+                return b""
+            self._advance()
+            return self._due()
+
+    def next_due_s(self) -> float | None:
+        """Return when something may next fall due, if anything will."""
+        with self._lock:
+            waiting_s = self._outbox[0][0] if self._outbox else None
+            times_s = [one for one in (waiting_s, self._next_event_s()) if one is not None]
+            return min(times_s, default=None)
+
+    def _due(self) -> bytes:
+        now_s = self._clock.now_s()
+        due = b""
+        while self._outbox and self._outbox[0][0] <= now_s:
+            due += heapq.heappop(self._outbox)[2]
+        return due
+
+    def _send(self, message: bytes) -> None:
+        """Put a message on the wire to the host, where faults may strike it."""
+        occasion = Occasion(self._command, message)
+        if self.faults.strikes("drop_reply", occasion):
+            return
+        if self.faults.strikes("lose_reply_byte", occasion):
+            message = _without_middle(message)
+        if self.faults.strikes("garble_reply", occasion):
+            self._garbled += 1
+            bit = 1 << self._garbled % 7
+            middle = len(message) // 2
+            message = message[:middle] + bytes([message[middle] ^ bit]) + message[middle + 1 :]
+        due_s = self._clock.now_s()
+        if self.faults.strikes("late_reply", occasion):
+            due_s += self.late_by_s
+        for _ in range(2 if self.faults.strikes("duplicate_reply", occasion) else 1):
+            self._sent += 1
+            heapq.heappush(self._outbox, (due_s, self._sent, message))
+
+    def _dropped(self, command: bytes) -> bool:
+        """Take note of the command under way; return whether a fault loses it."""
+        self._command = command
+        return self.faults.strikes("drop_command", Occasion(command))
+
+
+def _without_middle(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + data[middle + 1 :]

@@ -1,0 +1,154 @@
+"""Stages for tests: each protocol's simulated firmware on each kind of wire, or a real one."""
+
+import time
+from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any, ClassVar
+
+from drivers import grbl_codec as codec
+from drivers.apt import AptAxis, AptStage
+from drivers.apt_codec import Id
+from drivers.grbl import GrblStage
+from drivers.stage import DEFAULT_SETTINGS
+from drivers.transport import SerialTransport
+from drivers.zaber import ZaberStage
+from simulators.apt import AptController
+from simulators.clock import JumpingClock, ManualClock
+from simulators.grbl import GrblController
+from simulators.wire import PtyServer, TcpServer
+from simulators.zaber import AxisSpec, ZaberChain
+
+WIRES = ("memory", "pty", "tcp")
+MEMORY_TIMEOUT_S = 0.5
+WIRE_TIMEOUT_S = 0.05
+"""Replies over a pseudo-terminal or TCP really take time: far less than this."""
+WIRE_PACE = 5.0
+WIRE_POLL_S = 0.1
+QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
+"""mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
+
+
+class Rig(ABC):
+    """One stage: simulated firmware, the wire to it, and where its axes really are."""
+
+    axes: tuple[str, ...]
+    senses_stalls = True
+    hardware = False
+
+    @abstractmethod
+    def make_device(self) -> Any: ...
+
+    @abstractmethod
+    def make_from(self, settings): ...
+
+    @abstractmethod
+    def true_um(self, axis): ...
+
+    @abstractmethod
+    def is_move(self, occasion): ...
+
+    def __init__(self, wire: str, opened: ExitStack, tmp_path):
+        self.wire = wire
+        self.clock = ManualClock() if wire == "memory" else JumpingClock(WIRE_PACE)
+        self.timeout_s = MEMORY_TIMEOUT_S if wire == "memory" else WIRE_TIMEOUT_S
+        self.timeout_on_clock_s = self.timeout_s * (1.0 if wire == "memory" else WIRE_PACE)
+        self.device = self.make_device()
+        self.device.late_by_s = 1.5 * self.timeout_on_clock_s
+        self.server = None
+        self.link = tmp_path / "stage"
+        if wire == "pty":
+            self.server = opened.enter_context(PtyServer(self.device, self.link))
+        elif wire == "tcp":
+            self.server = opened.enter_context(TcpServer(self.device))
+        self.transport = self.make_transport()
+        opened.callback(self.transport.close)
+
+    def make_transport(self):
+        if self.server is None:
+            return self.device.transport(self.timeout_s)
+        port = f"{self.link}*" if self.wire == "pty" else self.server.port
+        return SerialTransport(port, timeout_s=self.timeout_s, flow_control=False)
+
+    def let_bytes_arrive(self):
+        """On a real wire bytes are under way for a while; jumps of the clock must not pass them."""
+        if self.server is not None:
+            time.sleep(0.03)
+
+    def replug(self, power_lost=False):
+        self.device.replug(power_lost)
+        deadline_s = time.monotonic() + 5.0
+        while self.server is not None and not self.server.is_open:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.001)
+
+    def make_stage(self, **settings):
+        poll_s = DEFAULT_SETTINGS.poll_s if self.server is None else WIRE_POLL_S
+        return self.make_from(replace(DEFAULT_SETTINGS, poll_s=poll_s, **settings))
+
+
+class ZaberRig(Rig):
+    axes = ("mask_x", "mask_y")
+    addresses: ClassVar = {"mask_x": (1, 1), "mask_y": (2, 1)}
+    spec = AxisSpec()
+
+    def make_device(self) -> Any:
+        return ZaberChain(self.clock, dict.fromkeys(self.addresses.values(), self.spec))
+
+    def make_from(self, settings):
+        return ZaberStage(
+            self.transport, self.addresses, self.spec.microstep_um, self.clock, settings
+        )
+
+    def true_um(self, axis):
+        return self.device.position_um(*self.addresses[axis])
+
+    def is_move(self, occasion):
+        return b" move " in occasion.command
+
+    def is_question(self, occasion):
+        return b" get pos" in occasion.command
+
+
+class GrblRig(Rig):
+    axes = ("mask_x", "mask_y")
+    letters: ClassVar = {"mask_x": "X", "mask_y": "Y"}
+    senses_stalls = False
+
+    def make_device(self) -> Any:
+        return GrblController(self.clock, settings=QUICK_HOMING)
+
+    def make_from(self, settings):
+        return GrblStage(self.transport, self.letters, self.clock, settings)
+
+    def true_um(self, axis):
+        letter = self.letters[axis]
+        return self.device.position_um(letter) - self.device.axes[letter].travel_um
+
+    def is_move(self, occasion):
+        return b"$J=" in occasion.command
+
+    def is_question(self, occasion):
+        return b"?" in occasion.command
+
+
+class AptRig(Rig):
+    axes = ("mask_x",)
+
+    def make_device(self) -> Any:
+        return AptController(self.clock)
+
+    def make_from(self, settings):
+        return AptStage({"mask_x": AptAxis(self.transport)}, self.clock, settings)
+
+    def true_um(self, axis):
+        return self.device.position_um()
+
+    def is_move(self, occasion):
+        return occasion.command[:2] == Id.MOT_MOVE_ABSOLUTE.to_bytes(2, "little")
+
+    def is_question(self, occasion):
+        return occasion.command[:2] == Id.MOT_REQ_DCSTATUSUPDATE.to_bytes(2, "little")
+
+
+RIGS = {"zaber": ZaberRig, "grbl": GrblRig, "apt": AptRig}

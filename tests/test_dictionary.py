@@ -1,0 +1,290 @@
+"""Dictionaries: what they refuse, their file, and the two that need no training."""
+
+import h5py
+import numpy as np
+import pytest
+
+from reconstruction.dictionary import (
+    KINDS,
+    OPPONENT,
+    Dictionary,
+    dct_dictionary,
+    lambertian_dictionary,
+    plane_disparities,
+)
+from reconstruction.errors import DictionaryError, ReconstructionError
+
+VIEWS, PATCH = (3, 2), (4, 5)
+SHAPE = (*VIEWS, *PATCH, 3)
+
+
+def random_atoms(count=6, shape=SHAPE):
+    return np.random.default_rng(0).standard_normal((count, *shape)).astype(np.float32)
+
+
+@pytest.fixture
+def some():
+    return Dictionary.normalised(random_atoms(), "ksvd", '{"seed": 3}')
+
+
+def test_atoms_have_unit_norm_and_known_shapes(some):
+    assert some.size == 6
+    assert some.patch_shape == SHAPE
+    assert some.matrix.shape == (6, 3 * 2 * 4 * 5 * 3)
+    assert some.atoms.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(some.matrix, axis=1), 1, rtol=1e-6)
+
+
+def test_the_matrix_is_a_view_of_the_atoms(some):
+    assert np.shares_memory(some.matrix, some.atoms)
+    np.testing.assert_array_equal(some.matrix[2], some.atoms[2].ravel())
+
+
+def test_normalising_keeps_directions():
+    atoms = random_atoms()
+    unit = Dictionary.normalised(7 * atoms, "ksvd").matrix
+    flat = atoms.reshape(6, -1)
+    np.testing.assert_allclose((unit * flat).sum(1), np.linalg.norm(flat, axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda a: 2 * a, "atom 0 has norm 2"),
+        (lambda a: a[0], "(atom, v, u, y, x, c)"),
+        (lambda a: a[:0], "(atom, v, u, y, x, c)"),
+        (lambda a: (a * 99).astype(np.int32), "int32"),
+        (lambda a: np.where(np.arange(6).reshape(6, 1, 1, 1, 1, 1) == 4, np.nan, a), "atom 4"),
+        (lambda a: np.where(np.arange(6).reshape(6, 1, 1, 1, 1, 1) == 3, np.inf, a), "atom 3"),
+        (lambda a: np.where(np.arange(6).reshape(6, 1, 1, 1, 1, 1) == 2, 0, a), "atom 2"),
+    ],
+)
+def test_what_is_no_set_of_unit_atoms_is_refused(some, change, told):
+    with pytest.raises(DictionaryError) as fault:
+        Dictionary(change(some.atoms), "ksvd")
+    assert told in str(fault.value)
+
+
+def test_zero_atoms_cannot_be_normalised(some):
+    atoms = some.atoms.copy()
+    atoms[1] = 0
+    with pytest.raises(DictionaryError, match="atom 1 is zero"):
+        Dictionary.normalised(atoms, "ksvd")
+
+
+def test_unknown_kinds_are_refused_with_the_known_ones(some):
+    with pytest.raises(DictionaryError, match="separable"):
+        Dictionary(some.atoms, "kvsd")
+    assert {Dictionary(some.atoms, kind).kind for kind in KINDS} == set(KINDS)
+
+
+def test_a_fitting_dictionary_is_passed_on(some):
+    assert some.checked(VIEWS, PATCH, 3) is some
+
+
+@pytest.mark.parametrize(
+    ("views", "patch", "colours", "told"),
+    [
+        ((2, 3), PATCH, 3, "3x2 views, not 2x3"),
+        (VIEWS, (5, 5), 3, "4x5 pixels, not 5x5"),
+        (VIEWS, PATCH, 1, "3 colour(s), not 1"),
+    ],
+)
+def test_a_dictionary_of_other_patches_names_what_differs(some, views, patch, colours, told):
+    with pytest.raises(ReconstructionError) as fault:
+        some.checked(views, patch, colours)
+    assert told in str(fault.value)
+    assert str(fault.value).count("not") == 1
+    assert "train" in str(fault.value)
+
+
+def test_everything_that_differs_is_named_at_once(some):
+    with pytest.raises(DictionaryError, match=r"views.*pixels.*colour"):
+        some.checked((9, 9), (8, 8), 4)
+
+
+def test_a_file_gives_back_the_same_dictionary(some, tmp_path):
+    path = tmp_path / "new/folder/d.h5"
+    some.save(path)
+    again = Dictionary.load(path)
+    np.testing.assert_array_equal(again.atoms, some.atoms)
+    assert (again.kind, again.provenance) == (some.kind, some.provenance)
+    assert [p.name for p in path.parent.iterdir()] == ["d.h5"]
+
+
+def test_long_provenance_is_kept(some, tmp_path):
+    long = Dictionary(some.atoms, "ksvd", "é" * 100_000)
+    long.save(tmp_path / "d.h5")
+    assert Dictionary.load(tmp_path / "d.h5").provenance == long.provenance
+
+
+def test_a_failed_write_leaves_the_old_file(some, tmp_path, monkeypatch):
+    path = tmp_path / "d.h5"
+    some.save(path)
+    before = path.read_bytes()
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("reconstruction.dictionary.os.replace", full)
+    with pytest.raises(DictionaryError, match="No space left"):
+        Dictionary.normalised(random_atoms(9), "ksvd").save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["d.h5"]
+
+
+def test_a_file_cut_anywhere_is_one_clear_line(some, tmp_path):
+    some.save(tmp_path / "d.h5")
+    whole = (tmp_path / "d.h5").read_bytes()
+    for part in np.linspace(0, len(whole) - 1, 23).astype(int):
+        (tmp_path / "cut.h5").write_bytes(whole[:part])
+        with pytest.raises(DictionaryError, match=r"cut\.h5") as fault:
+            Dictionary.load(tmp_path / "cut.h5")
+        assert "\n" not in str(fault.value)
+
+
+def test_a_flipped_bit_among_the_atoms_is_found(some, tmp_path):
+    some.save(tmp_path / "d.h5")
+    whole = bytearray((tmp_path / "d.h5").read_bytes())
+    place = bytes(whole).index(some.atoms[3].tobytes())
+    whole[place + 100] ^= 1
+    (tmp_path / "d.h5").write_bytes(whole)
+    with pytest.raises(DictionaryError, match="damaged"):
+        Dictionary.load(tmp_path / "d.h5")
+
+
+def test_files_that_are_no_dictionary_say_so(tmp_path):
+    with pytest.raises(DictionaryError, match="no such file"):
+        Dictionary.load(tmp_path / "none.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["light_field"] = np.zeros(3)
+    with pytest.raises(DictionaryError, match="not a dictionary"):
+        Dictionary.load(tmp_path / "other.h5")
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.attrs["format"] = "emmc-rig dictionary 1"
+    with pytest.raises(DictionaryError, match="damaged"):
+        Dictionary.load(tmp_path / "part.h5")
+
+
+def test_atoms_in_a_file_are_checked_too(some, tmp_path):
+    some.save(tmp_path / "d.h5")
+    with h5py.File(tmp_path / "d.h5", "r+") as file:
+        del file["atoms"]
+        file["atoms"] = 2 * some.atoms
+    with pytest.raises(DictionaryError, match=r"d\.h5: atom 0 has norm 2"):
+        Dictionary.load(tmp_path / "d.h5")
+
+
+def test_all_cosines_are_an_orthonormal_basis():
+    full = (*VIEWS, *PATCH)
+    matrix = dct_dictionary(VIEWS, PATCH, full, full).matrix.astype(np.float64)
+    assert matrix.shape == (360, 360)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(360), atol=2e-7)
+
+
+def test_the_default_cosines_are_orthonormal_and_hold_the_flat_patches():
+    matrix = dct_dictionary((5, 5), (9, 9)).matrix.astype(np.float64)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=2e-6)
+    for colour in np.eye(3):
+        flat = np.broadcast_to(colour, (5, 5, 9, 9, 3)).ravel()
+        np.testing.assert_allclose(matrix.T @ (matrix @ flat), flat, atol=1e-5)
+
+
+def test_more_cosines_than_samples_are_an_overcomplete_set():
+    plain = dct_dictionary(VIEWS, PATCH, (3, 2, 4, 5), colours=1)
+    more = dct_dictionary(VIEWS, PATCH, (3, 2, 8, 5), colours=1)
+    assert (plain.size, more.size) == (120, 240)
+    y = np.arange(4) + 0.5
+    second = np.cos(np.pi * y / 8)
+    np.testing.assert_allclose(
+        more.atoms.reshape(3, 2, 8, 5, *more.patch_shape)[0, 0, 1, 0, 0, 0, :, 0, 0],
+        second / np.linalg.norm(second) / np.sqrt(3 * 2 * 5),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (((0, 5), (9, 9)), "0x5 views"),
+        (((5, 5), (9, 0)), "9x0 pixels"),
+        (((5, 5), (9, 9), (1, 1, 1)), "4 numbers"),
+        (((5, 5), (9, 9), (1, 1, 1, 0)), "4 numbers"),
+    ],
+)
+def test_cosines_of_nothing_are_refused(arguments, told):
+    with pytest.raises(DictionaryError, match=told):
+        dct_dictionary(*arguments)
+
+
+@pytest.mark.parametrize("make", [dct_dictionary, lambertian_dictionary])
+def test_two_colours_are_refused(make):
+    with pytest.raises(DictionaryError, match="2 colours"):
+        make((3, 3), (6, 6), colours=2)
+
+
+@pytest.mark.parametrize("disparity", [-1, 0, 1, 2])
+def test_an_atom_at_a_whole_disparity_is_an_exact_shift(disparity):
+    views, size = (3, 3), (8, 9)
+    atoms = lambertian_dictionary(views, size, [disparity]).atoms
+    for v, u in np.ndindex(*views):
+        down, right = disparity * (v - 1), disparity * (u - 1)
+        here = atoms[:, 1, 1, max(0, -down) : 8 - max(0, down), max(0, -right) : 9 - max(0, right)]
+        there = atoms[:, v, u, max(0, down) : 8 + min(0, down), max(0, right) : 9 + min(0, right)]
+        np.testing.assert_allclose(there, here, atol=1e-6)
+
+
+def test_a_plane_s_edge_is_coded_by_one_atom_and_the_flat_ones():
+    """The sign of disparity is the light field's: an independent picture of a moving edge."""
+    views, size = (5, 5), (9, 9)
+    matrix = lambertian_dictionary(views, size, [0.5, 1.0]).matrix
+    u, x = np.arange(5) - 2, np.arange(9) - 4
+    edge = 1 / (1 + np.exp(-2.6 * (x[None, :] - 0.5 * u[:, None])))
+    patch = np.broadcast_to(edge[None, :, None, :, None], (*views, *size, 3)).ravel()
+    best = np.abs(matrix[3:] @ (patch - patch.mean())).max() / np.linalg.norm(patch - patch.mean())
+    assert best > 0.98
+    mirrored = np.broadcast_to(edge[None, ::-1, None, :, None], (*views, *size, 3)).ravel()
+    other = np.abs(matrix @ (mirrored - mirrored.mean())).max() / np.linalg.norm(mirrored)
+    assert other < 0.9
+
+
+def test_lambertian_atoms_are_of_one_opponent_colour_and_free_of_mean_but_for_the_flat_ones():
+    atoms = lambertian_dictionary((3, 3), (6, 6), [-1, 0, 1]).atoms.astype(np.float64)
+    colours = atoms.reshape(len(atoms), -1, 3) @ OPPONENT.T
+    strength = np.linalg.norm(colours, axis=1)
+    np.testing.assert_allclose(np.sort(strength, axis=1)[:, :2], 0, atol=1e-6)
+    flat = np.ptp(atoms, axis=(1, 2, 3, 4)).max(axis=1) < 1e-6
+    assert flat.sum() == 3
+    np.testing.assert_allclose(colours[~flat].mean(axis=1), 0, atol=1e-6)
+
+
+def test_no_two_lambertian_atoms_are_nearly_the_same():
+    matrix = lambertian_dictionary((5, 5), (9, 9)).matrix
+    gram = np.abs(matrix @ matrix.T)
+    np.fill_diagonal(gram, 0)
+    assert gram.max() < 0.9951
+
+
+def test_more_disparities_hold_fewer_ones_luminance_atoms():
+    few = lambertian_dictionary((3, 3), (6, 6), [0, 1], colours=1).matrix
+    many = lambertian_dictionary((3, 3), (6, 6), [-1, 0, 0.5, 1], colours=1).matrix
+    assert (np.abs(few @ many.T).max(axis=1) > 0.99).all()
+
+
+def test_planes_are_one_pixel_apart_in_the_outermost_view():
+    assert plane_disparities((5, 5), (9, 9)) == (-2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2)
+    assert plane_disparities((3, 3), (8, 8)) == (-2, -1, 0, 1, 2)
+    assert plane_disparities((9, 9), (8, 8)) == (-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1)
+    assert plane_disparities((5, 5), (1, 1)) == (0,)
+
+
+@pytest.mark.parametrize(("views", "patch"), [((2, 2), (4, 6)), ((7, 7), (8, 8)), ((9, 9), (3, 3))])
+def test_the_defaults_fit_any_views_and_patch(views, patch):
+    for make in (dct_dictionary, lambertian_dictionary):
+        assert make(views, patch).checked(views, patch, 3).size > 3
+
+
+@pytest.mark.parametrize("disparities", [[], [np.nan], [0, np.inf], [5]])
+def test_disparities_that_show_nothing_are_refused(disparities):
+    with pytest.raises(DictionaryError, match="pixels per view step"):
+        lambertian_dictionary((5, 5), (9, 9), disparities)

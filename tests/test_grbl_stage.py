@@ -1,0 +1,345 @@
+"""What is Grbl's own: alarms, resets, modes, work offsets, and homing that says nothing."""
+
+import math
+
+import pytest
+
+from drivers import grbl_codec as codec
+from drivers.errors import (
+    AxisFaultError,
+    CommandRefusedError,
+    LimitExceededError,
+    LimitSwitchError,
+    LostPositionError,
+    NotHomedError,
+    SpeedLimitError,
+    TransportTimeoutError,
+)
+from drivers.grbl import GrblStage, identify
+from drivers.stage import DEFAULT_SETTINGS, StageSettings
+from simulators.clock import ManualClock
+from simulators.grbl import BENCH_AXES, GrblController
+
+AXES = {"x": "X", "y": "Y"}
+TRAVEL_UM = BENCH_AXES["X"].travel_um
+PULL_OFF_UM = 1000.0
+
+
+class Bench:
+    def __init__(self, **options):
+        self.clock = ManualClock()
+        self.device = GrblController(self.clock, **options)
+        self.transport = self.device.transport()
+
+    def stage(self, axes=None, settings=DEFAULT_SETTINGS):
+        return GrblStage(self.transport, axes or AXES, self.clock, settings)
+
+    def homed(self):
+        stage = self.stage()
+        stage.home()
+        return stage
+
+    def say(self, line):
+        """Send a line as another program would; return what is said to it."""
+        return self.device.feed(line).decode("ascii")
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_it_starts_locked_until_it_is_homed(bench):
+    assert "Grbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]" in bench.say(b"")
+    assert bench.say(b"G0X-5\n") == "error:9\r\n"
+    assert bench.say(b"$J=X-5F100\n") == "error:8\r\n"
+    assert bench.say(b"?").startswith("<Alarm|MPos:0.000,0.000,0.000|FS:0,0|WCO:")
+
+
+def test_ok_means_accepted_and_not_arrived(bench):
+    bench.homed()
+    assert bench.say(b"$J=G53X-5.000F480\n") == "ok\r\n"
+    assert bench.say(b"?").startswith("<Jog|")
+    bench.clock.sleep(2.0)
+    assert bench.say(b"?").startswith("<Idle|MPos:-5.000,")
+
+
+def test_a_second_question_before_the_answer_is_not_answered_and_none_while_homing(bench):
+    bench.say(b"")
+    bench.say(b"$H\n")
+    assert bench.say(b"??") == ""
+    bench.clock.sleep(60.0)
+    told = bench.say(b"")
+    assert told.count("<") == 1
+    assert told.startswith("ok\r\n<Idle|")
+
+
+def test_moves_are_jogs_in_machine_coordinates_that_leave_the_modes_alone(bench):
+    stage = bench.homed()
+    bench.say(b"G91 G20\n")
+    bench.device.work_offset_mm["X"] = 7.0
+    stage.move_to_um({"x": -5000.0})
+    assert bench.device.position_um("X") == pytest.approx(TRAVEL_UM - 5000.0, abs=0.5)
+    assert "G20 G91" in bench.say(b"$G\n")
+
+
+def test_axes_that_move_together_arrive_together_each_at_its_own_speed(bench):
+    stage = GrblStage(bench.transport, AXES, bench.clock, StageSettings(approach_um=0.0))
+    stage.home()
+    stage.set_speed_um_s("y", 500.0)
+    start_s = bench.clock.now_s()
+    stage.move_to_um({"x": -2000.0, "y": -3000.0})
+    # 2000 um of y at 500 um/s are the slowest; x alone would take a quarter of a second.
+    assert 4.0 < bench.clock.now_s() - start_s < 4.3
+
+
+@pytest.mark.parametrize("mask", [0, 1])
+@pytest.mark.parametrize("inches", [0, 1])
+def test_positions_are_machine_positions_whatever_is_reported(mask, inches):
+    bench = Bench(settings={codec.REPORT_MASK: mask, codec.REPORT_INCHES: inches})
+    bench.device.work_offset_mm["X"] = -3.25
+    stage = bench.homed()
+    assert stage.position_um("x") == pytest.approx(-PULL_OFF_UM, abs=2.6)
+    stage.move_to_um({"x": -7000.0})
+    assert bench.device.position_um("X") == pytest.approx(TRAVEL_UM - 7000.0, abs=0.5)
+
+
+def test_the_travel_ends_short_of_the_switch(bench):
+    stage = bench.stage()
+    low_um, high_um = stage.limits_um("x")
+    assert (low_um, high_um) == (-TRAVEL_UM + 10.0, -PULL_OFF_UM)
+    stage.home()
+    with pytest.raises(LimitExceededError):
+        stage.move_to_um({"x": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("options", "limits_um"),
+    [
+        ("VH", (-TRAVEL_UM + PULL_OFF_UM + 10.0, 0.0)),
+        ("VHZ", (PULL_OFF_UM + 10.0, TRAVEL_UM)),
+    ],
+)
+def test_an_axis_that_homes_downwards_has_its_switch_at_the_other_end(options, limits_um):
+    bench = Bench(options=options, settings={codec.HOMING_DIRECTIONS: 0b001})
+    stage = bench.stage()
+    assert stage.limits_um("x") == limits_um
+    assert stage.limits_um("y")[1] == -PULL_OFF_UM
+
+
+def test_the_firmware_refuses_a_jog_beyond_its_travel_and_the_position_stays(bench):
+    stage = bench.homed()
+    bench.device.settings[codec.TRAVEL] = 5.0
+    with pytest.raises(CommandRefusedError, match="check the travel") as caught:
+        stage.move_to_um({"x": -9000.0})
+    assert caught.value.reply.startswith("error:15")
+    assert caught.value.command.startswith("$J=G53")
+    assert caught.value.axis == "x"
+    assert stage.move_to_um({"x": -2000.0})["x"] == pytest.approx(-2000.0, abs=1.0)
+
+
+def test_a_soft_limit_alarm_keeps_the_position_but_asks_for_homing(bench):
+    stage = bench.homed()
+    bench.transport.write(b"G0X50\n")
+    with pytest.raises(AxisFaultError, match="position kept") as caught:
+        stage.move_by_um({"x": -100.0})
+    assert not caught.value.loses_position
+    stage.home()
+    stage.move_by_um({"x": -100.0})
+
+
+def test_a_limit_switch_stops_all_loses_the_position_and_homing_resets_it(bench):
+    stage = bench.homed()
+    bench.say(b"$20=0\n")
+    bench.say(b"G53G0X5\n")
+    bench.clock.sleep(3.0)
+    with pytest.raises(LimitSwitchError, match="hard limit") as caught:
+        stage.position_um("x")
+    assert caught.value.reply == "ALARM:1"
+    with pytest.raises(NotHomedError, match="hard limit reached"):
+        stage.move_to_um({"y": -3000.0})
+    stage.home()
+    assert stage.move_to_um({"x": -3000.0})["x"] == pytest.approx(-3000.0, abs=1.0)
+
+
+def test_a_reset_while_it_moves_is_a_lost_position(bench, monkeypatch):
+    stage = bench.homed()
+    sleep, resets = bench.clock.sleep, []
+
+    def sleep_and_reset(duration_s):
+        sleep(duration_s)
+        if not resets:
+            resets.append(bench.transport.write(codec.SOFT_RESET))
+
+    monkeypatch.setattr(bench.clock, "sleep", sleep_and_reset)
+    with pytest.raises(LostPositionError) as caught:
+        stage.move_to_um({"x": -20_000.0})
+    assert caught.value.reply in ("ALARM:3", "")
+    assert not stage.is_homed("x")
+
+
+def test_a_restart_that_nobody_asked_for_is_a_lost_position(bench):
+    stage = bench.homed()
+    bench.device.power_cycle()
+    with pytest.raises(LostPositionError, match="restarted"):
+        stage.position_um("x")
+    with pytest.raises(NotHomedError):
+        stage.position_um("y")
+
+
+def test_homing_that_is_switched_off_is_refused_with_what_to_do():
+    bench = Bench(settings={codec.HOMING: 0})
+    stage = bench.stage()
+    with pytest.raises(CommandRefusedError, match=r"switch homing on \(\$22=1\)"):
+        stage.home()
+    assert not stage.is_homed("x")
+
+
+def test_homing_some_axes_needs_firmware_that_can():
+    stage = Bench(options="V").stage()
+    with pytest.raises(CommandRefusedError, match="homes all axes together"):
+        stage.home(["x"])
+    able = Bench()
+    stage = able.stage()
+    stage.home(["y"])
+    assert stage.is_homed("y")
+    assert not stage.is_homed("x")
+    stage.home(["x"])
+    assert stage.is_homed("x")
+
+
+def test_a_switch_that_is_not_found_leaves_the_axes_unknown(bench):
+    stage = bench.stage()
+    bench.device.faults.inject("stall")
+    with pytest.raises(AxisFaultError, match="did not find the limit switch") as caught:
+        stage.home()
+    assert caught.value.reply == "ALARM:9"
+    assert not stage.is_homed("x")
+
+
+@pytest.mark.parametrize("fault", ["drop_reply", "garble_reply"])
+def test_homing_whose_end_was_not_heard_does_not_count(bench, fault):
+    stage = bench.stage()
+    bench.device.faults.inject(fault, when=lambda occasion: occasion.reply == b"ok\r\n")
+    with pytest.raises(LostPositionError, match="ended without an answer"):
+        stage.home()
+    assert not stage.is_homed("x")
+    stage.home()
+    assert stage.is_homed("x")
+
+
+def test_homing_that_never_began_does_not_count(bench):
+    stage = bench.homed()
+    bench.device.faults.inject("drop_command", when=lambda occasion: b"$H" in occasion.command)
+    with pytest.raises(LostPositionError, match="ended without an answer"):
+        stage.home()
+    assert not stage.is_homed("x")
+
+
+def test_an_open_door_is_a_fault_that_is_named(bench):
+    stage = bench.homed()
+    bench.device.faults.inject("door")
+    with pytest.raises((AxisFaultError, CommandRefusedError)):
+        stage.move_by_um({"x": -100.0})
+    with pytest.raises(AxisFaultError, match="state Door"):
+        stage.wait_until_settled()
+
+
+def test_a_program_that_runs_is_held_by_a_stop(bench):
+    stage = bench.homed()
+    bench.say(b"G53G1X-20F60\n")
+    stage.stop()
+    here_um = bench.device.position_um("X")
+    bench.clock.sleep(30.0)
+    assert bench.device.position_um("X") == here_um
+    with pytest.raises(AxisFaultError, match="state Hold"):
+        stage.wait_until_settled()
+    stage.home()
+    stage.move_by_um({"x": -10.0})
+
+
+def test_a_speed_faster_than_the_axis_is_refused(bench):
+    stage = bench.stage()
+    top_um_s = BENCH_AXES["X"].max_speed_um_s
+    assert stage.speed_um_s("x") == pytest.approx(top_um_s)
+    with pytest.raises(SpeedLimitError, match=f"up to {top_um_s:g}"):
+        stage.set_speed_um_s("x", top_um_s * 1.01)
+
+
+def test_a_controller_that_boots_slowly_is_waited_for_and_a_silent_one_is_reset_once(bench):
+    bench.device.faults.inject("drop_command", times=5)
+    bench.stage()
+    stuck = Bench()
+    stuck.homed()
+    stuck.say(b"$20=0\n")
+    stuck.say(b"G53G0X5\n")
+    stuck.clock.sleep(3.0)
+    assert stuck.say(b"?") == "ALARM:1\r\n[MSG:Reset to continue]\r\n"
+    stuck.stage().home()
+    dead = Bench()
+    dead.device.faults.inject("drop_command", times=math.inf)
+    with pytest.raises(TransportTimeoutError, match="check power"):
+        dead.stage()
+
+
+def test_an_axis_that_the_controller_does_not_have_shows_at_construction():
+    two = Bench(axes={letter: BENCH_AXES[letter] for letter in "XY"})
+    with pytest.raises(CommandRefusedError, match="no such axis"):
+        two.stage({"focus": "Z"})
+    with pytest.raises(ValueError, match="use one of X, Y"):
+        two.stage({"focus": "Q"})
+
+
+def test_a_tolerance_finer_than_its_reports_is_refused(bench):
+    with pytest.raises(ValueError, match="loosen it"):
+        bench.stage(settings=StageSettings(tolerance_um=0.5))
+
+
+def test_it_says_what_it_is(bench):
+    assert identify(bench.transport, bench.clock) == ("version 1.1h.20190825:, options VH,15,128")
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        (b"\n", "ok\r\n"),
+        (
+            b"$\n",
+            "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]\r\nok\r\n",
+        ),
+        (b"$I\n", "[VER:1.1h.20190825:]\r\n[OPT:VH,15,128]\r\nok\r\n"),
+        (b"$N\n", "$N0=\r\n$N1=\r\nok\r\n"),
+        (b"$999=1\n", "error:3\r\n"),
+        (b"$110=-5\n", "error:4\r\n"),
+        (b"X" * 100 + b"\n", "error:11\r\n"),
+        (b"$X\n", "[MSG:Caution: Unlocked]\r\nok\r\n"),
+        (b"$X\n$J=X1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:22\r\n"),
+        (b"$X\n$J=F100\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:26\r\n"),
+        (b"$X\n$JX1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:16\r\n"),
+        (b"$X\n$J=M5F1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:16\r\n"),
+        (b"$X\n$J=X-99F100\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:15\r\n"),
+        (b"$X\nG1X-1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:22\r\n"),
+        (b"$X\nG2X1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:20\r\n"),
+        (b"$X\nG0 X\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:2\r\n"),
+        (b"$X\n(a comment) M5 ; more\n", "[MSG:Caution: Unlocked]\r\nok\r\nok\r\n"),
+    ],
+)
+def test_the_firmware_answers_as_its_documentation_says(line, answer):
+    device = GrblController(ManualClock())
+    device.due()
+    assert device.feed(line).decode("ascii") == answer
+
+
+def test_work_offset_and_overrides_come_in_some_reports_only(bench):
+    bench.homed()
+    reports = [bench.say(b"?") for _ in range(40)]
+    assert sum("WCO:" in report for report in reports) == 4
+    assert sum("Ov:" in report for report in reports) == 4
+    assert not any("WCO:" in report and "Ov:" in report for report in reports)
+
+
+def test_settings_are_told_line_by_line(bench):
+    lines = bench.say(b"$$\n").splitlines()
+    assert "$110=480.000" in lines
+    assert "$130=25.400" in lines
+    assert lines[-1] == "ok"

@@ -1,0 +1,378 @@
+"""A PTP camera over simulated USB: right frames, and for every fault one clear line or a cure."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import (
+    CameraBusyError,
+    CameraSettingError,
+    CaptureError,
+    CardFullError,
+    DownloadError,
+    PtpFormatError,
+    PtpRefusedError,
+    RawFrameError,
+    UsbClaimedError,
+    UsbGoneError,
+    UsbPermissionError,
+    UsbTimeoutError,
+)
+from drivers.ptp import PtpCamera, PtpSession, PtpSettings, is_raw
+from drivers.ptp_codec import Format, ObjectInfo, Operation
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.usb import open_device
+from simulators.clock import ManualClock
+from simulators.ptp import ANY_EXPOSURE, FAULTS, PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb
+
+SHAPE = (60, 80)
+LACKS = {True: (), False: (Operation.GET_PARTIAL_OBJECT,)}
+
+
+class Bench:
+    """A camera on a simulated bus, whose every exposure shows another mosaic."""
+
+    def __init__(self, settings=None, packet_size=512, **options):
+        self.clock = ManualClock()
+        self.exposed = []
+        self.simulator = PtpCameraSimulator(self.see, self.clock, **options)
+        self.function = PtpUsbFunction(self.simulator, packet_size)
+        self.bus = SimulatedUsb(self.clock, self.function)
+        self.settings = settings
+
+    def see(self, exposure_s):
+        generator = np.random.default_rng(len(self.exposed))
+        self.exposed.append(generator.integers(0, 4095, SHAPE, dtype=np.uint16))
+        return self.exposed[-1]
+
+    @property
+    def faults(self):
+        return self.simulator.faults
+
+    def open(self, **options):
+        device = open_device(PTP_INTERFACE, backend=self.bus)
+        session = PtpSession(PtpUsb(device, self.clock), self.clock, self.settings)
+        return PtpCamera(session, **options)
+
+    def snap_is_good(self, camera):
+        frame = camera.snap()
+        np.testing.assert_array_equal(frame.mosaic, self.exposed[-1])
+        return frame
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_each_frame_is_the_one_just_exposed(bench):
+    camera = bench.open()
+    names = [bench.snap_is_good(camera).metadata["name"] for _ in range(3)]
+    assert names == ["EMMC0001.DNG", "EMMC0002.DNG", "EMMC0003.DNG"]
+
+
+def test_the_first_frame_tells_the_size_and_colours(bench):
+    camera = bench.open()
+    assert camera.shape == SHAPE
+    assert camera.cfa == "rggb"
+    assert len(bench.exposed) == 1
+
+
+def test_a_stated_size_needs_no_frame(bench):
+    camera = bench.open(shape=SHAPE, cfa="rggb")
+    assert (camera.shape, camera.cfa) == (SHAPE, "rggb")
+    assert not bench.exposed
+
+
+@pytest.mark.parametrize(
+    ("asked_s", "taken_s"), [(0.01, 0.008), (0.05, 0.0667), (30.0, 30.0), (1 / 1000, 0.001)]
+)
+def test_an_exposure_becomes_the_nearest_that_the_camera_has(bench, asked_s, taken_s):
+    camera = bench.open()
+    camera.set_exposure_s(asked_s)
+    assert camera.exposure_s == pytest.approx(taken_s)
+    assert bench.snap_is_good(camera).exposure_s == pytest.approx(taken_s)
+
+
+def test_a_range_is_taken_in_its_steps():
+    camera = Bench(span=ANY_EXPOSURE).open()
+    camera.set_exposure_s(0.123_46)
+    assert camera.exposure_s == pytest.approx(0.1235)
+
+
+def test_the_exposure_takes_its_time(bench):
+    camera = bench.open()
+    camera.set_exposure_s(8.0)
+    before_s = bench.clock.now_s()
+    camera.snap()
+    assert 8.0 <= bench.clock.now_s() - before_s < 9.0
+
+
+def test_a_camera_that_keeps_its_own_exposure_is_taken_at_its_word(bench):
+    camera = bench.open()
+    before_s = camera.exposure_s
+    bench.faults.inject("stuck_exposure")
+    camera.set_exposure_s(1.0)
+    assert camera.exposure_s == before_s
+    assert bench.snap_is_good(camera).exposure_s == pytest.approx(before_s)
+
+
+def test_gain_is_iso_over_the_lowest_and_acts_above_the_black_level(bench):
+    bench.see = None
+    bench.simulator._render = lambda exposure_s: np.full(SHAPE, 164, np.uint16)
+    camera = bench.open()
+    assert camera.gain_limits == (1.0, 16.0)
+    camera.set_gain(3.0)
+    assert camera.gain == 4.0
+    frame = camera.snap()
+    assert frame.gain == 4.0
+    assert (frame.mosaic == 64 + 4 * 100).all()
+
+
+def test_the_camera_tells_its_time_and_battery(bench):
+    camera = bench.open()
+    first, second = camera.snap(), camera.snap()
+    assert second.camera_time_s >= first.camera_time_s > 1.7e9
+    assert camera.battery_percent == 87
+
+
+@pytest.mark.parametrize("partial", [True, False])
+@pytest.mark.parametrize("packet_size", [64, 512, 1024])
+def test_pictures_arrive_whole_with_or_without_parts(partial, packet_size):
+    bench = Bench(PtpSettings(part_bytes=1000), packet_size, lacks=LACKS[partial])
+    bench.snap_is_good(bench.open())
+
+
+def test_progress_is_told_to_the_end(bench):
+    seen = []
+    bench.settings = PtpSettings(part_bytes=4000)
+    camera = bench.open()
+    camera.on_progress = lambda done, size: seen.append((done, size))
+    frame = camera.snap()
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1] == (len(frame.original), len(frame.original))
+    assert len(seen) == -(-len(frame.original) // 4000)
+
+
+def test_of_a_pair_the_raw_file_is_taken():
+    bench = Bench(quality="raw+jpeg")
+    camera = bench.open()
+    for number in (1, 2, 3):
+        assert bench.snap_is_good(camera).metadata["name"] == f"EMMC000{number}.DNG"
+
+
+def test_a_camera_set_to_jpeg_is_told_what_to_set():
+    bench = Bench(quality="jpeg")
+    with pytest.raises(CaptureError, match=r"EMMC0001\.JPG: set its image quality to RAW"):
+        bench.open().snap()
+
+
+def test_pictures_stay_on_the_card_unless_they_are_to_go():
+    bench = Bench(quality="raw+jpeg")
+    camera = bench.open()
+    camera.snap()
+    assert len(bench.simulator.objects) == 3
+    camera.close()
+    bench.open(from_card=True).snap()
+    assert len(bench.simulator.objects) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "format_", "raw"),
+    [
+        ("A.DNG", "dng", Format.DNG, True),
+        ("DSC_0001.NEF", "nef", Format.UNDEFINED, True),
+        ("IMG_0001.CR3", "cr3", 0xB108, True),
+        ("IMG_0001.JPG", "jpg", Format.JPEG, False),
+        ("MVI_0001.MOV", "mov", Format.UNDEFINED, False),
+        ("noname", "", 0xB101, False),
+    ],
+)
+def test_raw_files_are_told_by_format_or_name(name, kind, format_, raw):
+    assert is_raw(ObjectInfo(1, format_, 100, 0, name)) is raw
+
+
+CURED = {
+    "busy": 3,
+    "drop_event": 2,
+    "duplicate_event": 2,
+    "drop_complete": 1,
+    "stall_in_download": 1,
+    "lost_bytes": 1,
+    "short_part": 5,
+    "silent": 0,
+}
+
+
+@pytest.mark.parametrize(("fault", "times"), [(f, n) for f, n in CURED.items() if n])
+@pytest.mark.parametrize("partial", [True, False])
+def test_the_driver_makes_up_for(fault, times, partial):
+    if fault == "short_part" and not partial:
+        pytest.skip("there are no parts")
+    bench = Bench(PtpSettings(part_bytes=3000), lacks=LACKS[partial])
+    camera = bench.open()
+    bench.faults.inject(fault, times)
+    bench.snap_is_good(camera)
+    assert not bench.faults.strikes(fault), "the fault never struck"
+    bench.snap_is_good(camera)
+
+
+@pytest.mark.parametrize(
+    ("fault", "times", "error", "message"),
+    [
+        ("torn_raw", 1, RawFrameError, "torn"),
+        ("wrong_size", 1, RawFrameError, "58x80 pixels"),
+        ("busy", math.inf, CameraBusyError, r"busy for 10\.\d s .*battery"),
+        ("late", 1, CaptureError, "nothing new on the card"),
+        ("silent", 1, UsbTimeoutError, "silent for 5 s"),
+        ("garbled_header", 1, PtpFormatError, "garbled"),
+        ("card_full", 1, CardFullError, "full or missing"),
+        ("lost_bytes", math.inf, DownloadError, "still on the card"),
+        ("short_part", math.inf, DownloadError, "the camera sent nothing"),
+        ("stall_in_download", math.inf, DownloadError, "stalled"),
+    ],
+)
+def test_a_fault_is_one_clear_line_and_the_camera_is_good_again(fault, times, error, message):
+    bench = Bench(PtpSettings(part_bytes=1 << 20))
+    camera = bench.open(shape=SHAPE)
+    if fault in ("stall_in_download", "short_part"):
+        # Each time half of what is left comes before the fault: the last packets never do.
+        camera.session.settings = PtpSettings(part_bytes=1 << 20, attempts=1)
+    bench.faults.inject(fault, times)
+    started_s = bench.clock.now_s()
+    with pytest.raises(error, match=message) as caught:
+        camera.snap()
+    assert "\n" not in str(caught.value)
+    assert bench.clock.now_s() - started_s < 60
+    bench.faults.clear()
+    if fault == "late":
+        bench.clock.sleep(60.0)
+    bench.snap_is_good(camera)
+
+
+def test_a_picture_that_comes_too_late_does_not_pass_for_the_next(bench):
+    camera = bench.open()
+    bench.faults.inject("late")
+    with pytest.raises(CaptureError):
+        camera.snap()
+    bench.clock.sleep(60.0)
+    assert len(bench.exposed) == 0
+    frame = bench.snap_is_good(camera)
+    assert len(bench.exposed) == 2
+    assert frame.metadata["name"] == "EMMC0002.DNG"
+
+
+@pytest.mark.parametrize("parts", range(4))
+def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(parts):
+    bench = Bench(PtpSettings(part_bytes=3000))
+    camera = bench.open()
+    bench.faults.inject("unplug_in_download", skip=parts)
+    with pytest.raises(UsbGoneError, match="plug it in"):
+        camera.snap()
+    with pytest.raises(UsbGoneError):
+        camera.snap()
+    camera.close()
+    bench.bus.plug(bench.function)
+    bench.snap_is_good(bench.open())
+
+
+def test_a_session_that_somebody_left_open_is_ended(bench):
+    bench.simulator.session = 77
+    bench.snap_is_good(bench.open())
+
+
+def test_an_exchange_that_an_earlier_program_left_in_the_pipes_is_cleared(bench):
+    first = bench.open()
+    bench.faults.inject("stall_in_download", math.inf)
+    first.session.settings = PtpSettings(attempts=1)
+    with pytest.raises(DownloadError):
+        first.snap()
+    bench.faults.clear()
+    first.session._transport.close()
+    bench.snap_is_good(bench.open())
+
+
+@pytest.mark.parametrize("partial", [True, False])
+@pytest.mark.parametrize("at", [0, 1, 3])
+def test_ctrl_c_in_a_download_leaves_a_usable_camera(partial, at):
+    bench = Bench(PtpSettings(part_bytes=3000), lacks=LACKS[partial])
+    camera = bench.open()
+    calls = []
+
+    def interrupt(done, size):
+        calls.append(done)
+        if len(calls) > at:
+            raise KeyboardInterrupt
+
+    camera.on_progress = interrupt
+    if not partial and at == 3:
+        pytest.skip("so small a picture comes in fewer pieces")
+    with pytest.raises(KeyboardInterrupt):
+        camera.snap()
+    camera.on_progress = lambda done, size: None
+    bench.snap_is_good(camera)
+
+
+def test_a_closed_camera_can_be_opened_by_the_next_program(bench):
+    with bench.open() as camera:
+        camera.snap()
+    assert bench.simulator.session == 0
+    bench.snap_is_good(bench.open())
+
+
+def test_a_camera_claimed_by_the_desktop_says_so(bench):
+    bench.bus.seize(bench.function)
+    with pytest.raises(UsbClaimedError, match="file manager"):
+        bench.open()
+    bench.bus.release(bench.function)
+    bench.snap_is_good(bench.open())
+
+
+def test_a_camera_without_permission_names_the_udev_rule(bench):
+    bench.bus.deny(bench.function)
+    with pytest.raises(UsbPermissionError, match=r"99-emmc-rig\.rules"):
+        bench.open()
+
+
+def test_a_card_that_fills_up_is_an_error_and_emptying_it_helps():
+    bench = Bench(capacity_bytes=15_000)
+    camera = bench.open()
+    camera.snap()
+    camera.snap()
+    with pytest.raises(CardFullError):
+        camera.snap()
+    bench.simulator.objects.clear()
+    bench.snap_is_good(camera)
+
+
+def test_a_picture_deleted_on_the_camera_is_refused_with_advice(bench):
+    session = bench.open().session
+    with pytest.raises(PtpRefusedError, match="invalid handle: the picture is gone"):
+        session.download(99, ObjectInfo(1, Format.DNG, 100, 0, "X.DNG"))
+
+
+def test_a_camera_that_cannot_be_released_says_so():
+    bench = Bench(lacks=(Operation.INITIATE_CAPTURE,))
+    with pytest.raises(PtpRefusedError, match=r"initiate capture.*PC remote"):
+        bench.open()
+
+
+def test_a_frame_of_other_colours_or_exposure_is_refused(bench):
+    with pytest.raises(RawFrameError, match="rggb instead of bggr"):
+        bench.open(cfa="bggr").snap()
+
+
+def test_a_setting_that_the_camera_lacks_is_said_to_be_set_by_hand(bench):
+    bench.simulator._values = {}
+    camera = bench.open()
+    with pytest.raises(CameraSettingError, match="not told over PTP"):
+        camera.set_exposure_s(0.1)
+    assert camera.gain_limits == (1.0, 1.0)
+
+
+def test_every_fault_of_the_simulator_is_tested_here():
+    source = Path(__file__).read_text(encoding="utf-8")
+    assert all(f'"{fault}"' in source for fault in FAULTS)

@@ -1,0 +1,270 @@
+"""Hostile cameras: whatever bytes come, however they are cut, the driver ends in its own errors.
+
+The number of cases is `--fuzz-cases`; nightly: `pytest tests/test_ptp_fuzz.py --fuzz-cases 100000`.
+"""
+
+import random
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers import ptp_codec as codec
+from drivers.errors import DriverError
+from drivers.ptp import PtpCamera, PtpSession, PtpSettings
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.raw import decode_raw
+from drivers.usb import open_device
+from simulators.clock import ManualClock
+from simulators.dng import encode_dng
+from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb, StallError, UnpluggedError
+
+SHAPE = (24, 26)
+MOSAIC = np.random.default_rng(0).integers(0, 4095, SHAPE, dtype=np.uint16)
+DNG = encode_dng(MOSAIC, "rggb", 64, 4095, 0.01)
+PACKET = 64
+MOST_TRANSFERS = 100_000
+"""More than any honest session takes by far: beyond it the driver is caught in a loop."""
+
+DECODERS = (
+    codec.decode_header,
+    codec.decode_message,
+    codec.decode_handles,
+    codec.decode_description,
+    codec.DeviceInfo.decode,
+    codec.StorageInfo.decode,
+    codec.ObjectInfo.decode,
+)
+SAMPLES = (
+    codec.ObjectInfo(1, codec.Format.DNG, 100, 1, "A.DNG", "20240101T000000").encode(),
+    codec.StorageInfo(1 << 40, 1 << 39, 1000, "card", "label").encode(),
+    codec.DeviceInfo((0x1001,) * 9, (0x4002,), (0x500D,), (), (), "M", "D", "1", "2").encode(),
+    codec.encode_description(
+        codec.PropertyDescription(0x500D, 6, True, 100, 100, choices=(1, 2, 3))
+    ),
+    codec.encode_message(codec.Message(codec.Kind.RESPONSE, 0x2001, 5, (1, 2))),
+    codec.encode_handles((1, 2, 3)),
+)
+
+
+@pytest.fixture
+def fuzz(request):
+    """Run a check on as many random cases as were asked for."""
+    cases = request.config.getoption("--fuzz-cases")
+
+    def run(check, *strategies):
+        slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
+        chosen = settings(
+            max_examples=cases, deadline=None, suppress_health_check=slow, database=None
+        )
+        chosen(given(*strategies)(check))()
+
+    return run
+
+
+@contextmanager
+def errors_of_the_driver_allowed():
+    try:
+        yield
+    except DriverError as error:
+        if "\n" in str(error):
+            raise AssertionError("an error of more than one line") from error
+
+
+def damage(data, seed):
+    """Return the bytes with a few of them changed, lost, doubled or added."""
+    generator = random.Random(seed)
+    damaged = bytearray(data)
+    for _ in range(generator.randrange(1, 5)):
+        at = generator.randrange(len(damaged) + 1)
+        match generator.randrange(5):
+            case 0 if at < len(damaged):
+                damaged[at] = generator.choice((0, 1, 0x7F, 0x80, 0xFF, generator.randrange(256)))
+            case 1:
+                del damaged[at : at + generator.randrange(1, 9)]
+            case 2:
+                damaged[at:at] = generator.randbytes(generator.randrange(1, 9))
+            case 3:
+                damaged[at:at] = damaged[at : at + 16]
+            case _:
+                del damaged[at:]
+    return bytes(damaged)
+
+
+def test_decoders_read_any_bytes_or_refuse_them_in_one_line(fuzz):
+    def check(data, sample, seed):
+        for decode in DECODERS:
+            for candidate in (data, damage(sample, seed)):
+                with errors_of_the_driver_allowed():
+                    decode(candidate)
+
+    fuzz(check, st.binary(max_size=200), st.sampled_from(SAMPLES), st.integers(0, 2**32))
+
+
+def test_values_of_any_type_are_read_or_refused(fuzz):
+    def check(data_type, data):
+        with suppress(DriverError):
+            codec.decode_value(data_type, data)
+
+    types = st.sampled_from((*range(12), *range(0x4000, 0x400C), 0xFFFF, 0x1234))
+    fuzz(check, types, st.binary(max_size=64))
+
+
+def test_a_damaged_raw_file_is_decoded_or_refused_in_one_line(fuzz):
+    def check(seed):
+        with errors_of_the_driver_allowed():
+            assert decode_raw(damage(DNG, seed)).mosaic.dtype == np.uint16
+
+    fuzz(check, st.integers(0, 2**63))
+
+
+@dataclass
+class Mischief:
+    """What happens to the pieces that a camera sends: a fault with some probability."""
+
+    seed: int
+    probability: float
+    garbage: bool
+
+
+class HostileFunction(PtpUsbFunction):
+    """A camera whose answers and events are damaged, lost, doubled, cut anew or never end."""
+
+    def __init__(self, camera, mischief):
+        super().__init__(camera, PACKET)
+        self._random = random.Random(mischief.seed)
+        self._mischief = mischief
+        self._held = []
+        self.transfers = 0
+
+    def bulk_in(self, endpoint, length, timeout_s):
+        self.transfers += 1
+        assert self.transfers < MOST_TRANSFERS, "the driver never ends"
+        generator = self._random
+        if self._held:
+            self._ends = True
+            return self._held.pop(0)
+        if self._mischief.garbage:
+            if generator.random() < 0.3:
+                return None
+            return generator.randbytes(generator.choice((0, 4, 12, 16, 64, 200)))
+        piece = super().bulk_in(endpoint, length, timeout_s)
+        if piece is None or generator.random() > self._mischief.probability:
+            return piece
+        data = bytes(piece)
+        match generator.randrange(10):
+            case 0:
+                return None
+            case 1:
+                self._held.append(data)
+            case 2:
+                at = generator.randrange(len(data) + 1)
+                self._held.append(data[at:])
+                return data[:at]
+            case 3:
+                self._held.append(b"")
+            case 4:
+                self._held.append(generator.randbytes(generator.randrange(40)))
+            case 5:
+                raise StallError
+            case 6 if generator.random() < 0.2:
+                raise UnpluggedError
+            case 7:
+                self._ends = not self._ends
+            case _:
+                return damage(data, generator.randrange(1 << 32))
+        return data
+
+    def interrupt(self, endpoint, length, timeout_s):
+        self.transfers += 1
+        assert self.transfers < MOST_TRANSFERS, "the driver never ends"
+        event = super().interrupt(endpoint, length, timeout_s)
+        if event is None or self._random.random() > self._mischief.probability:
+            return event
+        return damage(event, self._random.randrange(1 << 32))[:length]
+
+    def control(self, request_type, request, value, index, data):
+        if self._random.random() < self._mischief.probability:
+            return self._random.randbytes(self._random.randrange(8))
+        return super().control(request_type, request, value, index, data)
+
+
+def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time(fuzz):
+    outcomes = {"case": 0, "success": 0}
+
+    def check(seed, probability, garbage, parts):
+        clock = ManualClock()
+        simulator = PtpCameraSimulator(lambda exposure_s: MOSAIC, clock)
+        function = HostileFunction(simulator, Mischief(seed, probability, garbage))
+        bus = SimulatedUsb(clock, function)
+        patience = PtpSettings(part_bytes=parts, busy_limit_s=2.0, capture_limit_s=3.0)
+        outcomes["case"] += 1
+        with errors_of_the_driver_allowed():
+            device = open_device(PTP_INTERFACE, backend=bus)
+            with PtpCamera(PtpSession(PtpUsb(device, clock), clock, patience)) as camera:
+                for exposure_s in (0.01, 0.5):
+                    with suppress(DriverError):
+                        camera.set_exposure_s(exposure_s)
+                        camera.set_gain(2.0)
+                    assert camera.snap().mosaic.dtype == np.uint16
+            outcomes["success"] += 1
+        assert clock.now_s() < 20_000
+
+    fuzz(
+        check,
+        st.integers(0, 2**63),
+        st.sampled_from((0.01, 0.05, 0.3, 1.0)),
+        st.sampled_from((False, False, False, True)),
+        st.sampled_from((500, 1 << 20)),
+    )
+    assert 0 < outcomes["success"] < outcomes["case"]
+
+
+class SplittingFunction(PtpUsbFunction):
+    """An honest camera that cuts what it sends where it likes, at whole packets."""
+
+    def __init__(self, camera, seed):
+        super().__init__(camera, PACKET)
+        self._random = random.Random(seed)
+        self._rest = []
+
+    def bulk_in(self, endpoint, length, timeout_s):
+        if self._rest:
+            piece, self._ends = self._rest.pop(0)
+            return piece
+        piece = super().bulk_in(endpoint, length, timeout_s)
+        if piece is None:
+            return None
+        data, ends = bytes(piece), self._ends
+        if self._random.random() < 0.3 and len(data) > codec.HEADER_SIZE:
+            # Some cameras send the header of a data container in a packet of its own.
+            kind = codec.decode_header(data).kind if data[4:6] in (b"\x02\x00",) else None
+            if kind == codec.Kind.DATA and ends:
+                self._rest.append((data[codec.HEADER_SIZE :], True))
+                self._ends = True
+                return data[: codec.HEADER_SIZE]
+        cuts = sorted(
+            PACKET * self._random.randrange(1 + len(data) // PACKET)
+            for _ in range(self._random.randrange(4))
+        )
+        pieces = [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
+        pieces = [piece for piece in pieces[:-1] if piece] + [pieces[-1]]
+        self._rest = [(piece, False) for piece in pieces[:-1]] + [(pieces[-1], ends)]
+        piece, self._ends = self._rest.pop(0)
+        return piece
+
+
+def test_however_an_honest_camera_cuts_its_answers_they_arrive(fuzz):
+    def check(seed):
+        clock = ManualClock()
+        simulator = PtpCameraSimulator(lambda exposure_s: MOSAIC, clock)
+        bus = SimulatedUsb(clock, SplittingFunction(simulator, seed))
+        device = open_device(PTP_INTERFACE, backend=bus)
+        with PtpCamera(PtpSession(PtpUsb(device, clock), clock)) as camera:
+            np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+    fuzz(check, st.integers(0, 2**63))

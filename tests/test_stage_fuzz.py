@@ -1,0 +1,386 @@
+"""Codecs and whole drivers against bytes that nobody meant to send.
+
+Never a hang, never an exception outside the drivers' own, never a position that was not read.
+`python -m pytest tests/test_stage_fuzz.py --fuzz-cases 100000` is the nightly size.
+"""
+
+import random
+import re
+import struct
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers import apt_codec, grbl_codec, zaber_codec
+from drivers.apt import AptAxis, AptStage
+from drivers.errors import DriverError, GarbledReplyError
+from drivers.grbl import GrblStage
+from drivers.stage import StageSettings
+from drivers.zaber import ZaberStage
+from simulators.apt import COUNTS_PER_UM, Z825, AptController
+from simulators.clock import ManualClock
+from simulators.grbl import GrblController
+from simulators.wire import MemoryTransport
+from simulators.zaber import AxisSpec, ZaberChain
+
+CARELESS = StageSettings(poll_s=0.2, settle_s=0.0)
+MOST_WRITES = 3000
+"""A driver that writes more often for one call counts as hung."""
+SIMULATED_LIMIT_S = 600.0
+SAME_EVERY_TIME = 2000
+
+ZABER_LINES = (
+    b"@01 1 10 OK BUSY -- 0:E6\r\n",
+    b"@02 1 07 OK IDLE WR 02 WR WH\r\n",
+    b"@01 2 99 RJ IDLE -- BADDATA\r\n",
+    b"!01 1 IDLE FS\r\n",
+    b"#01 0 03 ranges: 0 to 5\r\n",
+)
+GRBL_LINES = (
+    b"ok\r\n",
+    b"error:15\r\n",
+    b"ALARM:1\r\n",
+    b"Grbl 1.1h ['$' for help]\r\n",
+    b"$110=500.000\r\n",
+    b"[MSG:Reset to continue]\r\n",
+    b">G54G20:ok\r\n",
+    b"<Idle|MPos:0.000,-10.000,5.000|FS:0,0|WCO:0.000,1.551,5.664>\r\n",
+    b"<Hold:1|WPos:-2.500,0.000,11.000|Bf:15,128|FS:500,8000|Pn:XZ>\r\n",
+)
+APT_MESSAGES = (
+    bytes.fromhex("44 04 01 00 01 50"),
+    bytes.fromhex("91 04 0e 00 81 50 01 00 40 0d 03 00 fe ff 00 00 10 05 00 80"),
+    bytes.fromhex("15 04 0e 00 81 50 01 00 00 00 00 00 05 01 00 00 87 b5 0b 00"),
+    bytes.fromhex("81 00 44 00 81 50") + bytes(68),
+)
+
+
+@pytest.fixture(scope="module")
+def cases(request):
+    return request.config.getoption("--fuzz-cases")
+
+
+def run(cases, *strategies):
+    """Return a decorator that runs a function on many examples.
+
+    They are the same ones every time in the suite, and new ones in a nightly run.
+    """
+    careful = settings(
+        max_examples=cases,
+        deadline=None,
+        derandomize=cases <= SAME_EVERY_TIME,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    return lambda body: careful(given(*strategies)(body))()
+
+
+def part_of(cases):
+    """A whole driver answers in the time of many codec calls."""
+    return max(1, cases // 4)
+
+
+def check_one_line(error):
+    assert "\n" not in str(error)
+
+
+def spoilt(messages):
+    """Valid messages with a few bytes changed, lost, doubled or put in, and plain noise."""
+    edits = st.lists(
+        st.tuples(st.sampled_from("clid"), st.integers(0, 200), st.integers(0, 255)), max_size=4
+    )
+    return st.one_of(
+        st.builds(edited, st.sampled_from(messages), edits),
+        st.binary(max_size=60),
+        st.builds(lambda noise: noise + b"\r\n", st.binary(max_size=40)),
+    )
+
+
+def edited(message, edits):
+    data = bytearray(message)
+    for kind, place, value in edits:
+        place %= max(1, len(data))
+        if kind == "c" and data:
+            data[place] = value
+        elif kind == "l":
+            del data[place : place + 1]
+        elif kind == "i":
+            data.insert(place, value)
+        elif data:
+            data.insert(place, data[place])
+    return bytes(data)
+
+
+def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum(cases):
+    accepted = []
+
+    @run(cases, spoilt(ZABER_LINES), st.booleans())
+    def _(line, required):
+        try:
+            message = zaber_codec.decode_message(line, required)
+        except GarbledReplyError as error:
+            check_one_line(error)
+            return
+        accepted.append(message)
+        body, colon, checksum = line.rstrip(b"\r\n")[1:].rpartition(b":")
+        if required or (colon and re.fullmatch(rb"[0-9A-Fa-f]{2}", checksum)):
+            assert (sum(body) + int(checksum, 16)) % 256 == 0
+        assert message.data.encode("ascii") in line
+
+    assert accepted
+
+
+def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
+    accepted = []
+
+    @run(cases, spoilt(GRBL_LINES))
+    def _(line):
+        try:
+            message = grbl_codec.decode_line(line)
+        except GarbledReplyError as error:
+            check_one_line(error)
+            return
+        accepted.append(message)
+        if isinstance(message, grbl_codec.Status):
+            told = [float(word) for word in re.findall(rb"-?\d+(?:\.\d+)?", line)]
+            for position in (message.machine, message.work, message.offset):
+                assert all(number in told for number in position or ())
+
+    assert any(isinstance(message, grbl_codec.Status) for message in accepted)
+
+
+def test_no_bytes_make_the_apt_codec_fail_and_what_it_reads_it_writes_again(cases):
+    accepted = []
+
+    @run(cases, spoilt(APT_MESSAGES))
+    def _(raw):
+        try:
+            message = apt_codec.decode(raw)
+        except GarbledReplyError as error:
+            check_one_line(error)
+            return
+        accepted.append(message)
+        again = apt_codec.encode(
+            message.id,
+            message.destination,
+            message.param1,
+            message.param2,
+            message.data,
+            message.source,
+        )
+        assert again == raw
+        for decode in (
+            apt_codec.decode_status,
+            apt_codec.decode_velocity,
+            apt_codec.decode_home,
+            apt_codec.decode_info,
+            apt_codec.decode_complaint,
+        ):
+            try:
+                decode(message)
+            except GarbledReplyError:
+                continue
+
+    assert accepted
+
+
+def test_every_command_that_the_codecs_write_the_firmware_reads_back(cases):
+    @run(part_of(cases), st.integers(1, 99), st.integers(0, 9), st.integers(1, 99))
+    def _(device, axis, message_id):
+        number = device * axis - message_id
+        raw = zaber_codec.encode_command(device, axis, message_id, f"move rel {number}")
+        body, _, checksum = raw[1:-1].partition(b":")
+        assert (sum(body) + int(checksum, 16)) % 256 == 0
+
+    @run(part_of(cases), st.integers(-(2**31), 2**31 - 1), st.integers(1, 6))
+    def _(position, channel):
+        raw = apt_codec.encode(0x0453, 0x50, data=apt_codec.encode_position(channel, position))
+        assert struct.unpack("<Hi", apt_codec.decode(raw).data or b"") == (channel, position)
+
+    @run(part_of(cases), st.floats(-999, 999), st.floats(0.1, 9999))
+    def _(target_mm, feed_mm_min):
+        line = grbl_codec.jog({"X": target_mm, "Y": -target_mm}, feed_mm_min)
+        found = re.fullmatch(r"\$J=G53G90G21X(.+)Y(.+)F(.+)", line)
+        assert found is not None
+        assert float(found[1]) == pytest.approx(target_mm, abs=6e-5)
+        assert len(grbl_codec.encode_line(line)) <= grbl_codec.LINE_LENGTH
+
+
+class Liar:
+    """Firmware whose answers pass through hands that spoil them."""
+
+    def __init__(self, firmware, clock):
+        self.firmware = firmware
+        self.clock = clock
+        self.moods = []
+        self.random = random.Random(0)
+        self.heard = b""
+        self.writes = 0
+        self.unplugged = False
+        self.plugs = 1
+        self._old = b""
+
+    def lie(self, seed, moods):
+        self.random = random.Random(seed)
+        self.moods = list(moods)
+
+    def feed(self, data):
+        self.writes += 1
+        assert self.writes < MOST_WRITES, "hung"
+        assert self.clock.now_s() < SIMULATED_LIMIT_S, "hung"
+        return self._pass_on(self.firmware.feed(data), self.moods.pop(0) if self.moods else "t")
+
+    def due(self):
+        return self._pass_on(self.firmware.due(), "t")
+
+    def next_due_s(self):
+        return self.firmware.next_due_s()
+
+    def _pass_on(self, answer, mood):
+        if mood == "n":  # nothing
+            answer = b""
+        elif mood == "r":  # random bytes
+            answer = self.random.randbytes(self.random.randrange(60))
+        elif mood == "s":  # spoilt
+            edits = [
+                (self.random.choice("clid"), self.random.randrange(200), self.random.randrange(256))
+                for _ in range(self.random.randrange(1, 4))
+            ]
+            answer = edited(answer, edits)
+        elif mood == "o":  # an older answer
+            answer = self._old
+        elif mood == "d":  # twice
+            answer += answer
+        elif mood == "l":  # lines of the protocols, of whatever kind
+            answer = self.random.choice(ZABER_LINES + GRBL_LINES + APT_MESSAGES)
+        if answer and mood == "t":
+            self._old = answer
+        self.heard += answer
+        return answer
+
+
+MOODS = st.lists(st.sampled_from("ttnrsodl"), max_size=30)
+STEPS = ("position", "homed", "move", "jog", "stop", "home", "settle")
+PLANS = st.lists(st.sampled_from(STEPS), max_size=4)
+
+
+def quick(spec):
+    """The axis, so quick that a test spends its time on answers and not on waiting."""
+    return AxisSpec(
+        travel_um=5000.0,
+        microstep_um=spec.microstep_um,
+        max_speed_um_s=50_000.0,
+        acceleration_um_s2=1e7,
+        start_um=300.0,
+    )
+
+
+def zaber(clock):
+    liar = Liar(ZaberChain(clock, {(1, 1): quick(AxisSpec())}), clock)
+    wire = MemoryTransport(liar, clock)
+    return liar, ZaberStage(wire, {"x": (1, 1)}, AxisSpec().microstep_um, clock, CARELESS)
+
+
+def grbl(clock):
+    liar = Liar(GrblController(clock, {"X": quick(AxisSpec(microstep_um=0.5))}), clock)
+    return liar, GrblStage(MemoryTransport(liar, clock), {"x": "X"}, clock, CARELESS)
+
+
+def apt(clock):
+    liar = Liar(AptController(clock, {apt_codec.USB_UNIT: quick(Z825)}), clock)
+    return liar, AptStage({"x": AptAxis(MemoryTransport(liar, clock))}, clock, CARELESS)
+
+
+def zaber_positions_um(heard):
+    found = re.findall(rb"@\d\d \d (?:\d\d )?OK \S+ \S\S (-?\d+(?:\.\d+)?)", heard)
+    return [float(number) * AxisSpec().microstep_um for number in found]
+
+
+def grbl_positions_um(heard):
+    found = re.findall(rb"[MW](?:Pos|CO):(-?[\d.]+)", heard)
+    return [float(number) * 1e3 for number in found if re.fullmatch(rb"-?\d+(\.\d+)?", number)]
+
+
+def apt_positions_um(heard):
+    places = [place.start() for place in re.finditer(rb"(?=\x91\x04\x0e\x00)", heard)]
+    return [
+        int.from_bytes(heard[place + 8 : place + 12], "little", signed=True) / COUNTS_PER_UM
+        for place in places
+    ]
+
+
+DRIVERS = {
+    "zaber": (zaber, zaber_positions_um),
+    "grbl": (grbl, grbl_positions_um),
+    "apt": (apt, apt_positions_um),
+}
+
+
+@pytest.mark.parametrize("protocol", DRIVERS)
+def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_read(
+    protocol, cases
+):
+    make, positions_um = DRIVERS[protocol]
+    told = []
+
+    @run(part_of(cases), st.integers(0, 2**32), MOODS, PLANS)
+    def _(seed, moods, plan):
+        clock = ManualClock()
+        liar, stage = make(clock)
+        stage.home()
+        low_um, high_um = stage.limits_um("x")
+        middle_um = (low_um + high_um) / 2
+        calls = {
+            "position": lambda: stage.position_um("x"),
+            "homed": lambda: stage.is_homed("x"),
+            "move": lambda: stage.move_to_um({"x": middle_um})["x"],
+            "jog": lambda: stage.move_by_um({"x": 30.0})["x"],
+            "stop": stage.stop,
+            "home": stage.home,
+            "settle": stage.wait_until_settled,
+        }
+        liar.lie(seed, moods)
+        for name in plan:
+            liar.heard, liar.writes = b"", 0
+            try:
+                answer = calls[name]()
+            except DriverError as error:
+                check_one_line(error)
+                continue
+            if name in ("position", "move", "jog"):
+                told.append(answer)
+                read_um = positions_um(liar.heard)
+                assert any(abs(answer - um) < 1e-6 for um in read_um), (answer, read_um)
+
+    assert len(told) > part_of(cases) / 20
+
+
+@pytest.mark.parametrize("protocol", DRIVERS)
+def test_no_answers_make_connecting_hang_or_fail_otherwise_than_by_an_error_of_the_drivers(
+    protocol, cases
+):
+    makers = {"zaber": ZaberChain, "grbl": GrblController, "apt": AptController}
+    connected = []
+
+    @run(part_of(cases), st.integers(0, 2**32), MOODS)
+    def _(seed, moods):
+        clock = ManualClock()
+        liar = Liar(makers[protocol](clock), clock)
+        liar.lie(seed, moods)
+        wire = MemoryTransport(liar, clock)
+        try:
+            if protocol == "zaber":
+                stage = ZaberStage(wire, {"x": (1, 1)}, AxisSpec().microstep_um, clock)
+            elif protocol == "grbl":
+                stage = GrblStage(wire, {"x": "X"}, clock)
+            else:
+                stage = AptStage({"x": AptAxis(wire)}, clock)
+        except DriverError as error:
+            check_one_line(error)
+            return
+        connected.append(stage)
+        low_um, high_um = stage.limits_um("x")
+        assert low_um < high_um
+
+    assert connected

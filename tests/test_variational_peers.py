@@ -1,0 +1,105 @@
+"""DV_K with frames and patches against other people's solvers (extra `peers`)."""
+
+import numpy as np
+import pytest
+
+from emmc_rig.camera_sheet import find_camera
+from reconstruction.differences import gradient, norm_squared, variation
+from reconstruction.patch_term import from_patches
+from reconstruction.tv import TVSettings, reconstruct_tv
+
+
+def capture(psi):
+    rng = np.random.default_rng(0)
+    truth = 0.2 + 0.5 * rng.random(psi.light_field_shape)
+    truth[:, :, :, 3:] = [0.7, 0.3, 0.5]
+    return truth, psi.forward(truth)
+
+
+@pytest.mark.parametrize(
+    ("order", "mu", "primal_step"), [(1, 4e-3, 3.0), (2, 3e-3, 2.0), (3, 1e-3, 3.0)]
+)
+@pytest.mark.parametrize("patched", [False, True])
+def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_step, patched):
+    cvxpy = pytest.importorskip("cvxpy")
+    psi = coded_psi("mono", 1, 8, (4, 5), (1, 2), np.float64)
+    truth, frames = capture(psi)
+    usable = np.random.default_rng(1).random(frames.shape) < 0.9
+    samples = truth.size
+    identity = np.eye(samples).reshape(samples, *truth.shape)
+    differences = np.stack([gradient(unit, order).ravel() for unit in identity], axis=-1)
+    unknown = cvxpy.Variable(samples)
+    count = len(differences) // samples
+    parts = [
+        cvxpy.reshape(
+            differences[i * samples : (i + 1) * samples] @ unknown, (samples // 3, 3), "C"
+        )
+        for i in range(count)
+    ]
+    regulariser = cvxpy.sum(cvxpy.norm(cvxpy.hstack(parts), 2, axis=1))
+    dense = psi.to_scipy().toarray()[usable.ravel()]
+    value = 0.5 * cvxpy.sum_squares(dense @ unknown - frames[usable]) + mu * regulariser
+    term, rho = None, 0.1
+    if patched:
+        patches = [truth[:, :, :3, :3], truth[:, :, 1:, 2:]]
+        term = from_patches([(0, 0), (1, 1)], patches, [1, 0.5], truth.shape)
+        spread = np.broadcast_to(term.weight[..., None], truth.shape).ravel()
+        apart = cvxpy.multiply(np.sqrt(spread), unknown - term.target.ravel())
+        value += rho / 2 * cvxpy.sum_squares(apart)
+    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
+    least = cvxpy.Problem(cvxpy.Minimize(value)).solve(solver="CLARABEL", **tight)
+    settings = TVSettings(
+        order=order,
+        mu=mu,
+        rho=rho,
+        primal_step=primal_step,
+        chroma_weight=1.0,
+        rtol=1e-10,
+        max_steps=6000,
+    )
+    found = reconstruct_tv(psi, frames, 0.0, settings, usable, patch_term=term)
+    assert found.objective[-1][1] == pytest.approx(least, rel=1e-6)
+
+
+def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
+    pytest.importorskip("pyproximal")
+    from emmc_rig.variational_benchmark import PeerProblem
+
+    psi = coded_psi("rggb", 2, 3, (4, 6), (2, 3), np.float64)
+    truth, frames = capture(psi)
+    mu, primal_step, steps = 1e-3, 3.0, 60
+    peer = PeerProblem(psi, frames, mu)
+    flat = peer.flat(truth)
+    regulariser = peer.variation(peer.differences @ flat)
+    assert regulariser == pytest.approx(mu * variation(truth, 1), rel=1e-12)
+    start = np.full_like(truth, 0.5)
+    dual_step = 1 / (norm_squared(1, (2, 3, None, None)) * primal_step)
+    theirs = peer.solve(start, primal_step, steps, dual_step)
+    settings = TVSettings(
+        mu=mu,
+        primal_step=primal_step,
+        chroma_weight=1.0,
+        relaxation=1.0,
+        rtol=1e-30,
+        max_steps=steps,
+    )
+    ours = reconstruct_tv(psi, frames, 0.0, settings, start=start)
+    assert theirs.min() > 0.05
+    assert theirs.max() < 0.95
+    np.testing.assert_allclose(ours.light_field, theirs, atol=1e-6)
+    value = peer.misfit(peer.flat(theirs)) + peer.variation(peer.differences @ peer.flat(theirs))
+    assert ours.objective[-1] == (steps, pytest.approx(value, rel=1e-9))
+
+
+def test_the_steps_of_both_are_timed():
+    pytest.importorskip("pyproximal")
+    from emmc_rig.variational_benchmark import variational_timings
+
+    rows = list(variational_timings(find_camera("rgbw-bayer-1shot"), (16, 20), 1))
+    assert [row.name for row in rows] == [
+        "fused step",
+        "pyproximal",
+        "pyproximal without data step",
+    ]
+    assert all(row.seconds > 0 for row in rows)
+    assert rows[0].times_ours == 1
