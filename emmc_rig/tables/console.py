@@ -33,7 +33,7 @@ def _tables(grids: Sequence[Grid]) -> Iterator[Table]:
             table.add_column(head, no_wrap=True)
         stacked = len(grid.columns) > WIDE
         for column in grid.columns:
-            table.add_column(column, justify="right")
+            table.add_column(column.replace(") ", ")\n"), justify="right")
         table.caption = "PSNR in dB: ours" + (
             ", the paper's below" if stacked else " | the paper's"
         )
@@ -65,7 +65,7 @@ def _db(value: float | None) -> str:
 
 def _findings_table(findings: Sequence[Finding]) -> Table:
     """Return the findings: verdict, by how much and in how many scenes, and in the paper."""
-    table = Table(title="The paper's findings on these light fields", box=SIMPLE_HEAD)
+    table = Table(title="The paper's findings on these light fields, by TV-Dict", box=SIMPLE_HEAD)
     table.title_justify = table.caption_justify = "left"
     table.add_column("verdict", no_wrap=True)
     table.add_column("dB: mean (range), scenes", no_wrap=True)
@@ -77,11 +77,13 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
         if judged is None:
             missing += 1
             continue
+        judge = finding.claim.judged_by
+        told = "" if judge == "tv-dict" else f" [dim](by {METHOD_TITLES[judge]})[/]"
         table.add_row(
             Text(finding.verdict, style=COLOURS[finding.verdict]),
             f"{judged}, {judged.holding}/{judged.scenes}",
             "-" if printed is None else f"{printed.mean_db:+.2f}",
-            f"{finding.claim.says} [dim]({METHOD_TITLES[finding.claim.judged_by]})[/]",
+            finding.claim.says + told,
         )
     if missing:
         table.caption = f"{missing} findings need tables that were not asked for"

@@ -71,11 +71,11 @@ class TablesSettings(Settings):
 
 
 FAST = TablesSettings(
-    cut=Cut((80, 112)),
+    cut=Cut((96, 128)),
     binned_cut=Cut((64, 80), 2),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
-        sparse=SparseSettings(solver=BPDNSettings(rtol=1e-2)),
+        sparse=SparseSettings(solver=BPDNSettings(method="lars")),
     ),
     training=TrainingSettings(
         cut=Cut((192, 192)),
@@ -83,7 +83,10 @@ FAST = TablesSettings(
         learning=LearningSettings(atoms=256, iterations=4),
     ),
 )
-"""Crops and small dictionaries: all tables on nine scenes in minutes."""
+"""Crops and small dictionaries, coded by LARS: all tables on nine scenes in minutes.
+
+LARS finds the minimiser that ADMM approaches, sooner where dictionaries are small.
+"""
 
 
 @dataclass
@@ -265,7 +268,7 @@ def _do(
             }
             journal.add(digests[cell], inputs[cell], _plain(result))
             forecast.done(cell, clock() - started)
-            watcher.step(f"{scores.psnr_db:.2f} dB {cell.label}; {forecast.left()}")
+            watcher.step(f"{forecast.left()}; {scores.psnr_db:.2f} dB {cell.label}")
 
 
 @dataclass(frozen=True, eq=False)
