@@ -1,70 +1,91 @@
-"""What a stage command costs the host: on a wire in memory, which itself takes no time."""
+"""Speed of the camera drivers on pictures in memory, as ratios to the library they rest on."""
 
 from __future__ import annotations
 
+import io
+import statistics
 import time
-from collections.abc import Callable
+import tracemalloc
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import rawpy
+from numpy.typing import NDArray
 
-from emmc_rig.hardware import open_simulated
-from simulators.firmware import SimulatedController
+from drivers.ptp import PtpSession, is_raw
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.raw import RawFrame, decode_raw
+from drivers.usb import open_device
+from simulators.clock import ManualClock
+from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb
 
-PROTOCOLS = ("zaber", "grbl", "apt")
+SHAPE = (4000, 6000)
+"""24 megapixels: a DNG of 48 MB."""
 
 
 @dataclass(frozen=True)
-class StageTiming:
-    """Median time of one command, the simulated firmware's part included.
+class PictureTiming:
+    """Median seconds from a picture on the simulated bus to its mosaic, and rawpy's alone.
 
-    exchanges: how often the command wrote to the wire.
+    download_s: USB transfers to bytes. decode_s: bytes to a checked and hashed `RawFrame`.
+    rawpy_s: rawpy on the same bytes, to a mosaic of its own. peak_pictures: the most memory that
+    Python and NumPy held at once, in pictures: the bytes and the mosaic make two.
     """
 
-    protocol: str
-    command: str
-    exchanges: float
-    milliseconds: float
+    megabytes: float
+    download_s: float
+    decode_s: float
+    rawpy_s: float
+    ratio: float
+    peak_pictures: float
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the figures as they are written to metrics.json."""
+    def as_dict(self) -> dict[str, float]:
+        """Return the figures by name."""
         return asdict(self)
 
 
-def stage_timings(repeats: int) -> list[StageTiming]:
-    """Return the timings of every protocol's commands."""
-    return [one for protocol in PROTOCOLS for one in _timings(protocol, repeats)]
+def picture_timing(shape: tuple[int, int] = SHAPE, repeats: int = 9) -> PictureTiming:
+    """Time a PTP download over simulated USB with its decoding, in turn with rawpy alone."""
+    mosaic = np.random.default_rng(0).integers(0, 4096, shape, dtype=np.uint16)
+    clock = ManualClock()
+    bus = SimulatedUsb(clock, PtpUsbFunction(PtpCameraSimulator(lambda exposure_s: mosaic, clock)))
+    session = PtpSession(PtpUsb(open_device(PTP_INTERFACE, backend=bus), clock), clock)
+    taken = session.capture(0.01, is_raw)
+    rows: list[tuple[float, float, float]] = []
+    ratios = []
+    data = b""
+    for _ in range(repeats + 1):
+        started = time.perf_counter()
+        data = session.download(taken.handle, taken.info)
+        downloaded = time.perf_counter()
+        frame: RawFrame | None = decode_raw(data, shape)
+        decoded = time.perf_counter()
+        frame = None
+        again = time.perf_counter()
+        alone: NDArray[np.uint16] | None = _by_rawpy(data)
+        ended = time.perf_counter()
+        alone = None
+        rows.append((downloaded - started, decoded - downloaded, ended - again))
+        ratios.append((decoded - started) / (ended - again))
+    assert frame is None
+    assert alone is None
+    download_s, decode_s, rawpy_s = (
+        statistics.median(column[1:]) for column in zip(*rows, strict=True)
+    )
+    size = len(data)
+    del data
+    tracemalloc.start()
+    try:
+        decode_raw(session.download(taken.handle, taken.info), shape)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    session.close()
+    ratio = statistics.median(ratios[1:])
+    return PictureTiming(size / 1e6, download_s, decode_s, rawpy_s, ratio, peak / size)
 
 
-def _timings(protocol: str, repeats: int) -> list[StageTiming]:
-    stage, firmware = open_simulated(protocol)
-    stage.home()
-    axis = stage.axes[0]
-    low_um, high_um = stage.limits_um(axis)
-    places_um = [(low_um + high_um) / 2 + step_um for step_um in (0.0, 100.0)]
-    calls: dict[str, Callable[[int], object]] = {
-        "position": lambda turn: stage.position_um(axis),
-        "is homed": lambda turn: stage.is_homed(axis),
-        "stop": lambda turn: stage.stop([axis]),
-        "move 100 um and wait": lambda turn: stage.move_to_um({axis: places_um[turn % 2]}),
-    }
-    return [_timing(protocol, name, call, firmware, repeats) for name, call in calls.items()]
-
-
-def _timing(
-    protocol: str,
-    name: str,
-    call: Callable[[int], object],
-    firmware: SimulatedController,
-    repeats: int,
-) -> StageTiming:
-    call(0)
-    call(1)
-    written = firmware.fed
-    seconds = []
-    for turn in range(repeats):
-        start_s = time.perf_counter()
-        call(turn)
-        seconds.append(time.perf_counter() - start_s)
-    exchanges = (firmware.fed - written) / repeats
-    return StageTiming(protocol, name, exchanges, float(np.median(seconds)) * 1e3)
+def _by_rawpy(data: bytes) -> NDArray[np.uint16]:
+    with rawpy.imread(io.BytesIO(data)) as raw:
+        return raw.raw_image_visible.copy()
