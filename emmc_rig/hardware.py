@@ -20,6 +20,7 @@ from drivers.folder import FolderCamera
 from drivers.ptp import PtpCamera, PtpSession
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.stage import Stage, StageSettings
+from drivers.u3v import open_u3v
 from drivers.usb import open_device
 from drivers.zaber import ZaberStage
 from emmc_rig.errors import AppError
@@ -146,7 +147,8 @@ def simulated_rig(
 def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
     """Open the camera that `spec` names: a kind, a colon and what tells it from others.
 
-    `ptp:` or `ptp:SERIAL`, `folder:DIR`, `simulated`. `backend`: of pyusb, for a simulated bus.
+    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `folder:DIR`, `simulated`. `backend`: of pyusb,
+    for a simulated bus.
     Raises AppError for any other kind, or an error of the driver.
     """
     kind, _, rest = spec.partition(":")
@@ -171,6 +173,10 @@ def _open_ptp(serial: str, clock: Clock, backend: Any) -> CameraDevice:
     return _ptp_camera(clock, backend, serial)
 
 
+def _open_u3v(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return open_u3v(serial, backend=backend, clock=clock)
+
+
 def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
     return FolderCamera(folder or ".", clock)
 
@@ -183,10 +189,11 @@ def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
 
 CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {
     "ptp": _open_ptp,
+    "u3v": _open_u3v,
     "folder": _open_folder,
     "simulated": _open_simulated,
 }
-CAMERA_KINDS = "ptp:, ptp:SERIAL, folder:DIR or simulated"
+CAMERA_KINDS = "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, folder:DIR or simulated"
 SCENE_SIZE = (240, 320)
 
 
