@@ -101,7 +101,8 @@ class U3vCameraSimulator(UsbFunction):
     gain, called when the exposure is over. It must have `shape`, the sensor's. `depths` names the
     formats offered, as in `drivers.pixel_formats.CODES`. `alignment_bits`: transfers are
     multiples of 2 to its power. Faults, armed with `faults.inject`, strike commands, frames or
-    the middle of a payload, as their names say.
+    the middle of a payload, as their names say; `when` is given a command's address, or a frame's
+    number.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class U3vCameraSimulator(UsbFunction):
         exposure_us: tuple[float, float] = (10.0, 10_000_000.0),
         gain_db: tuple[float, float] = (0.0, 24.0),
     ) -> None:
-        self.faults = Faults(FAULTS)
+        self.faults = Faults(FAULTS, clock)
         self.spec = _spec(serial, packet)
         self._render = render
         self._clock = clock
@@ -245,25 +246,30 @@ class U3vCameraSimulator(UsbFunction):
     def _command(self, data: bytes) -> None:
         prefix, _, command, length, request_id = struct.unpack_from("<IHHHH", data)
         body = data[12:]
+        address = struct.unpack_from("<Q", body)[0] if len(body) >= 8 else 0
         self._busy_request = None
-        if prefix != 0x43563355 or len(body) != length or self.faults.strikes("lost_reply"):
+        if (
+            prefix != 0x43563355
+            or len(body) != length
+            or self.faults.strikes("lost_reply", address)
+        ):
             return
         now_s = self._clock.now_s()
-        if self.faults.strikes("busy"):
+        if self.faults.strikes("busy", address):
             self._busy_request = request_id
             return
-        if self.faults.strikes("pending"):
+        if self.faults.strikes("pending", address):
             wait_ms = round(PENDING_S * 1000) + 500
             pending = _answer(OK, 0x0805, request_id, struct.pack("<HH", 0, wait_ms))
             self._answers.append((now_s, pending))
             now_s += PENDING_S
         answer = self._execute(command, request_id, body)
-        if self.faults.strikes("late_reply"):
+        if self.faults.strikes("late_reply", address):
             now_s += LATE_REPLY_S
-        if self.faults.strikes("garbled_reply"):
+        if self.faults.strikes("garbled_reply", address):
             answer = answer[:2] + bytes((answer[2] ^ 0x10,)) + answer[3:]
         self._answers.append((now_s, answer))
-        if self.faults.strikes("duplicate_reply"):
+        if self.faults.strikes("duplicate_reply", address):
             self._answers.append((now_s, answer))
 
     def _execute(self, command: int, request_id: int, body: bytes) -> bytes:
@@ -377,7 +383,7 @@ class U3vCameraSimulator(UsbFunction):
         acquisition = self._acquisition
         if acquisition is None or not self._read_u32(SIRM, 0x04) & 1:
             return False
-        if self.faults.strikes("late_frame"):
+        if self.faults.strikes("late_frame", acquisition.block):
             acquisition.late_s = LATE_FRAME_S
         exposure_s = self._read_u32(xml.BASE, xml.EXPOSURE) * xml.EXPOSURE_TICK_US * 1e-6
         rate_hz = struct.unpack_from("<f", self._regions[xml.BASE], xml.FRAME_RATE)[0]
@@ -394,7 +400,7 @@ class U3vCameraSimulator(UsbFunction):
             missed = max(0, waiting - HELD_FRAMES)
             acquisition.block += missed
             acquisition.next_start_s += missed * period_s
-        if self.faults.strikes("dropped_frame"):
+        if self.faults.strikes("dropped_frame", acquisition.block):
             acquisition.block += 1
             acquisition.next_start_s += period_s
         self._send(exposure_s, acquisition.block, acquisition.next_start_s)
@@ -412,7 +418,7 @@ class U3vCameraSimulator(UsbFunction):
             for offset in (xml.HEIGHT, xml.WIDTH, xml.OFFSET_Y, xml.OFFSET_X)
         )
         payload = memoryview(self._pixels(exposure_s, form, (top, left, rows, columns)))
-        if self.faults.strikes("wrong_size"):
+        if self.faults.strikes("wrong_size", block):
             rows -= 2
             payload = payload[: len(payload) * rows // (rows + 2)]
         leader = struct.pack(
@@ -432,23 +438,23 @@ class U3vCameraSimulator(UsbFunction):
             0,
             0,
         )
-        status = DISCARDED if self.faults.strikes("discarded") else OK
+        status = DISCARDED if self.faults.strikes("discarded", block) else OK
         trailer = struct.pack(
             "<IHHQHHQI", 0x54563355, 0, TRAILER_SIZE, block, status, 0, len(payload), rows
         )
-        if self.faults.strikes("garbled_leader"):
+        if self.faults.strikes("garbled_leader", block):
             leader = b"\0" + leader[1:]
-        if self.faults.strikes("torn_payload"):
+        if self.faults.strikes("torn_payload", block):
             payload = payload[: len(payload) * 2 // 3 + 1]
         pieces = self._cut(payload)
-        if self.faults.strikes("stall_stream"):
+        if self.faults.strikes("stall_stream", block):
             pieces.insert(len(pieces) // 2, b"stall")
-        if self.faults.strikes("unplug_in_payload"):
+        if self.faults.strikes("unplug_in_payload", block):
             pieces.insert(len(pieces) // 2, b"unplug")
-        if not self.faults.strikes("lost_leader"):
+        if not self.faults.strikes("lost_leader", block):
             self._messages.append(leader)
         self._messages.extend(pieces)
-        if not self.faults.strikes("lost_trailer"):
+        if not self.faults.strikes("lost_trailer", block):
             self._messages.append(trailer)
 
     def _cut(self, payload: memoryview) -> list[bytes | memoryview]:

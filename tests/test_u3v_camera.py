@@ -3,6 +3,7 @@
 import array
 import errno
 import itertools
+import math
 import struct
 from contextlib import closing, suppress
 from random import Random
@@ -35,9 +36,9 @@ from drivers.u3v import UNZIPPED_LIMIT, decode_u3v, list_u3v, open_u3v
 from drivers.u3v_control import BUSY_LIMIT_S, READ_ATTEMPTS
 from drivers.u3v_stream import plan_sizes
 from drivers.usb import TRANSFER_BYTES
+from emmc_rig.hardware import open_camera
 from simulators import u3v as simulation
 from simulators.clock import ManualClock
-from simulators.faults import ALWAYS
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 
@@ -128,6 +129,11 @@ def test_a_camera_is_listed_and_says_who_made_it(bench):
         bench.open(serial="U2")
 
 
+def test_a_camera_is_opened_by_its_name_on_the_command_line(bench):
+    camera = open_camera("u3v:U1", bench.clock, bench.bus)
+    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
 def test_exposure_and_gain_are_what_the_camera_took(bench):
     camera = bench.open()
     camera.set_exposure_s(0.0012345)
@@ -172,7 +178,7 @@ def test_a_stream_numbers_its_frames_and_stops_when_closed(bench):
 
 def test_a_stream_that_fails_stops_the_camera(bench, faults):
     camera = bench.open()
-    faults.inject("torn_payload", times=ALWAYS)
+    faults.inject("torn_payload", times=math.inf)
     with pytest.raises(FrameLostError):
         next(camera.stream())
     assert not bench.simulator.streaming
@@ -339,7 +345,7 @@ def test_a_write_that_goes_wrong_is_not_repeated(bench, faults, fault, error):
 
 def test_a_camera_that_stays_silent_is_given_up_in_bounded_time(bench, faults):
     camera = bench.open()
-    faults.inject("lost_reply", times=ALWAYS)
+    faults.inject("lost_reply", times=math.inf)
     before_s = bench.clock.now_s()
     with pytest.raises(UsbTimeoutError, match="was silent"):
         camera.features.number("Width")
@@ -413,6 +419,17 @@ def test_a_stream_passes_over_a_torn_frame_and_counts_it(fault, shape):
     block = int(frame.metadata["block_id"])
     assert int(frame.metadata["frames_lost"]) == block - 1 >= 1
     assert next(stream).metadata["frames_lost"] == "0"
+
+
+def test_faults_strike_the_frame_or_the_register_that_they_are_armed_for(bench, faults):
+    camera = bench.open()
+    faults.inject("dropped_frame", when=lambda block: block == 2)
+    faults.inject("lost_reply", times=math.inf, when=lambda address: address == 0x100010)
+    frames = itertools.islice(camera.stream(), 4)
+    assert [frame.metadata["block_id"] for frame in frames] == ["0", "1", "3", "4"]
+    assert camera.features.number("Width") == SHAPE[1]
+    with pytest.raises(UsbTimeoutError):
+        camera.features.number("WidthMax")
 
 
 def test_only_one_frame_is_lost_where_only_its_end_is_missing(bench, faults):
