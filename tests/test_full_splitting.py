@@ -1,6 +1,5 @@
 """The paper's eq. 10-13 against the exact data step: one minimiser; and its step sizes."""
 
-
 import numba
 import numpy as np
 import pytest

@@ -22,7 +22,7 @@ from emmc_rig.tables import paper
 from emmc_rig.tables.journal import digest_of
 from emmc_rig.tables.library import VIEWS, Cut, Library
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
-from reconstruction.learning import LearningSettings, fixed_atoms, learn_ksvd, without_unused
+from reconstruction.learning import LearningSettings, learn_ksvd
 from reconstruction.training_patches import PatchSettings, training_patches
 
 TRAINING_FREE = ("dct", "lambertian")
@@ -134,7 +134,6 @@ class LeaveOneOut:
             learning,
             on_step=lambda state: watcher.step(f"error {state.history[-1].updated_rmse:.4f}"),
         )
-        state = without_unused(state, len(fixed_atoms(learning, shape)))
         return state.atoms.reshape(-1, *shape)
 
 
