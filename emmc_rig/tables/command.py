@@ -118,7 +118,11 @@ def _about(run: Run, cells: int) -> list[str]:
     cut = run.settings.cut.size
     size = "whole views" if cut is None else f"the middle {cut[0]}×{cut[1]} pixels"
     solver = run.settings.methods.sparse.solver.method
-    coded = "" if solver == "admm" else f" Patches are coded by {solver.upper()} in place of ADMM."
+    coded = (
+        ""
+        if solver == "admm"
+        else f" Dict-ADMM's patches are coded by {solver.upper()}, which finds the same minimiser."
+    )
     return [
         f"{cells} reconstructions of {', '.join(run.library.names)}; {size}, 5×5 views, PSNR with "
         "peak 1 over all views, pixels and colours.",

@@ -23,7 +23,6 @@ from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors, Shots
-from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
 from reconstruction.learning import LearningSettings
@@ -41,7 +40,11 @@ class TablesStopped(KeyboardInterrupt):
 
 
 class TablesSettings(Settings):
-    """How everything is computed; cuts are the middle of each scene."""
+    """How everything is computed; cuts are the middle of each scene.
+
+    The patches of `dict-admm`, and of `tv-dict` which starts from them, are coded once by the
+    solver of `methods.sparse`; LARS, its default, finds the minimiser that ADMM approaches.
+    """
 
     cut: Cut = Cut()
     binned_cut: Cut = Cut(multiple=2)
@@ -73,20 +76,14 @@ class TablesSettings(Settings):
 FAST = TablesSettings(
     cut=Cut((96, 128)),
     binned_cut=Cut((64, 80), 2),
-    methods=MethodSettings(
-        tv=TVSettings(max_steps=100),
-        sparse=SparseSettings(solver=BPDNSettings(method="lars")),
-    ),
+    methods=MethodSettings(tv=TVSettings(max_steps=100)),
     training=TrainingSettings(
         cut=Cut((192, 192)),
         patches=PatchSettings(count=2000, candidates_per_patch=2),
         learning=LearningSettings(atoms=256, iterations=4),
     ),
 )
-"""Crops and small dictionaries, coded by LARS: all tables on nine scenes in minutes.
-
-LARS finds the minimiser that ADMM approaches, sooner where dictionaries are small.
-"""
+"""Crops and small dictionaries: all tables on nine scenes in minutes."""
 
 
 @dataclass
