@@ -254,11 +254,7 @@ class _Controller:
         raise GarbledReplyError(b"", "no report tells the work offset").about(command="?")
 
     def command(self, line: str, axis: str = "the controller") -> dict[str, str]:
-        """Send a line once and return the feedback before its `ok`, by kind.
-
-        When the answer does not come, what still arrives is taken off the wire first, so that a
-        late `ok` is not taken for the next line's.
-        """
+        """Send a line once and return the feedback before its `ok`, by kind."""
         feedback: dict[str, str] = {}
         try:
             with self._transport.lock:
@@ -279,7 +275,6 @@ class _Controller:
                         break
                 raise GarbledReplyError(b"", "no ok among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
-            self._drain()
             self.raise_alarm()
             error.about(axis=axis, command=line)
             raise

@@ -236,6 +236,7 @@ class AptController(SimulatedController):
             self._speed_um_s(bay),
             self._acceleration_um_s2(bay),
             self.faults.strikes("stall", self._command),
+            self._start_s(),
         )
 
     def _info(self, address: int, bay: _Bay, message: Message) -> None:

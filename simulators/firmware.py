@@ -20,7 +20,7 @@ WIRE_FAULTS = (
     "duplicate_reply",
     "unplug",
 )
-MOTION_FAULTS = ("stall", "drift", "busy_forever")
+MOTION_FAULTS = ("stall", "drift", "busy_forever", "slow_start")
 
 
 class Occasion(NamedTuple):
@@ -38,14 +38,15 @@ class SimulatedController(ABC):
     there (another one each time), `late_reply` holds it back for `late_by_s`, `duplicate_reply`
     sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
     next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
-    move, after `busy_forever` an axis says for ever that it moves. `fed` counts how often the host
-    wrote.
+    move, after `busy_forever` an axis says for ever that it moves, `slow_start` lets the next move
+    begin `slow_by_s` after its command. `fed` counts how often the host wrote.
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
         self.faults = Faults((*WIRE_FAULTS, *MOTION_FAULTS, *faults), clock)
         self.late_by_s = 0.7
         self.drift_um = 40.0
+        self.slow_by_s = 0.2
         self._clock = clock
         self._lock = threading.RLock()
         self._plugged = True
@@ -55,6 +56,11 @@ class SimulatedController(ABC):
         self._sent = 0
         self._garbled = 0
         self.fed = 0
+
+    def _start_s(self) -> float:
+        """Return when a move that was commanded now begins."""
+        slow = self.faults.strikes("slow_start", Occasion(self._command))
+        return self._clock.now_s() + (self.slow_by_s if slow else 0.0)
 
     @abstractmethod
     def power_cycle(self) -> None:

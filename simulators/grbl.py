@@ -509,7 +509,7 @@ class GrblController(SimulatedController):
     def _queue(self, block: _Block) -> None:
         self._blocks.append(block)
         if self._block is None:
-            self._start_block(None)
+            self._start_block(self._start_s())
 
     def _planned_mm(self) -> dict[str, float]:
         """Return where the axes will be when all that is queued is done."""

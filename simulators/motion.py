@@ -149,7 +149,8 @@ class Motor:
     @property
     def moving(self) -> bool:
         """Whether it says that it moves."""
-        return self._course is not None or self.busy_forever
+        begun = self._course is not None and self._course.start_s <= self._clock.now_s()
+        return begun or self.busy_forever
 
     @property
     def nut_um(self) -> float:

@@ -77,12 +77,14 @@ class _Axis:
         """Position in microsteps from where the counter believes 0 to be."""
         return round(self.motor.counted_um / self.spec.microstep_um)
 
-    def move_abs(self, target: int, stalls: bool) -> None:
+    def move_abs(self, target: int, stalls: bool, start_s: float) -> None:
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise _RefusedError("BADDATA")
         self._begin(False)
         speed_um_s, acceleration_um_s2 = self._pace()
-        self.motor.go(target * self.spec.microstep_um, speed_um_s, acceleration_um_s2, stalls)
+        self.motor.go(
+            target * self.spec.microstep_um, speed_um_s, acceleration_um_s2, stalls, start_s
+        )
 
     def home(self, stalls: bool) -> None:
         self._begin(True)
@@ -263,7 +265,7 @@ class ZaberChain(SimulatedController):
         amount = _integer(words[1])
         for axis in axes:
             origin = axis.counter if words[0] == "rel" else 0
-            axis.move_abs(origin + amount, self._stalls(axis))
+            axis.move_abs(origin + amount, self._stalls(axis), self._start_s())
         return "0"
 
     def _stalls(self, axis: _Axis) -> bool:

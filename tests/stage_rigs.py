@@ -34,6 +34,7 @@ class Rig(ABC):
 
     axes: tuple[str, ...]
     senses_stalls = True
+    replies_are_numbered = False
     hardware = False
 
     @abstractmethod
@@ -88,6 +89,7 @@ class Rig(ABC):
 
 
 class ZaberRig(Rig):
+    replies_are_numbered = True
     axes = ("mask_x", "mask_y")
     addresses: ClassVar = {"mask_x": (1, 1), "mask_y": (2, 1)}
     spec = AxisSpec()

@@ -582,6 +582,28 @@ def test_a_closed_stage_says_that_its_port_is_gone(simulated):
         stage.position_um(stage.axes[0])
 
 
+def test_an_axis_that_begins_late_is_waited_for(in_memory):
+    stage = in_memory.make_stage(approach_um=0.0)
+    stage.home()
+    axis = stage.axes[0]
+    target_um = middle_um(stage, axis)
+    in_memory.device.faults.inject("slow_start")
+    assert stage.move_to_um({axis: target_um})[axis] == pytest.approx(target_um, abs=1.0)
+
+
+def test_an_answer_that_came_late_is_not_left_for_the_next_question(in_memory):
+    stage = in_memory.make_stage()
+    stage.home()
+    axis = stage.axes[0]
+    in_memory.device.faults.inject("late_reply", when=in_memory.is_question)
+    stage.position_um(axis)
+    in_memory.clock.sleep(2.0)
+    if in_memory.replies_are_numbered:
+        assert stage.position_um(axis) == pytest.approx(in_memory.true_um(axis), abs=4.0)
+    else:
+        assert in_memory.transport.waiting() == 0
+
+
 def test_an_axis_that_has_not_begun_is_waited_for_only_so_long(simulated):
     stage = simulated.make_stage(approach_um=0.0)
     stage.home()

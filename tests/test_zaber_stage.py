@@ -237,6 +237,15 @@ def test_a_stalled_axis_is_reported_stopped_and_must_be_homed_again(stage, bench
     assert stage.move_to_um({"mask_x": 5000.0})["mask_x"] == pytest.approx(5000.0, abs=MICROSTEP_UM)
 
 
+@pytest.mark.parametrize("fault", ["drop_command", "drop_reply", "garble_reply"])
+def test_homing_is_asked_for_again_when_the_answer_is_lost(bench, fault):
+    stage = bench.stage()
+    strike_at_first(bench, fault, " home")
+    stage.home(["mask_x"])
+    assert stage.is_homed("mask_x")
+    assert len([line for line in bench.sent if " home" in line]) == 2
+
+
 def test_homing_that_stalls_leaves_the_axis_unhomed(bench):
     stage = bench.stage()
     bench.chain.faults.inject("stall")
