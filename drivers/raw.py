@@ -14,6 +14,7 @@ import rawpy
 import tifffile
 
 from drivers.errors import RawFrameError
+from drivers.plain_dng import read_in_place
 
 Array = np.ndarray
 
@@ -46,7 +47,7 @@ TOLD_IN_EXIF = {
 HASH_BESIDE_BYTES = 1 << 20
 """From here on a file is hashed in a thread of its own, while LibRaw decodes it."""
 
-_DAMAGED_TIFF = (
+_DAMAGED = (
     tifffile.TiffFileError,
     struct.error,
     ValueError,
@@ -56,13 +57,14 @@ _DAMAGED_TIFF = (
     AttributeError,
     MemoryError,
 )
+"""What tifffile and rawpy raise for values in a damaged file that they did not expect."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
     """One frame as the sensor gave it.
 
-    `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
+    `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it; may lie in `original`.
     `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
     `exposure_s`: None where neither the file nor the camera says.
@@ -89,6 +91,8 @@ class RawFrame:
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
     """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
 
+    The mosaic of a plain uncompressed DNG is a view of `data`; LibRaw decodes all others.
+
     Raises `RawFrameError` for bytes that are no RAW file, a TIFF-based file (DNG, NEF, CR2, ...)
     that is torn, or a mosaic whose `(y, x)` is not `expected_shape`. A torn uncompressed DNG
     decodes without complaint, so the file's own table of contents is checked first. A flipped bit
@@ -98,13 +102,7 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
         raise RawFrameError("it is empty")
     told = _read_tiff(data) if data[:4] in TIFF_MAGICS else _Told()
     with hashed(data) as digest:
-        try:
-            with rawpy.imread(io.BytesIO(data)) as raw:
-                mosaic = raw.raw_image_visible.copy()
-                black_level_dn, cfa = _read_levels_and_phase(raw)
-                white_level_dn = int(raw.white_level)
-        except rawpy.LibRawError as error:
-            raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
+        mosaic, black_level_dn, white_level_dn, cfa = told.pixels or decode_by_libraw(data)
     if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
         raise RawFrameError("it holds colour or floating-point pixels, not one mosaic of 16 bits")
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
@@ -132,6 +130,18 @@ class _Told:
     exposure_s: float | None = None
     tile: str | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
+    pixels: tuple[Array, Array, int, str] | None = None
+
+
+def decode_by_libraw(data: bytes) -> tuple[Array, Array, int, str]:
+    """Return mosaic, black levels `(2, 2)`, white level and phase; raises `RawFrameError`."""
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            mosaic = raw.raw_image_visible.copy()
+            black_level_dn, cfa = _read_levels_and_phase(raw)
+            return mosaic, black_level_dn, int(raw.white_level), cfa
+    except (rawpy.LibRawError, NotImplementedError, *_DAMAGED) as error:
+        raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
 
 
 @contextmanager
@@ -185,7 +195,8 @@ def _read_tiff(data: bytes) -> _Told:
             description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
             metadata = {name: tags.valueof(tag) for name, tag in TOLD.items()}
             metadata |= {name: exif.get(key) for name, key in TOLD_IN_EXIF.items() if key in exif}
-    except _DAMAGED_TIFF as error:
+            pixels = read_in_place(data, tiff) if missing <= 0 else None
+    except _DAMAGED as error:
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
@@ -194,6 +205,7 @@ def _read_tiff(data: bytes) -> _Told:
         exposure_s,
         tile if tile != description else None,
         {name: _shown(value) for name, value in metadata.items() if value is not None},
+        pixels,
     )
 
 

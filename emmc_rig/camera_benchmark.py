@@ -30,7 +30,7 @@ class PictureTiming:
 
     download_s: USB transfers to bytes. decode_s: bytes to a checked and hashed `RawFrame`.
     rawpy_s: rawpy on the same bytes, to a mosaic of its own. peak_pictures: the most memory that
-    Python and NumPy held at once, in pictures: the bytes and the mosaic make two.
+    Python and NumPy held at once, in pictures: 1 where the mosaic lies in the bytes.
     """
 
     megabytes: float

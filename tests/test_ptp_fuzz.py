@@ -16,7 +16,7 @@ from drivers import ptp_codec as codec
 from drivers.errors import DriverError
 from drivers.ptp import PtpCamera, PtpSession, PtpSettings
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import decode_raw
+from drivers.raw import decode_by_libraw, decode_raw
 from drivers.usb import open_device
 from simulators.clock import ManualClock
 from simulators.dng import encode_dng
@@ -114,10 +114,15 @@ def test_values_of_any_type_are_read_or_refused(fuzz):
     fuzz(check, types, st.binary(max_size=64))
 
 
-def test_a_damaged_raw_file_is_decoded_or_refused_in_one_line(fuzz):
+def test_a_damaged_raw_file_is_refused_in_one_line_or_read_as_libraw_reads_it(fuzz):
     def check(seed):
         with errors_of_the_driver_allowed():
-            assert decode_raw(damage(DNG, seed)).mosaic.dtype == np.uint16
+            damaged = damage(DNG, seed)
+            frame = decode_raw(damaged)
+            mosaic, black, white, phase = decode_by_libraw(damaged)
+            np.testing.assert_array_equal(frame.mosaic, mosaic)
+            np.testing.assert_array_equal(frame.black_level_dn, black)
+            assert (frame.white_level_dn, frame.cfa[:4]) == (white, phase[:4])
 
     fuzz(check, st.integers(0, 2**63))
 
