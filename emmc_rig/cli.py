@@ -121,12 +121,13 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
+def _size(
+    text: str | None, option: str = "--size", example: str = "192x256"
+) -> tuple[int, int] | None:
     if text is None:
         return None
     rows, cross, columns = text.lower().partition("x")
     if not (cross and rows.isdigit() and columns.isdigit()):
-        example = "192x256" if option == "--size" else "9x9"
         raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
     return int(rows), int(columns)
 
@@ -422,6 +423,9 @@ def train(
         list[str] | None,
         typer.Option("--leave-out", help="a scene not to train on, by its name; may repeat"),
     ] = None,
+    views: Annotated[
+        str | None, typer.Option("--views", help="ROWSxCOLUMNS, the middle ones (default: all)")
+    ] = None,
     kind: Annotated[str, typer.Option("--kind", help="ksvd, online or separable")] = "ksvd",
     atoms: Annotated[int, typer.Option("--atoms", help="number of atoms")] = 1024,
     patch: Annotated[str, typer.Option("--patch", help="ROWSxCOLUMNS of a patch")] = "9x9",
@@ -437,13 +441,13 @@ def train(
     from emmc_rig.train import InterruptedTrainingError, picture_path, train_settings
     from emmc_rig.train import train as run
 
-    size = _size(patch, "--patch")
+    size, grid = _size(patch, "--patch", "9x9"), _size(views, "--views", "5x5")
     assert size is not None
     chosen = {
         "patches": {"rows": size[0], "columns": size[1], "count": patches, "seed": seed},
         "learning": {"atoms": atoms, "sparsity": sparsity, "iterations": iterations, "seed": seed},
     }
-    settings = train_settings(out, scenes or (), leave_out or (), kind, chosen, resume)
+    settings = train_settings(out, scenes or (), leave_out or (), grid, kind, chosen, resume)
     try:
         with _progress() as progress:
             bars = Bars(progress)

@@ -70,9 +70,9 @@ class Source:
     spec: str
     seed: int = 0
 
-    def open(self) -> NDArray[np.float32]:
-        """Return the light field (v, u, y, x, c)."""
-        return open_scene(self.spec, seed=self.seed).light_field
+    def open(self, views: tuple[int, int] | None) -> NDArray[np.float32]:
+        """Return the light field (v, u, y, x, c), its middle views where `views` says how many."""
+        return open_scene(self.spec, views=views, seed=self.seed).light_field
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ class TrainSettings:
     out: Path
     scenes: Sequence[str] = ()
     leave_out: Sequence[str] = ()
+    views: tuple[int, int] | None = None
     kind: str = "ksvd"
     learning: LearningSettings | SeparableSettings = field(default_factory=LearningSettings)
     patches: PatchSettings = field(default_factory=PatchSettings)
@@ -92,6 +93,7 @@ def train_settings(
     out: Path,
     scenes: Sequence[str],
     leave_out: Sequence[str],
+    views: tuple[int, int] | None,
     kind: str,
     chosen: Mapping[str, Mapping[str, object]],
     resume: bool,
@@ -107,6 +109,7 @@ def train_settings(
         out=out,
         scenes=scenes,
         leave_out=leave_out,
+        views=views,
         kind=kind,
         learning=validated(learning, dict(chosen["learning"]), "training", AppError),
         patches=validated(PatchSettings, dict(chosen["patches"]), "training patches", AppError),
@@ -160,14 +163,16 @@ def _sources(spec: str) -> list[Source]:
     return [Source(path.stem, str(path)) for path in inner]
 
 
-def _opened_once(source: Source) -> Callable[[], NDArray[np.float32]]:
+def _opened_once(
+    source: Source, views: tuple[int, int] | None
+) -> Callable[[], NDArray[np.float32]]:
     """Return what opens a scene; a small one, slow to render, is kept for the second pass."""
     kept: list[NDArray[np.float32]] = []
 
     def scene() -> NDArray[np.float32]:
         if kept:
             return kept.pop()
-        light_field = source.open()
+        light_field = source.open(views)
         if light_field.nbytes <= _KEPT_SCENE_BYTES:
             kept.append(light_field)
         return light_field
@@ -207,7 +212,7 @@ def train(
     started = clock()
     watcher.begin("reading scenes", 2 * len(sources))
     patches = training_patches(
-        [_opened_once(source) for source in sources],
+        [_opened_once(source, settings.views) for source in sources],
         settings.patches,
         lambda number: watcher.step(sources[number].name),
     )

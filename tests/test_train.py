@@ -109,6 +109,13 @@ def test_a_built_in_scene_is_trained_on(run, tmp_path, monkeypatch):
     assert told["sources"] == ["dark, seed 0"]
 
 
+def test_the_middle_views_can_be_asked_for(run, tmp_path):
+    save_hdf5(tmp_path / "wide.h5", np.random.default_rng(0).random((4, 5, 20, 24, 3)), {})
+    code, _, err = run("--scenes", "wide.h5", "--views", "3x3", "--out", "d.h5", *SMALL)
+    assert code == 0, err
+    assert Dictionary.load(tmp_path / "d.h5").patch_shape == (3, 3, 4, 4, 3)
+
+
 def test_folders_scenes_and_names_mix(scenes):
     sources = find_sources((str(scenes), "dark", str(scenes / "emu"), str(scenes / "cat.h5")), ())
     names = [source.name for source in sources]
@@ -132,6 +139,8 @@ def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, to
     ("arguments", "told"),
     [
         (["--patch", "9"], "9x9"),
+        (["--views", "5"], "5x5"),
+        (["--views", "3x3"], "cannot give 3x3"),
         (["--patch", "30x4"], "less than a patch of 30x4"),
         (["--atoms", 0], "atoms"),
         (["--atoms", 500], "120 patches for 500 atoms"),
@@ -230,7 +239,9 @@ def test_a_checkpoint_is_written_now_and_then(scenes, tmp_path, monkeypatch):
         "patches": {"rows": 4, "columns": 4, "count": 120},
         "learning": {"atoms": 24, "sparsity": 3, "iterations": 9},
     }
-    settings = train.train_settings(tmp_path / "d.h5", [str(scenes)], [], "ksvd", chosen, False)
+    settings = train.train_settings(
+        tmp_path / "d.h5", [str(scenes)], [], None, "ksvd", chosen, False
+    )
     train.train(settings, Quiet(), lambda: float(next(ticks)))
     assert 1 < len(saved) < 9
 
