@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -99,7 +99,14 @@ class PeerProblem:
         """Return a light field (v, u, y, x, c) as pyproximal takes it."""
         return np.ascontiguousarray(np.moveaxis(light_field, -1, 0)).ravel()
 
-    def solve(self, start: Array, primal_step: float, steps: int, dual_step: float) -> Array:
+    def solve(
+        self,
+        start: Array,
+        primal_step: float,
+        steps: int,
+        dual_step: float,
+        on_step: Callable[[object], None] | None = None,
+    ) -> Array:
         """Return the light field (v, u, y, x, c) after pyproximal's primal-dual steps."""
         proximal = peer_module("pyproximal")
         found = proximal.optimization.primaldual.PrimalDual(
@@ -111,6 +118,7 @@ class PeerProblem:
             mu=dual_step,
             niter=steps,
             gfirst=False,
+            callback=on_step,
         )
         return self.natural(found)
 
@@ -120,34 +128,32 @@ def variational_timings(
 ) -> Iterator[StepTiming]:
     """Yield the seconds of our step, of pyproximal's, and of that without its data step.
 
-    A step is timed as the difference of a long and a short run, which share what comes before.
+    Each is the median time between the ends of two steps of one run.
     """
     psi = build_imaging_matrix(camera, size)
     truth = np.random.default_rng(0).random(psi.light_field_shape, dtype=np.float32)
     frames = psi.forward(truth)
+    grey = np.full_like(truth, 0.5)
+    steps = repeats + 2
+    settings = TVSettings(
+        mu=MU, primal_step=PRIMAL_STEP, rtol=1e-30, max_steps=steps, objective_every=10**6
+    )
+    ends: list[float] = []
 
-    def ours(steps: int) -> None:
-        settings = TVSettings(
-            mu=MU, primal_step=PRIMAL_STEP, rtol=1e-30, max_steps=steps, objective_every=10**6
-        )
-        reconstruct_tv(psi, frames, 0.0, settings, start=truth)
+    def ended(_: object) -> None:
+        ends.append(time.perf_counter())
 
-    own_s = _step_s(ours, 10 * repeats)
+    reconstruct_tv(psi, frames, 0.0, settings, on_step=ended, start=grey)
+    own_s = _step_s(ends)
     yield StepTiming(OURS, own_s, 1.0)
     for name, data_step in (("pyproximal", True), ("pyproximal without data step", False)):
+        ends.clear()
         problem = PeerProblem(psi, frames, MU, data_step)
-        peer_s = _step_s(
-            lambda steps, p=problem: p.solve(truth, PRIMAL_STEP, steps, DUAL_STEP), repeats
-        )
+        problem.solve(grey, PRIMAL_STEP, steps, DUAL_STEP, ended)
+        peer_s = _step_s(ends)
         yield StepTiming(name, peer_s, peer_s / own_s)
 
 
-def _step_s(run: Any, steps: int) -> float:
-    """Return the seconds of a step of run(steps), which takes the same time to begin."""
-    run(1)
-    seconds = []
-    for count in (1, 1 + steps):
-        started = time.perf_counter()
-        run(count)
-        seconds.append(time.perf_counter() - started)
-    return max(seconds[1] - seconds[0], 1e-9) / steps
+def _step_s(ends: list[float]) -> float:
+    """Return the median seconds between the ends of steps; the first one may have compiled."""
+    return float(np.median(np.diff(ends)))

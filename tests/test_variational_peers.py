@@ -102,4 +102,5 @@ def test_the_steps_of_both_are_timed():
         "pyproximal without data step",
     ]
     assert all(row.seconds > 0 for row in rows)
+    assert rows[1].times_ours == rows[1].seconds / rows[0].seconds
     assert rows[0].times_ours == 1
