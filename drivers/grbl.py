@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from drivers import grbl_codec as codec
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -85,7 +85,7 @@ class GrblStage(HostStage):
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
 
-    def stop(self, axes=None) -> None:
+    def stop(self, axes: Iterable[str] | None = None) -> None:
         """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
         self._choose(axes)
         self._stop_axis(self._axes[0])

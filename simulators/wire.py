@@ -243,7 +243,8 @@ class _Server(ABC):
 class PtyServer(_Server):
     """Serves firmware on a pseudo-terminal; its name changes after an unplug, as a USB port's may.
 
-    `link` is a path that always leads to it, as /dev/serial/by-id does. POSIX only.
+    `link` is a path that always leads to it, as /dev/serial/by-id does; it must be free, or an
+    earlier link. POSIX only.
     """
 
     def __init__(self, firmware: Firmware, link: Path | None = None) -> None:
@@ -258,7 +259,8 @@ class PtyServer(_Server):
         tty.setraw(self._line)
         self.port = os.ttyname(self._line)
         if self._link is not None:
-            self._link.unlink(missing_ok=True)
+            if self._link.is_symlink():
+                self._link.unlink()
             self._link.symlink_to(self.port)
 
     def _close(self) -> None:

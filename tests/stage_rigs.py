@@ -35,7 +35,6 @@ class Rig(ABC):
     axes: tuple[str, ...]
     senses_stalls = True
     replies_are_numbered = False
-    hardware = False
 
     @abstractmethod
     def make_device(self) -> Any: ...

@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -336,3 +338,18 @@ def test_a_simulated_stage_is_served_to_other_programs(wire, tmp_path):
             _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert "Traceback" not in err
+
+
+def test_a_link_does_not_replace_a_file(run, tmp_path):
+    (tmp_path / "notes").write_text("mine")
+    code, _, err = run("serve", "zaber", "--link", "notes")
+    assert (code, "cannot serve" in one_line(err)) == (1, True)
+    assert (tmp_path / "notes").read_text() == "mine"
+
+
+def test_every_test_that_the_page_about_devices_names_exists():
+    root = Path(__file__).parents[1]
+    named = set(re.findall(r"`(test_\w+)`", (root / "docs/devices.md").read_text()))
+    written = "".join(path.read_text() for path in (root / "tests").glob("test_*.py"))
+    assert len(named) > 10
+    assert [name for name in sorted(named) if f"def {name}(" not in written] == []

@@ -34,9 +34,7 @@ REPLY_FAULTS = ("drop_reply", "lose_reply_byte", "garble_reply", "late_reply", "
 
 
 class HardwareRig:
-    """The real stage that the command line names; its faults are not ours to make."""
-
-    hardware = True
+    """The real stage that the command line names."""
 
     def __init__(self, spec):
         from emmc_rig.hardware import open_stage
@@ -55,38 +53,41 @@ class HardwareRig:
             self._stage.close()
 
 
-@pytest.fixture(
-    params=[
-        *(f"{protocol}-{wire}" for protocol in RIGS for wire in WIRES),
-        pytest.param("hardware", marks=pytest.mark.hardware),
-    ]
-)
-def rig(request, tmp_path, monkeypatch):
-    with ExitStack() as opened:
-        if request.param == "hardware":
-            real = HardwareRig(request.config.getoption("--stage"))
-            opened.callback(real.close)
-            yield real
-        else:
-            protocol, wire = request.param.split("-")
-            # pyserial pauses 0.3 s in the closing of a socket, for the other side's sake
-            monkeypatch.setattr(
-                protocol_socket, "time", SimpleNamespace(sleep=lambda pause_s: None)
-            )
-            yield RIGS[protocol](wire, opened, tmp_path)
-
-
-@pytest.fixture(params=RIGS)
-def in_memory(request, tmp_path):
-    with ExitStack() as opened:
-        yield RIGS[request.param]("memory", opened, tmp_path)
+SIMULATED = [f"{protocol}-{wire}" for protocol in RIGS for wire in WIRES]
 
 
 @pytest.fixture
-def simulated(rig):
-    if rig.hardware:
-        pytest.skip("needs a simulator, to know the truth or to make a fault")
-    return rig
+def opened():
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture(params=[*SIMULATED, pytest.param("hardware", marks=pytest.mark.hardware)])
+def rig(request, opened, tmp_path, monkeypatch):
+    """Every kind of stage, a real one too."""
+    if request.param != "hardware":
+        return simulated_rig(request.param, opened, tmp_path, monkeypatch)
+    real = HardwareRig(request.config.getoption("--stage"))
+    opened.callback(real.close)
+    return real
+
+
+@pytest.fixture(params=SIMULATED)
+def simulated(request, opened, tmp_path, monkeypatch):
+    """Every kind of stage whose truth is known, and whose faults can be made."""
+    return simulated_rig(request.param, opened, tmp_path, monkeypatch)
+
+
+@pytest.fixture(params=RIGS)
+def in_memory(request, opened, tmp_path):
+    return RIGS[request.param]("memory", opened, tmp_path)
+
+
+def simulated_rig(name, opened, tmp_path, monkeypatch):
+    protocol, wire = name.split("-")
+    # pyserial pauses 0.3 s in the closing of a socket, for the other side's sake
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda pause_s: None))
+    return RIGS[protocol](wire, opened, tmp_path)
 
 
 @pytest.fixture

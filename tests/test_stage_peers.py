@@ -19,6 +19,8 @@ from simulators.grbl import BENCH_AXES, GrblController
 from simulators.wire import PtyServer, TcpServer
 from simulators.zaber import AxisSpec, ZaberChain
 
+pytestmark = pytest.mark.peers
+
 PATIENCE_S = 10.0
 QUICK = AxisSpec(max_speed_um_s=200_000.0, acceleration_um_s2=2e7)
 

@@ -1,4 +1,8 @@
-"""Zaber wire format, by transcript: the bytes are those of the protocol, not of our encoder."""
+"""Zaber wire format, by transcript: the bytes are those of the protocol, not of our encoder.
+
+Lines marked with a section are examples of the ASCII Protocol Manual, as far as they were seen
+quoted; the others were seen with a running client, or are built by the manual's rules.
+"""
 
 import pytest
 
@@ -41,6 +45,16 @@ def test_a_command_the_format_cannot_carry_is_refused(arguments, complaint):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        # "Replies": the answer to `/1 move abs 10000`
+        (
+            b"@01 0 OK IDLE -- 0\r\n",
+            Reply(1, 0, None, accepted=True, busy=False, flag="--", data="0"),
+        ),
+        # `home`: the answer to `/ home` before the axis has a reference
+        (
+            b"@01 0 OK BUSY WR 0\r\n",
+            Reply(1, 0, None, accepted=True, busy=True, flag="WR", data="0"),
+        ),
         (
             b"@01 1 10 OK BUSY -- 0\r\n",
             Reply(1, 1, 10, accepted=True, busy=True, flag="--", data="0"),
