@@ -25,7 +25,7 @@ from emmc_rig.tables.library import Cut, Library, middle, scene_specs
 from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part
 from emmc_rig.tables.rows import csv_text
-from emmc_rig.tables.run import Forecast, Run, TablesSettings, TablesStopped, do_cells
+from emmc_rig.tables.run import FAST, Forecast, Run, TablesSettings, TablesStopped, do_cells
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors
 from reconstruction.bpdn import BPDNSettings
@@ -42,7 +42,7 @@ TINY = TablesSettings(
     binned_cut=Cut(SIZE, 2),
     methods=MethodSettings(
         tv=TVSettings(max_steps=5),
-        sparse=SparseSettings(stride=9, solver=BPDNSettings(max_steps=20, rtol=0.1)),
+        sparse=SparseSettings(stride=9, solver=BPDNSettings(method="admm", max_steps=20, rtol=0.1)),
     ),
     binned_stride=8,
     training=TrainingSettings(
@@ -145,10 +145,8 @@ def test_sharing_the_first_stage_changes_no_result(scenes, tmp_path):
     shots = Sensors(TINY.seed).take(capture, truth, "shed")
     dictionary = run.source.dictionary("shed", 1, Silent())
     for method in ("dict-admm", "tv-dict"):
-        # The cell is that of the solver that is set, which finds what ADMM approaches.
-        solver = f"dict-{TINY.methods.sparse.solver.method}"
         alone = reconstruct(
-            solver if method == "dict-admm" else method,
+            method,
             shots.psi,
             shots.frames,
             shots.noise_sigma,
@@ -159,6 +157,12 @@ def test_sharing_the_first_stage_changes_no_result(scenes, tmp_path):
         kept = results[Cell("shed", capture, method)]
         assert kept["psnr_db"] == pytest.approx(psnr_db(alone.light_field, truth), abs=1e-3)
         assert kept["status"] == alone.status
+
+
+def test_patches_are_coded_by_the_papers_solver_unless_told():
+    for settings in (TablesSettings(), FAST):
+        for method in ("dict-admm", "tv-dict"):
+            assert settings.of(method, Capture("ii", 1)).sparse.solver.method == "admm"
 
 
 def test_nothing_is_done_twice(scenes, tmp_path, monkeypatch):

@@ -118,11 +118,7 @@ def _about(run: Run, cells: int) -> list[str]:
     cut = run.settings.cut.size
     size = "whole views" if cut is None else f"the middle {cut[0]}×{cut[1]} pixels"
     solver = run.settings.methods.sparse.solver.method
-    coded = (
-        ""
-        if solver == "admm"
-        else f" Dict-ADMM's patches are coded by {solver.upper()}, which finds the same minimiser."
-    )
+    coded = "" if solver == "admm" else f" Dict-ADMM's patches are coded by {solver.upper()} here."
     return [
         f"{cells} reconstructions of {', '.join(run.library.names)}; {size}, 5×5 views, PSNR with "
         "peak 1 over all views, pixels and colours.",

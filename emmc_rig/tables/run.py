@@ -23,6 +23,7 @@ from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors, Shots
+from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
 from reconstruction.learning import LearningSettings
@@ -33,6 +34,7 @@ from reconstruction.training_patches import PatchSettings
 from reconstruction.tv import TVSettings
 
 PICTURES = "pictures"
+PAPERS_SOLVER = BPDNSettings(method="admm")
 
 
 class TablesStopped(KeyboardInterrupt):
@@ -43,12 +45,12 @@ class TablesSettings(Settings):
     """How everything is computed; cuts are the middle of each scene.
 
     The patches of `dict-admm`, and of `tv-dict` which starts from them, are coded once by the
-    solver of `methods.sparse`; LARS, its default, finds the minimiser that ADMM approaches.
+    solver of `methods.sparse`: ADMM, as in the paper.
     """
 
     cut: Cut = Cut()
     binned_cut: Cut = Cut(multiple=2)
-    methods: MethodSettings = Field(default_factory=MethodSettings)
+    methods: MethodSettings = MethodSettings(sparse=SparseSettings(solver=PAPERS_SOLVER))
     binned_stride: int = Field(default=4, ge=2, multiple_of=2)
     training: TrainingSettings = Field(default_factory=TrainingSettings)
     seed: int = Field(default=0, ge=0)
@@ -76,7 +78,10 @@ class TablesSettings(Settings):
 FAST = TablesSettings(
     cut=Cut((96, 128)),
     binned_cut=Cut((64, 80), 2),
-    methods=MethodSettings(tv=TVSettings(max_steps=100)),
+    methods=MethodSettings(
+        tv=TVSettings(max_steps=100),
+        sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
+    ),
     training=TrainingSettings(
         cut=Cut((192, 192)),
         patches=PatchSettings(count=2000, candidates_per_patch=2),
