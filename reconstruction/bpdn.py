@@ -25,12 +25,14 @@ Array32 = NDArray[np.float32]
 Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
 MINIMISERS = ("admm", "lars", "ista", "fista")
 SL0_RIDGE = 1e-5
+LARS_GAP = 0.05
+"""A path that ends further from the minimiser went wrong by rounding: told as not converged."""
 
 
 class BPDNSettings(Settings):
     """Which solver, and when it stops; None lets noise and data choose."""
 
-    method: Method = "lars"
+    method: Method = "admm"
     penalty: float | None = Field(
         default=None, gt=0, description="eta, in units of readings times a sensed atom's norm"
     )
@@ -170,7 +172,7 @@ def prepared(
             correlation = np.empty(count, dtype=np.float32)
             gap = kernels.judge(atoms, one, np.float32(eta), weights, correlation)[1]
             if steps != kernels.NONE:
-                return Code(weights, eta, gap, np.nan, steps, True)
+                return Code(weights, eta, gap, np.nan, steps, gap <= LARS_GAP)
             steps = settings.max_steps
         else:
             steps, gap = kernels.proximal_gradient(

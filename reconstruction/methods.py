@@ -124,7 +124,7 @@ METHODS = {
             "tv-dict",
             "DV_K drawn towards sparse patches (the paper's TV-Dict)",
             "what `tv` and `dict-admm` assume, each where it holds",
-            "that of dict-lars (the same minimiser), then that of tv with 4N bytes more a step",
+            "that of dict-admm, then that of tv with 4N bytes more a step",
             "the best here, from any number of shots",
             True,
         ),
