@@ -22,7 +22,8 @@ DEPENDENT = 1e-3
 """An atom of which the chosen ones explain all but this share of its norm adds nothing."""
 DARKEST = 1e-6
 """Sensed atoms weaker than this, against the strongest, are dark and never chosen."""
-REFRESH = 25
+FRESH = 0.7
+"""LARS: once the level fell to this share, correlations are computed anew: they are 32 bits."""
 NEVER = 1e30
 POWER_STEPS = 40
 POWER_MARGIN = 1.02
@@ -535,6 +536,8 @@ def lars(atoms, data, eta, max_steps, code):
     weights = np.zeros(room + 1)
     direction = np.empty(room + 1)
     toward = np.empty(length)
+    left = np.empty(count, np.int64)
+    dependent = np.empty(count, np.int64)
     residual = data.astype(np.float64)
     _correlations_along(atoms, residual, correlation)
     level = 0.0
@@ -543,9 +546,8 @@ def lars(atoms, data, eta, max_steps, code):
         if abs(correlation[j]) > level:
             level = abs(correlation[j])
             joining = j
-    used = 0
-    steps = 0
-    just_left = NONE
+    refreshed = level
+    used = steps = resting = refused = 0
     while level > eta and steps < max_steps:
         if joining != NONE:
             if used < room and _grow(lower, used, rows, atoms[joining]):
@@ -553,7 +555,10 @@ def lars(atoms, data, eta, max_steps, code):
                 signs[used] = 1.0 if correlation[joining] > 0 else -1.0
                 weights[used] = 0.0
                 used += 1
-            # Inside now, or never: it adds nothing to the atoms inside.
+            else:
+                # It adds nothing to the atoms inside, until one of them leaves.
+                dependent[refused] = joining
+                refused += 1
             blocked[joining] = NEVER
         _solve(lower, used, signs, direction)
         toward[:] = 0
@@ -563,8 +568,6 @@ def lars(atoms, data, eta, max_steps, code):
         reach = level - eta
         joining = NONE
         leaving = NONE
-        if just_left != NONE:
-            blocked[just_left] = NEVER
         nearest = _join_steps(correlation, slope, blocked, np.float32(level), joins)
         if nearest < reach:
             for j in range(count):
@@ -572,11 +575,10 @@ def lars(atoms, data, eta, max_steps, code):
                     joining = j
                     break
             reach = max(np.float64(nearest), 0.0)
-        if just_left != NONE:
-            blocked[just_left] = 0
         for i in range(used):
-            if weights[i] * direction[i] < 0:
-                step = -weights[i] / direction[i]
+            # By its sign, not by its weight: of two that reach 0 together one may be past it.
+            if signs[i] * direction[i] < 0:
+                step = max(signs[i] * weights[i], 0.0) / abs(direction[i])
                 if step < reach:
                     reach = step
                     leaving = i
@@ -586,15 +588,23 @@ def lars(atoms, data, eta, max_steps, code):
             weights[i] += reach * direction[i]
         residual -= reach * toward
         steps += 1
-        if steps % REFRESH == 0:
+        if level < FRESH * refreshed:
+            refreshed = level
             _correlations_along(atoms, residual, correlation)
         else:
             for j in range(count):
                 correlation[j] -= reach * slope[j]
-        just_left = NONE
+        if reach > 0:
+            for i in range(resting):
+                blocked[left[i]] = 0
+            resting = 0
         if leaving != NONE:
-            just_left = chosen[leaving]
-            blocked[just_left] = 0
+            # It is at the level still, and must not come back before the level falls.
+            left[resting] = chosen[leaving]
+            resting += 1
+            for i in range(refused):
+                blocked[dependent[i]] = 0
+            refused = 0
             used -= 1
             for i in range(leaving, used):
                 chosen[i], signs[i], weights[i] = chosen[i + 1], signs[i + 1], weights[i + 1]

@@ -25,8 +25,9 @@ from reconstruction.choices import (
 )
 from reconstruction.differences import adjoint, gradient, norm_squared
 from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
-from reconstruction.problem import Problem, check, colour_metric
+from reconstruction.problem import Problem, colour_metric
 from reconstruction.result import Progress, Reconstruction
 
 Array = NDArray[np.floating]
@@ -110,11 +111,9 @@ def reconstruct_full_splitting(
     """
     settings = settings or FullSplittingSettings()
     started = clock()
-    check(psi, frames, noise_sigma, usable, patch_term, start)
-    if usable is None:
-        usable = np.ones(psi.frames_shape, dtype=bool)
+    data, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    check_light_fields(psi, patch_term, start)
     dtype = psi.weights.dtype
-    data = np.where(usable, frames, 0).astype(dtype)
     mu = choose_mu(psi, data[usable], noise_sigma) if settings.mu is None else settings.mu
     order, rho = settings.order, settings.rho if patch_term is not None else 0.0
     metric = colour_metric(settings.chroma_weight).astype(dtype)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
+from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
 
@@ -38,3 +39,16 @@ def checked_inputs(
     if not np.isfinite(frames[usable]).all():
         raise ReconstructionError("the frames hold values that are not finite: exclude them")
     return np.where(usable, frames, 0).astype(psi.weights.dtype), usable
+
+
+def check_light_fields(psi: ImagingMatrix, patches: PatchTerm | None, start: Array | None) -> None:
+    """Raise ReconstructionError for patches or a start that do not fit Psi's light field."""
+    shape = psi.light_field_shape
+    if patches is not None and patches.target.shape != shape:
+        raise ReconstructionError(
+            f"patches for a light field of shape {patches.target.shape} given, Psi needs {shape}"
+        )
+    if start is not None and start.shape != shape:
+        raise ReconstructionError(f"a start of shape {start.shape} given, Psi needs {shape}")
+    if start is not None and not np.isfinite(start).all():
+        raise ReconstructionError("the start holds values that are not finite")

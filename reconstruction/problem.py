@@ -1,4 +1,4 @@
-"""What the variational methods minimise, the paper's eq. 9, and the checks of its parts.
+"""What the variational methods minimise: the paper's eq. 9.
 
 min over L of 1/2 |Psi L - I|^2 + mu DV_K(L) + rho/2 |P L - Lhat|^2, over the usable pixels.
 """
@@ -79,41 +79,3 @@ class Problem:
                 f"use patch corners and sizes that are multiples of {k}"
             )
         return self.rho * blocks[:, 0, :, 0].astype(np.float64)
-
-
-def check(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_] | None,
-    patch_term: PatchTerm | None,
-    start: Array | None,
-) -> None:
-    """Raise ReconstructionError, one line, for data that no reconstruction can be made from."""
-    if not 0 <= noise_sigma < np.inf:
-        raise ReconstructionError(
-            f"a noise level of {noise_sigma:g}: it must be finite, at least 0"
-        )
-    if frames.shape != psi.frames_shape:
-        raise ReconstructionError(
-            f"frames of shape {frames.shape} given, Psi needs {psi.frames_shape} "
-            "(shot, row, column): use the Psi measured with these shots"
-        )
-    if usable is not None and usable.shape != psi.frames_shape:
-        raise ReconstructionError(f"the mask of usable pixels has shape {usable.shape}")
-    if usable is not None and not usable.any():
-        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
-    judged = frames if usable is None else frames[usable]
-    if not np.isfinite(judged).all():
-        raise ReconstructionError("the frames hold values that are not finite: exclude them")
-    if patch_term is not None and patch_term.target.shape != psi.light_field_shape:
-        raise ReconstructionError(
-            f"patches for a light field of shape {patch_term.target.shape} given, Psi needs "
-            f"{psi.light_field_shape}"
-        )
-    if start is not None and start.shape != psi.light_field_shape:
-        raise ReconstructionError(
-            f"a start of shape {start.shape} given, Psi needs {psi.light_field_shape}"
-        )
-    if start is not None and not np.isfinite(start).all():
-        raise ReconstructionError("the start holds values that are not finite")

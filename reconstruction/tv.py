@@ -43,8 +43,9 @@ from reconstruction.choices import (
 )
 from reconstruction.differences import norm_squared as norm_squared_of
 from reconstruction.differences import stencils
+from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
-from reconstruction.problem import Problem, check, colour_metric
+from reconstruction.problem import Problem, colour_metric
 from reconstruction.result import Progress, Reconstruction
 
 Array = NDArray[np.floating]
@@ -107,14 +108,14 @@ def reconstruct_tv(
     started = clock()
     if settings.rho == 0:
         patch_term = None
-    check(psi, frames, noise_sigma, usable, patch_term, start)
-    if usable is None:
-        usable = np.ones(psi.frames_shape, dtype=bool)
+    data, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    check_light_fields(psi, patch_term, start)
     dtype = psi.weights.dtype.type
-    data = np.where(usable, frames, 0).astype(dtype)
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
-    gamma = settings.primal_step or choose_primal_step(contrast(guess), mu, settings.chroma_weight)
+    gamma = settings.primal_step or choose_primal_step(
+        contrast(guess), mu, settings.chroma_weight, settings.order
+    )
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)

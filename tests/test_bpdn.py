@@ -89,6 +89,21 @@ def test_atoms_leave_the_lasso_path_again():
     assert objective(atoms, data, eta, code.weights) <= least * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_atoms_that_join_and_leave_the_lasso_path_together_do_no_harm(seed):
+    """Mirrored atoms and a symmetric signal: every event of the path is one of two atoms."""
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(30, 16))
+    side = rng.normal(size=16)
+    code = solve_bpdn(
+        np.concatenate([half, half[:, ::-1]]),
+        side + side[::-1],
+        settings=BPDNSettings(method="lars"),
+    )
+    assert code.converged
+    assert code.gap < 1e-3
+
+
 def test_equal_atoms_and_dark_atoms_do_no_harm():
     atoms, data, _ = problem(60, 20, noise=0.1)
     atoms[10] = atoms[3]
