@@ -367,7 +367,7 @@ def chart(
     out: OutOption = Path("emmc-kernels"),
 ) -> None:
     """Measure speed: kernels against their memory bound, sparse solvers against theirs."""
-    from emmc_rig.benchmark import kernel_timings, reconstruction_memory
+    from emmc_rig.benchmarks.kernels import kernel_timings, reconstruction_memory
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
@@ -505,9 +505,9 @@ def tables(
 
 
 def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
+    from emmc_rig.benchmarks.variational import variational_timings
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
-    from emmc_rig.variational_benchmark import variational_timings
 
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
@@ -523,10 +523,10 @@ def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None
 
 
 def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
+    from emmc_rig.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
     from emmc_rig.reconstruct import open_dictionary
-    from emmc_rig.sparse_benchmark import TIMED_SIZE, peer_timings, solver_timings
 
     described = find_camera(camera)
     atoms = open_dictionary(dictionary, described.views, described.sensor.binning)

@@ -194,10 +194,10 @@ def bench(
     out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
 ) -> None:
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
-    from emmc_rig.camera_benchmark import picture_timing
-    from emmc_rig.device_benchmark import stage_timings
+    from emmc_rig.benchmarks.ptp import picture_timing
+    from emmc_rig.benchmarks.stages import stage_timings
+    from emmc_rig.benchmarks.u3v import u3v_timings
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
-    from emmc_rig.u3v_benchmark import u3v_timings
 
     timings = stage_timings(repeats)
     table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")

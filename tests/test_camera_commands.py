@@ -15,7 +15,7 @@ from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
 from emmc_rig import camera_commands, hardware
-from emmc_rig.camera_benchmark import picture_timing
+from emmc_rig.benchmarks.ptp import picture_timing
 from emmc_rig.camera_commands import register, save_frame
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import frame_figures, histogram, histogram_text, preview

@@ -63,7 +63,7 @@ def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_st
 
 def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
     pytest.importorskip("pyproximal")
-    from emmc_rig.variational_benchmark import PeerProblem
+    from emmc_rig.benchmarks.variational import PeerProblem
 
     psi = coded_psi("rggb", 2, 3, (4, 6), (2, 3), np.float64)
     truth, frames = capture(psi)
@@ -93,7 +93,7 @@ def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
 
 def test_the_steps_of_both_are_timed():
     pytest.importorskip("pyproximal")
-    from emmc_rig.variational_benchmark import variational_timings
+    from emmc_rig.benchmarks.variational import variational_timings
 
     rows = list(variational_timings(find_camera("rgbw-bayer-1shot"), (16, 20), 1))
     assert [row.name for row in rows] == [

@@ -7,9 +7,7 @@ buffer, the frame put together, its SHA-256 and its mosaic.
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -18,6 +16,7 @@ import numpy as np
 
 from drivers.pixel_formats import BY_NAME, KERNELS, image_bytes, unpack
 from drivers.u3v import open_u3v
+from emmc_rig.benchmarks.timing import median_s
 from simulators.clock import ManualClock
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
@@ -60,7 +59,7 @@ def unpacking_timings(size: tuple[int, int] = SIZE_24MP, repeats: int = 9) -> It
             ("kernel", partial(kernel, packed, mosaic)),
             ("new mosaic", partial(unpack, data, form, size)),
         ):
-            yield U3vTiming(f"{name}, {what}", gigabytes, _median_s(call, repeats))
+            yield U3vTiming(f"{name}, {what}", gigabytes, median_s(call, repeats))
 
 
 def stream_timing(size: tuple[int, int] = SIZE_24MP, frames: int = 9) -> U3vTiming:
@@ -71,7 +70,7 @@ def stream_timing(size: tuple[int, int] = SIZE_24MP, frames: int = 9) -> U3vTimi
     opened = open_u3v(backend=SimulatedUsb(clock, camera), clock=clock, pixel_format="BayerRG12p")
     with closing(opened), closing(opened.stream()) as stream:
         first = next(stream)
-        seconds = _median_s(lambda: next(stream), frames)
+        seconds = median_s(lambda: next(stream), frames)
     return U3vTiming("simulated stream, one frame", len(first.original) / 1e9, seconds)
 
 
@@ -81,18 +80,8 @@ def command_timing(count: int = 500) -> U3vTiming:
     shape = (4, 4)
     camera = U3vCameraSimulator(lambda exposure_s: np.zeros(shape, np.uint16), clock, shape)
     with closing(open_u3v(backend=SimulatedUsb(clock, camera), clock=clock)) as opened:
-        seconds = _median_s(lambda: opened.features.number("WidthMax"), count)
+        seconds = median_s(lambda: opened.features.number("WidthMax"), count)
     return U3vTiming("read one register", 4 / 1e9, seconds)
-
-
-def _median_s(call: Callable[[], object], repeats: int) -> float:
-    call()
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds)
 
 
 def u3v_timings() -> Iterator[U3vTiming]:

@@ -7,7 +7,6 @@ allocation. The bound of a kernel is its bytes over the triad's bandwidth.
 from __future__ import annotations
 
 import resource
-import statistics
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numba import get_num_threads, njit, prange
 
+from emmc_rig.benchmarks.timing import median_s
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
 from emmc_rig.model import kernels
@@ -57,16 +57,6 @@ def triad(a, b, c, scale):
         a[i] = b[i] + scale * c[i]
 
 
-def _median_s(call: Callable[[], object], repeats: int) -> float:
-    call()
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds)
-
-
 def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Iterator[Timing]:
     """Yield the triad, then every kernel on a light field of `size` (rows, columns).
 
@@ -76,7 +66,7 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
     triad_bytes = a.nbytes + b.nbytes + c.nbytes
 
     def bandwidth() -> float:
-        return triad_bytes / _median_s(lambda: triad(a, b, c, np.float32(2)), repeats)
+        return triad_bytes / median_s(lambda: triad(a, b, c, np.float32(2)), repeats)
 
     rate = bandwidth()
     yield Timing("triad", triad_bytes / 1e9, triad_bytes / rate, triad_bytes / rate)
@@ -121,13 +111,13 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
     with pool:
         for name, call, counted in cases:
             rate = bandwidth()
-            yield Timing(name, counted / 1e9, _median_s(call, repeats), counted / rate)
+            yield Timing(name, counted / 1e9, median_s(call, repeats), counted / rate)
 
 
 def reconstruction_memory(camera_name: str, size: tuple[int, int]) -> tuple[float, float]:
     """Return seconds and peak memory (GiB) of a TV reconstruction in a process of its own."""
     code = (
-        "from emmc_rig.benchmark import _reconstruct_once;"
+        "from emmc_rig.benchmarks.kernels import _reconstruct_once;"
         f"_reconstruct_once({camera_name!r}, {size!r})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
