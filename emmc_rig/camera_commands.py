@@ -37,6 +37,9 @@ SAVE_KEY, END_KEYS = "s", "q\x1b"
 CameraSpec = Annotated[
     str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
 ]
+RigOption = Annotated[
+    str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
+]
 ExposureOption = Annotated[
     float | None, typer.Option("--exposure", help="in seconds (default: as the camera is set)")
 ]
@@ -60,8 +63,9 @@ def register(app: typer.Typer) -> None:
     app.command("live")(live)
 
 
-def camera_info(camera: CameraSpec = "ptp:") -> None:
+def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
     """Tell what a camera is, and what it can be set to."""
+    camera = _chosen(camera, rig)
     table = Table("camera", camera, box=SIMPLE)
     with closing(open_camera(camera)) as device:
         for name, value in camera_rows(device):
@@ -71,13 +75,14 @@ def camera_info(camera: CameraSpec = "ptp:") -> None:
 
 def snap(
     camera: CameraSpec = "ptp:",
+    rig: RigOption = None,
     exposure: ExposureOption = None,
     gain: GainOption = None,
     count: Annotated[int, typer.Option("--count", min=1, help="number of frames")] = 1,
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
-    with closing(open_camera(camera)) as device:
+    with closing(open_camera(_chosen(camera, rig))) as device:
         folder = frames_folder(out)
         choose(device, exposure, gain)
         for _ in range(count):
@@ -89,6 +94,7 @@ def snap(
 
 def live(
     camera: CameraSpec = "ptp:",
+    rig: RigOption = None,
     exposure: ExposureOption = None,
     gain: GainOption = None,
     frames: Annotated[
@@ -102,7 +108,8 @@ def live(
     """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
     folder = frames_folder(out) if save_every else None
     console = Console()
-    with closing(open_camera(camera)) as device, _keys() as pressed, suppress(KeyboardInterrupt):
+    device = open_camera(_chosen(camera, rig))
+    with closing(device), _keys() as pressed, suppress(KeyboardInterrupt):
         choose(device, exposure, gain)
         showing = Live(console=console, auto_refresh=False) if console.is_terminal else None
         with showing or nullcontext(), closing(_frames(device)) as stream:
@@ -120,6 +127,23 @@ def live(
                     showing.update(drawn, refresh=True)
                 if key and key in END_KEYS:
                     break
+
+
+def simulated_protocol(rig: str) -> str:
+    """Return the stages' protocol of `--rig simulated[:PROTOCOL]`; typer's error for any other."""
+    kind, _, protocol = rig.partition(":")
+    if kind != "simulated":
+        raise typer.BadParameter(
+            f"--rig {rig}: only simulated rigs are known; name real devices by --stage or --camera"
+        )
+    return protocol or "zaber"
+
+
+def _chosen(camera: str, rig: str | None) -> str:
+    if rig is None:
+        return camera
+    simulated_protocol(rig)
+    return "simulated"
 
 
 def camera_rows(device: Camera) -> Iterator[tuple[str, str]]:

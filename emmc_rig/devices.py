@@ -13,14 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from emmc_rig.camera_commands import register
+from emmc_rig.camera_commands import register, simulated_protocol
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -48,10 +48,22 @@ register(app)
 
 
 @app.command("list")
-def list_devices() -> None:
+def list_devices(rig: RigOption = None) -> None:
     """List serial ports (adapter, what usually answers there, who holds them) and USB cameras."""
+    from drivers.clock import SYSTEM_CLOCK
     from drivers.ports import holder_of, list_serial_ports
 
+    if rig is not None:
+        from emmc_rig.hardware import simulated_bus
+        from emmc_rig.stage_config import PROTOCOLS
+
+        simulated_protocol(rig)
+        _list_cameras(simulated_bus(SYSTEM_CLOCK))
+        table = Table("stage", box=SIMPLE)
+        for protocol in PROTOCOLS:
+            table.add_row(f"--rig simulated:{protocol}")
+        Console().print(table)
+        return
     _list_cameras()
     ports = list_serial_ports()
     if not ports:
@@ -72,8 +84,8 @@ def list_devices() -> None:
     Console().print(table)
 
 
-def _list_cameras() -> None:
-    """Print the PTP and USB3 Vision cameras that are plugged in."""
+def _list_cameras(backend: Any = None) -> None:
+    """Print the PTP and USB3 Vision cameras that are plugged in; `backend`: of pyusb."""
     from drivers.errors import DriverError
     from drivers.ptp_usb import PTP_INTERFACE
     from drivers.u3v_codec import CONTROL
@@ -82,7 +94,7 @@ def _list_cameras() -> None:
     found = []
     for kind, interface in (("ptp", PTP_INTERFACE), ("u3v", CONTROL)):
         try:
-            found += [(kind, one) for one in list_usb(interface)]
+            found += [(kind, one) for one in list_usb(interface, backend)]
         except DriverError as fault:
             typer.echo(f"USB cameras cannot be listed: {fault}")
             return
@@ -101,11 +113,18 @@ def probe(
     ports: Annotated[
         list[str] | None, typer.Argument(help="ports to ask (default: those of a known adapter)")
     ] = None,
+    rig: RigOption = None,
 ) -> None:
     """Ask ports what answers there; nothing moves."""
     from drivers.ports import list_serial_ports
-    from emmc_rig.hardware import probe_port
+    from emmc_rig.hardware import probe_port, probe_simulated
 
+    # Silence in all protocols but one is what a probe expects.
+    logging.getLogger("drivers").setLevel(logging.ERROR)
+    if rig is not None:
+        protocol = simulated_protocol(rig)
+        typer.echo(f"simulated:{protocol}: {probe_simulated(protocol)}")
+        return
     chosen = ports or [port.device for port in list_serial_ports() if port.guess]
     if not chosen:
         raise AppError("no port with a known adapter: name the ports to ask")
@@ -237,12 +256,12 @@ def bench(
 def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
     from drivers.errors import DriverError
-    from emmc_rig.hardware import SIMULATED, open_stage
+    from emmc_rig.hardware import open_stage
 
     if (stage is None) == (rig is None):
         raise typer.BadParameter("say which stage: either --stage or --rig simulated")
-    if rig is not None and rig.partition(":")[0] != SIMULATED:
-        raise typer.BadParameter(f"--rig {rig}: only simulated rigs are known, use --stage")
+    if rig is not None:
+        simulated_protocol(rig)
     logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)
     with _signals_interrupt(), open_stage(rig or stage or "") as opened:
         try:

@@ -51,6 +51,7 @@ from simulators.firmware import SimulatedController
 from simulators.grbl import GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb
+from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 _log = logging.getLogger(__name__)
@@ -236,6 +237,12 @@ def probe_port(port: str) -> str:
     return ""
 
 
+def probe_simulated(protocol: str) -> str:
+    """Return what simulated firmware answers, asked through a pseudo-terminal as a port is."""
+    with PtyServer(simulated_firmware(protocol, SYSTEM_CLOCK)) as server:
+        return probe_port(server.port)
+
+
 def _probe_zaber(transport: Transport) -> str:
     return ", ".join(
         f"device {one.address} (id {one.device_id}, serial number {one.serial_number}, firmware "
@@ -333,8 +340,12 @@ def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
 
 def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
     """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
-    bus = SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
-    return _ptp_camera(clock, bus, from_card=True)
+    return _ptp_camera(clock, simulated_bus(clock), from_card=True)
+
+
+def simulated_bus(clock: Clock) -> SimulatedUsb:
+    """Return a USB bus, for pyusb, with one simulated still camera."""
+    return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
 
 
 CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {

@@ -353,3 +353,23 @@ def test_every_test_that_the_page_about_devices_names_exists():
     written = "".join(path.read_text() for path in (root / "tests").glob("test_*.py"))
     assert len(named) > 10
     assert [name for name in sorted(named) if f"def {name}(" not in written] == []
+
+
+def test_list_and_probe_know_the_simulated_rig(run):
+    code, listed, _ = run("list", "--rig", "simulated")
+    assert code == 0
+    assert "ptp:S1" in listed
+    assert "simulated:grbl" in listed
+    for protocol, answer in (("zaber", "zaber: device 1"), ("grbl", "grbl: "), ("apt", "KDC101")):
+        code, probed, told = run("probe", "--rig", f"simulated:{protocol}")
+        assert code == 0
+        assert answer in probed
+        assert told == ""
+    assert run("probe", "--rig", "mine")[0] == 2
+
+
+def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
+    code, told, _ = run("snap", "--rig", "simulated", "--out", tmp_path / "snaps")
+    assert code == 0
+    assert "frame-0001.dng: 240x320 rggb" in told.replace("\n", "")
+    assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320

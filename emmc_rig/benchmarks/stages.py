@@ -9,9 +9,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from emmc_rig.hardware import open_simulated
+from emmc_rig.stage_config import PROTOCOLS
 from simulators.firmware import SimulatedController
-
-PROTOCOLS = ("zaber", "grbl", "apt")
 
 
 @dataclass(frozen=True)
