@@ -67,6 +67,18 @@ def _take_place(partial: Path, out: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def parse_size(
+    text: str | None, option: str = "--size", example: str = "192x256"
+) -> tuple[int, int] | None:
+    """Return rows and columns from ROWSxCOLUMNS; raises AppError."""
+    if text is None:
+        return None
+    rows, cross, columns = text.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
+    return int(rows), int(columns)
+
+
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
     """Write metrics.json; values that are not finite become null, as JSON has none."""
     text = json.dumps(_finite(metrics), indent=2, allow_nan=False)

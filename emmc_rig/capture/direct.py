@@ -1,4 +1,4 @@
-"""Sequences of exposures: whiteboards through the stepped pinhole, and the shots of a scene."""
+"""Exposures kept in memory: whiteboards through the stepped pinhole, and the shots of a scene."""
 
 from __future__ import annotations
 
