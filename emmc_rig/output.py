@@ -10,6 +10,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -111,10 +112,12 @@ def save_frames(
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
-    found = {"emmc-rig": __version__, "python": platform.python_version()}
-    for name in VERSIONED:
-        found[name] = metadata.version(name)
-    return found
+    return {"emmc-rig": __version__, "python": platform.python_version(), **_library_versions()}
+
+
+@cache
+def _library_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in VERSIONED}
 
 
 def command_line() -> str:
