@@ -32,7 +32,7 @@ def place():
 
 @pytest.fixture(scope="module")
 def killed():
-    """Run a capture that kills itself at an event: returns its exit code and how many there were."""
+    """Run a capture that kills itself at an event; returns its exit code and their number."""
     program = [sys.executable, str(Path(__file__).with_name("capture_kills.py"))]
     with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
         assert one.stdin is not None
