@@ -167,7 +167,12 @@ class SimulatedDisk:
 
     def free_bytes(self, folder: Path) -> int:
         """Return how much more can be written."""
-        return int(min(self.capacity_bytes - _bytes_in(self._root), 1 << 60))
+        return int(min(self.capacity_bytes - self.used_bytes, 1 << 60))
+
+    @property
+    def used_bytes(self) -> int:
+        """How much is on it."""
+        return _bytes_in(self._root)
 
     def _operate(self, name: str) -> None:
         self.operations += 1

@@ -20,7 +20,7 @@ from simulators.still import StillStage
 SIZE = (24, 32)
 BLACK, WHITE = 100, 4000
 AXES = ("mask_x", "mask_y", "aperture_x", "aperture_y")
-ZERO_UM = dict.fromkeys(AXES, 5000.0)
+ZERO_UM = dict.fromkeys(AXES, 20_000.0)
 PLAN_YAML = """
 camera: rgbw-bayer-3shots
 shots:
@@ -49,7 +49,7 @@ class NamedFrames:
 def frame_bytes(name, exposure_s, size=SIZE):
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-    top = BLACK + 20 if name.startswith("dark") else WHITE - 100
+    top = BLACK + 20 if name.startswith("dark") else WHITE - 400
     return encode_dng(rng.integers(BLACK, top, size, np.uint16), "rggb", BLACK, WHITE, exposure_s)
 
 
@@ -86,7 +86,7 @@ def still_rig(size=SIZE):
         opened(),
         QuietAttendant(),
         ZERO_UM,
-        20_000.0,
+        40_000.0,
         clock,
         opened,
         wire.announce,

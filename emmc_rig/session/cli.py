@@ -140,6 +140,47 @@ def sheet(
     typer.echo(f"open {path}")
 
 
+@app.command()
+def bench(
+    folder: Annotated[
+        Path, typer.Option("--folder", help="where the frames are written: names the disk")
+    ] = Path(),
+    shots: Annotated[int, typer.Option("--shots", min=2, help="24 MP frames to verify")] = 20,
+    listed: Annotated[int, typer.Option("--listed", min=2, help="shots to list")] = 10_000,
+    out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
+) -> None:
+    """Time what capturing costs beside the devices, and verifying and listing sessions."""
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.session_benchmark import listing_seconds, overheads, verification
+
+    measured = []
+    for one in overheads(folder, 300):
+        measured.append(one)
+        typer.echo(
+            f"sequencing {one.shots} shots of {one.megapixels:.3g} MP: {one.on_the_way_ms:.2f} ms "
+            f"for each beside devices and disk; {one.hidden_share:.0%} of hashing and writing "
+            "hidden"
+        )
+    rates = verification(folder, shots)
+    typer.echo(
+        f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
+        f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
+        f"threads: {rates.share:.0%} of the slower"
+    )
+    listing_s = listing_seconds(folder, listed)
+    typer.echo(f"listing a session of {listed} shots: {listing_s:.3f} s")
+    if out is not None:
+        metrics = {
+            "overhead": [one.as_dict() for one in measured],
+            "verification": rates.as_dict(),
+            "listing": {"shots": listed, "seconds": listing_s},
+            "command": command_line(),
+            "versions": versions(),
+        }
+        with result_folder(out) as results:
+            write_metrics(results, metrics)
+
+
 @contextmanager
 def _bar(name: str, total: int) -> Iterator[Callable[[], None]]:
     """Show a bar on a terminal; yields what advances it, from any thread."""
