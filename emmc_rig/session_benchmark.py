@@ -46,15 +46,17 @@ MOVE_S = 0.15
 
 @dataclass(frozen=True)
 class Overhead:
-    """Of a run whose devices take no time: milliseconds of the program for each shot.
+    """Milliseconds of the program for each shot, the time in the devices not counted.
 
-    on_the_way_ms: between two exposures, without waiting for the disk. hidden_share: of hashing
-    and writing, while the bench worked, here with moves of MOVE_S.
+    sequencing_ms: all but handing_over_ms, which includes waiting for a disk that is behind.
+    hidden_share: of hashing and writing, how much went on while the bench worked.
     """
 
     megapixels: float
     shots: int
-    on_the_way_ms: float
+    move_s: float
+    sequencing_ms: float
+    handing_over_ms: float
     hidden_share: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -128,11 +130,14 @@ def _overhead(
     steps = _Steps(device)
     Sequencer(session, plan, rig, steps).run()
     told = overlap(run_entries(session.journal.entries)[-1])
-    # While the disk has more than it can take, the program waits for it.
-    waited_s = steps.handing_over_s if told.writing_s > told.seconds / 2 else 0.0
-    on_the_way_s = steps.looped_s - steps.device_s - waited_s
+    program_s = steps.looped_s - steps.device_s - steps.handing_over_s
     return Overhead(
-        shape[0] * shape[1] / 1e6, shots, 1e3 * on_the_way_s / (shots - 1), told.hidden_share
+        shape[0] * shape[1] / 1e6,
+        shots,
+        move_s,
+        1e3 * program_s / (shots - 1),
+        1e3 * steps.handing_over_s / (shots - 1),
+        told.hidden_share,
     )
 
 

@@ -47,7 +47,7 @@ def test_the_fused_rate_is_unbiased_and_its_deviation_is_true(ramp):
     judged = fused.usable & (ramp < 3.0)
     assert judged[:, ramp[0] < 3.0].all()
     score = (fused.dn_per_s - true_rate(ramp)) / np.sqrt(fused.variance)
-    by_level = [part for part in np.array_split(score[:, ramp[0] < 3.0], 16, axis=1)]
+    by_level = np.array_split(score[:, ramp[0] < 3.0], 16, axis=1)
     for part in by_level:
         # Dark noise is shared by a pixel's exposures, not by pixels: the scores are independent.
         assert abs(part.mean()) < 5 / np.sqrt(part.size) + 0.02

@@ -157,9 +157,9 @@ def bench(
     for one in overheads(folder, 300):
         measured.append(one)
         typer.echo(
-            f"sequencing {one.shots} shots of {one.megapixels:.3g} MP: {one.on_the_way_ms:.2f} ms "
-            f"for each beside devices and disk; {one.hidden_share:.0%} of hashing and writing "
-            "hidden"
+            f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of {one.move_s:g} s: "
+            f"{one.sequencing_ms:.2f} ms each beside the devices, {one.handing_over_ms:.2f} ms "
+            f"handing over; {one.hidden_share:.0%} of hashing and writing behind the bench's work"
         )
     rates = verification(folder, shots)
     typer.echo(
