@@ -5,6 +5,7 @@ Every frame is made from its own name, so that two runs of one plan differ in no
 
 import hashlib
 from functools import cache
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,7 +21,7 @@ from simulators.still import StillStage
 SIZE = (24, 32)
 BLACK, WHITE = 100, 4000
 AXES = ("mask_x", "mask_y", "aperture_x", "aperture_y")
-ZERO_UM = dict.fromkeys(AXES, 20_000.0)
+ZERO_UM: dict[str, float] = dict.fromkeys(AXES, 20_000.0)
 PLAN_YAML = """
 camera: rgbw-bayer-3shots
 shots:
@@ -73,7 +74,7 @@ class QuietAttendant:
         return [told[1] for told in self.told if told[0] == "lamp"][-1]
 
 
-def still_rig(size=SIZE):
+def still_rig(size=SIZE) -> Any:
     """Return a rig on which nothing takes time."""
     wire = NamedFrames(size)
     clock = ManualClock()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -138,7 +139,7 @@ def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured,
     code, _, err = run("session", "export", "plan-session", "--out", "x.h5", "--compress")
     assert code == 0, err
     with h5py.File("x.h5") as file:
-        entry = file[file.attrs["default"]]
+        entry: Any = file[file.attrs["default"]]
         kinds = {}
         entry.visititems(lambda name, one: kinds.update({name: one.attrs.get("NX_class")}))
         assert entry.attrs["NX_class"] == "NXentry"

@@ -59,20 +59,21 @@ def whiteboards(session: Session) -> Whiteboards:
 
     Raises AppError where the plan has no whiteboards, no darks, or they were not all captured.
     """
-    groups: dict[object, list[PlannedFrame]] = defaultdict(list)
+    references: dict[tuple[int, str], list[PlannedFrame]] = defaultdict(list)
+    pinholes: dict[tuple[int, int, int, str], list[PlannedFrame]] = defaultdict(list)
     for frame in session.frames:
+        shot, lamp = frame.bench.shot, frame.bench.lamp
         if frame.kind == "reference":
-            groups["reference", frame.bench.shot, frame.bench.lamp].append(frame)
-        elif frame.kind == "whiteboard":
-            assert frame.view is not None
-            groups["whiteboard", frame.bench.shot, *frame.view, frame.bench.lamp].append(frame)
-    if not groups:
+            references[shot, lamp].append(frame)
+        elif frame.kind == "whiteboard" and frame.view is not None:
+            pinholes[shot, *frame.view, lamp].append(frame)
+    if not references:
         raise AppError(f"{session.folder}: its plan has no whiteboards")
-    references, pinholes = {}, {}
-    for (kind, *key), frames in groups.items():
-        target = references if kind == "reference" else pinholes
-        target[tuple(key)] = _mean(session, frames)
-    return Whiteboards(mean_dark(session), references, pinholes)
+    return Whiteboards(
+        mean_dark(session),
+        {key: _mean(session, frames) for key, frames in references.items()},
+        {key: _mean(session, frames) for key, frames in pinholes.items()},
+    )
 
 
 def mean_dark(session: Session) -> MeanFrame:
