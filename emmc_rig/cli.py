@@ -26,6 +26,7 @@ from emmc_rig import __version__
 from emmc_rig.capture.cli import CaptureStoppedError, capture
 from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
+from emmc_rig.live.cli import live
 from emmc_rig.model.errors import ModelError
 from emmc_rig.session.cli import app as session
 from reconstruction.errors import ReconstructionError
@@ -49,6 +50,7 @@ app = typer.Typer(
 app.add_typer(devices, name="devices")
 app.add_typer(session, name="session")
 app.command()(capture)
+app.command()(live)
 console = Console(stderr=True)
 
 SceneOption = Annotated[
