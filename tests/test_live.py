@@ -116,6 +116,18 @@ def test_a_zoomed_view_shows_its_part_pixel_by_pixel():
     assert encoded(shown)[:2] == b"\xff\xd8"
 
 
+def test_a_dark_view_is_brightened_until_its_brightest_part_is_white():
+    mosaic = np.full((64, 64), BLACK)
+    mosaic[:, 32:] = BLACK + 40
+    dark, bright = (
+        picture(frame_of(mosaic), View(kind="mosaic", longest_px=64, bright=chosen))
+        for chosen in (False, True)
+    )
+    assert dark[:, 40:].max() < 40
+    assert bright[:, 40:].min() > 250
+    assert bright[:, :24].max() == 0
+
+
 def test_views_stay_inside_the_frame_and_refuse_nonsense():
     assert window(View(x=1.0, y=0.0, part=0.25), (100, 200)) == (slice(0, 24), slice(150, 200))
     for wrong in (

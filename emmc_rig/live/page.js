@@ -3,7 +3,7 @@
 const $ = (id) => document.getElementById(id);
 const COLOURS = { red: "#ff6b6b", green: "#63c98c", blue: "#6d9bf2", grey: "#d0d4d9" };
 const PARTS = [1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64];
-const view = { kind: "colour", x: 0.5, y: 0.5, level: 0, marked: true };
+const view = { kind: "colour", x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
 let state = { version: 0 };
 let loading = false, wanted = false, best = 0, times = [];
 
@@ -54,7 +54,7 @@ async function show() {
   const scale = window.devicePixelRatio || 1;
   const px = Math.max(16, Math.min(1600, Math.round(Math.max(box.width, box.height) * scale)));
   const query = new URLSearchParams({
-    kind: view.kind, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, px,
+    kind: view.kind, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
   });
   try {
     const blob = await (await ask("picture.jpg?" + query)).blob();
@@ -90,7 +90,7 @@ function draw() {
   drawLevels(figures);
   best = Math.max(best, figures.focus);
   $("focus").textContent = figures.focus.toPrecision(3);
-  $("focus-best").textContent = `${Math.round(100 * figures.focus / best)} % of the best so far`;
+  $("focus-best").textContent = `${Math.round(100 * figures.focus / best)} % of the best`;
   const mask = figures.alignment;
   $("rotation").textContent = `${mask.rotation_deg.toFixed(3)}\u00b0`;
   $("straightness").textContent = `straight edges ${Math.round(100 * mask.straightness)} %`;
@@ -102,12 +102,15 @@ function draw() {
 
 function drawSetting(id, value, limits, unit) {
   const field = $(id);
-  if (document.activeElement !== field) field.value = Number(value.toPrecision(4));
+  // What somebody types stays until it is sent.
+  if (document.activeElement !== field && !field.dataset.typed) field.value = Number(value.toPrecision(4));
   const fixed = limits[0] === limits[1];
+  const shown = (limit) => unit === "ms" && limit >= 1000
+    ? `${Number((limit / 1000).toPrecision(3))} s` : `${Number(limit.toPrecision(3))} ${unit}`;
   field.disabled = fixed || state.read_only;
   field.form.querySelector("button").disabled = field.disabled;
   $(id + "-limits").textContent = fixed ? "fixed"
-    : `${Number(limits[0].toPrecision(3))} to ${Number(limits[1].toPrecision(3))} ${unit}`;
+    : `${shown(limits[0])} to ${shown(limits[1])}`;
 }
 
 function drawHistogram(counts) {
@@ -224,7 +227,8 @@ for (const one of document.querySelectorAll("[data-kind]")) {
     show();
   });
 }
-$("marked").addEventListener("change", () => { view.marked = $("marked").checked; show(); });
+for (const name of ["marked", "bright"])
+  $(name).addEventListener("change", () => { view[name] = $(name).checked; show(); });
 $("closer").addEventListener("click", () => zoom(1));
 $("farther").addEventListener("click", () => zoom(-1));
 $("whole").addEventListener("click", () => zoom(-PARTS.length));
@@ -251,17 +255,20 @@ $("stage").addEventListener("pointermove", (event) => {
 });
 for (const end of ["pointerup", "pointercancel"])
   $("stage").addEventListener(end, () => { held = null; $("stage").classList.remove("held"); });
-$("exposure-form").addEventListener("submit", (event) => {
-  event.preventDefault();
-  const ms = number($("exposure"));
-  act("exposure", { seconds: typeof ms === "number" ? ms / 1e3 : ms });
-  $("exposure").blur();
-});
-$("gain-form").addEventListener("submit", (event) => {
-  event.preventDefault();
-  act("gain", { factor: number($("gain")) });
-  $("gain").blur();
-});
+for (const [id, send] of [
+  ["exposure", (ms) => act("exposure", { seconds: typeof ms === "number" ? ms / 1e3 : ms })],
+  ["gain", (factor) => act("gain", { factor })],
+]) {
+  const field = $(id);
+  for (const change of ["input", "change"])
+    field.addEventListener(change, () => { field.dataset.typed = "yes"; });
+  field.form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    send(number(field));
+    delete field.dataset.typed;
+    field.blur();
+  });
+}
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
 $("home").addEventListener("click", () => act("home"));
 $("centre").addEventListener("click", () => act("centre"));

@@ -16,6 +16,7 @@ Kind = Literal["mosaic", "colour"]
 KINDS = get_args(Kind)
 LONGEST_PX = 1600
 SMALLEST_PART = 1 / 256
+BRIGHTEST = 0.999
 SATURATED_BGR = (60, 60, 255)
 CLIPPED_BGR = (255, 90, 60)
 FROM_BAYER = {
@@ -32,6 +33,7 @@ class View:
 
     x, y: the part's centre, and part: its width, as shares of the frame's. longest_px: of the
     picture made. marked: saturated pixels in red, those clipped at 0 in blue.
+    bright: the brightest thousandth of the part becomes white.
     """
 
     kind: Kind = "colour"
@@ -40,6 +42,7 @@ class View:
     part: float = 1.0
     longest_px: int = LONGEST_PX
     marked: bool = True
+    bright: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -74,6 +77,8 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     else:
         seen = np.repeat(mosaic[..., None], 3, axis=2)
     linear = np.clip((seen.astype(np.float32) - black) / span, 0, 1)
+    if view.bright:
+        linear = np.clip(linear / max(1 / span, float(np.quantile(linear, BRIGHTEST))), 0, 1)
     scale = view.longest_px / max(mosaic.shape)
     shrunk = _resized(linear, scale)
     coded = np.where(shrunk <= 0.0031308, 12.92 * shrunk, 1.055 * shrunk ** (1 / 2.4) - 0.055)

@@ -215,4 +215,5 @@ def _view(query: Mapping[str, str]) -> View:
         part=_number(query, "part", whole.part),
         longest_px=_number(query, "px", whole.longest_px, int),
         marked=query.get("marked", "1") != "0",
+        bright=query.get("bright", "0") != "0",
     )
