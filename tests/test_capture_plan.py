@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.capture.estimate import estimate, shown_bytes, shown_seconds
+from emmc_rig.capture.estimate import estimate
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
@@ -25,6 +25,7 @@ from emmc_rig.capture.plan import (
 )
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import shipped_cameras
+from emmc_rig.output import shown_bytes, shown_seconds
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 WINDOW_UM = 40_000.0

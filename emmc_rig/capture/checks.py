@@ -1,6 +1,6 @@
 """What a frame must pass before it counts, and where the bench stands after a resume.
 
-The checks look at a quarter of a million pixels, and so take about a millisecond.
+The checks look at some ten thousand pixels, and so take less than a millisecond.
 """
 
 from __future__ import annotations

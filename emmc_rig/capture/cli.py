@@ -84,8 +84,8 @@ def _run(
     from emmc_rig.capture.command import run_capture, wish_from_plan, wish_from_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
-    from emmc_rig.capture.estimate import Estimate, shown_bytes, shown_seconds
-    from emmc_rig.output import parse_size
+    from emmc_rig.capture.estimate import Estimate
+    from emmc_rig.output import parse_size, shown_bytes, shown_seconds
     from emmc_rig.rig_config import ImagedRig, rig_description
     from emmc_rig.session.contact_sheet import write_sheet
     from emmc_rig.session.session import REPORT, is_session

@@ -19,6 +19,7 @@ from drivers.errors import DriverError
 from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
+from emmc_rig.output import shown_bytes
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -104,7 +105,7 @@ def _cards(session: Session) -> Iterator[str]:
     )
     yield _card("", "Frames", f"{stored} of {planned}", _kinds(session))
     size = sum(entry["bytes"] for entry in session.stored.values())
-    yield _card("", "Size", f"{size / 1e6:.1f} MB", "the camera's own bytes")
+    yield _card("", "Size", shown_bytes(size), "the camera's own bytes")
     retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
     yield _card("watch" if retries else "", "Retries", str(retries), f"in {session.runs} run(s)")
     runs = run_entries(session.journal.entries)
