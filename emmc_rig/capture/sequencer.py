@@ -534,8 +534,13 @@ class Sequencer:
                 self._note_stop(error)
             raise
         finally:
-            with uninterrupted(), suppress(DriverError):
-                self._rig.attendant.set_lamp("off")
+            with uninterrupted():
+                if self._applied.lamp != "off":
+                    with suppress(DriverError, AppError):
+                        self._rig.attendant.set_lamp("off")
+                if self._camera is not self._rig.camera:
+                    with suppress(DriverError):
+                        self._camera.close()
 
     def _note_stop(self, error: BaseException) -> None:
         """Tell the journal why; where it cannot be written any more that is told already."""

@@ -37,6 +37,7 @@ from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES = 200
+QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
 HEADINGS = {
     "dark": "Darks",
@@ -54,6 +55,12 @@ def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> 
         write_whole(session.disk, path, page)
     except OSError as fault:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+
+
+def quick_pictures(session: Session) -> int:
+    """Return how many pictures can be made without reading more than QUICK_BYTES."""
+    largest = max((entry["bytes"] for entry in session.stored.values()), default=1)
+    return min(MOST_PICTURES, QUICK_BYTES // largest)
 
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
