@@ -79,15 +79,10 @@ def captured(tmp_path_factory):
 def capture(*arguments):
     """Capture without a terminal; returns standard output and standard error."""
     out, err = io.StringIO(), io.StringIO()
-    argv = ["emmc-rig", "capture", *map(str, arguments), *RIG]
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        redirect_stdout(out),
-        redirect_stderr(err),
-        pytest.raises(SystemExit) as stop,
-    ):
-        patch.setattr(sys, "argv", argv)
-        cli.main()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["emmc-rig", "capture", *map(str, arguments), *RIG])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
     assert not stop.value.code, err.getvalue()
     return out.getvalue(), err.getvalue()
 

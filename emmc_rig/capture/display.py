@@ -41,12 +41,12 @@ class CaptureDisplay:
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
         self._progress = Progress(
-            TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=False),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
             console=console,
         )
         self._task: TaskID | None = None
