@@ -81,6 +81,13 @@ def test_a_plan_may_take_the_camera_s_shots_in_any_order():
     assert camera.shots == (own.shots[2], own.shots[0])
 
 
+def test_more_shots_than_the_camera_has_are_placed_by_the_plan():
+    places = [{"mask_um": [24 * i, 0]} for i in range(5)]
+    plan = plan_of(camera="sensor-side-binary", shots=places)
+    offsets = [shot.offset_um for shot in planned_camera(plan).shots]
+    assert [next(iter(one.values()))[0] for one in offsets] == [0, 24, 48, 72, 96]
+
+
 def test_a_bracket_is_taken_from_the_shortest_exposure_on():
     plan = plan_of(shots=[{"exposure_s": [0.1, 0.01]}, {"exposure_s": 0.02}])
     assert exposures_s(plan, planned_camera(plan)) == [(0.01, 0.1), (0.02,)]

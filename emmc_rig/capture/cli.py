@@ -107,7 +107,7 @@ def _run(
                 f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
             )
         with display.aside():
-            typer.prompt(f"please {what}, then press Enter", default="", show_default=False)
+            input(f"please {what}, then press Enter ")
 
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
