@@ -16,7 +16,7 @@ STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
 BLOCKS = " ▁▂▃▄▅▆▇█"
 BINS = 64
 LONGEST_PREVIEW_PX = 1600
-SAMPLED_PIXELS = 1 << 18
+SAMPLED_PIXELS = 1 << 16
 
 Array = NDArray[np.floating]
 

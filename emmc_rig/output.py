@@ -120,6 +120,24 @@ def _library_versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in VERSIONED}
 
 
+def shown_seconds(seconds: float) -> str:
+    """Return a duration for people."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def shown_bytes(count: float) -> str:
+    """Return a size for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
 def command_line() -> str:
     """Return the command as it was typed."""
     return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

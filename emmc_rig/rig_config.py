@@ -27,13 +27,15 @@ class RealRig(Settings):
     stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
     far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
     the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
-    plate's open window. What no axis moves is asked for: lamp, board, masks.
+    plate's open window. by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
+    not, nothing of that changes, as in a recording that is replayed.
     """
 
     stage: str
     camera: str
     zero_um: dict[str, float] = Field(default_factory=dict)
     window_um: float = 0.0
+    by_hand: bool = True
 
 
 class ImagedRig(Settings):
@@ -67,6 +69,19 @@ class AskingAttendant:
             (f"put in the masks {names}" if names else "take all masks out")
             + ("" if chosen == "none" else f", and the {chosen} filter in")
         )
+
+
+class NoAttendant:
+    """An `Attendant` of a bench on which nothing ever changes."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Leave the lamp as it is."""
+
+    def place(self, target: str) -> None:
+        """Leave the board or scene where it is."""
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Leave the masks in or out."""
 
 
 def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
@@ -113,7 +128,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         yield Rig(
             stage,
             device,
-            AskingAttendant(camera, ask),
+            AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
             real.zero_um,
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),

@@ -265,7 +265,7 @@ def listing_seconds(folder: Path, shots: int) -> float:
             for frame in session.frames:
                 entry = {"kind": "frame", "id": frame.id, "file": f"{frame.id}.dng", **facts}
                 file.write(encode_line(entry))
-        return _timed(lambda: summary(Session(session.folder)))
+        return _timed(lambda: summary(session.folder))
 
 
 def _timed(work: Callable[[], object]) -> float:

@@ -1,6 +1,7 @@
 """The sequencer: what it takes, retries, refuses, and how it leaves the bench."""
 
 import os
+import signal
 import threading
 from dataclasses import replace
 from functools import cache
@@ -24,7 +25,7 @@ from emmc_rig.capture.command import (
     refuse_other_camera,
     refuse_small_disk,
 )
-from emmc_rig.capture.control import Control
+from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.plan import Checks, Retries
 from emmc_rig.capture.retries import GaveUpError, Mending, mending
 from emmc_rig.capture.sequencer import Sequencer, Unwatched
@@ -246,6 +247,16 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
     assert session.journal.entries[-1]["kind"] == "stopped"
     assert not verify(session).damaged
     assert 0 < len(session.stored) < len(session.frames)
+
+
+def test_ctrl_c_stops_after_the_frame_and_the_second_one_now():
+    control, told = Control(), []
+    with interruptible(control, told.append):
+        signal.raise_signal(signal.SIGINT)
+        assert control.stopping
+        assert "stopping after this frame" in told[0]
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 CAMERA_FAULTS = (

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.capture.estimate import estimate, shown_bytes, shown_seconds
+from emmc_rig.capture.estimate import estimate
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
@@ -25,6 +25,7 @@ from emmc_rig.capture.plan import (
 )
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import shipped_cameras
+from emmc_rig.output import shown_bytes, shown_seconds
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 WINDOW_UM = 40_000.0
@@ -78,6 +79,13 @@ def test_a_plan_may_take_the_camera_s_shots_in_any_order():
     camera = planned_camera(plan_of(shots=[{"camera_shot": 2}, {"camera_shot": 0}]))
     own = find_camera("rgbw-bayer-3shots")
     assert camera.shots == (own.shots[2], own.shots[0])
+
+
+def test_more_shots_than_the_camera_has_are_placed_by_the_plan():
+    places = [{"mask_um": [24 * i, 0]} for i in range(5)]
+    plan = plan_of(camera="sensor-side-binary", shots=places)
+    offsets = [shot.offset_um for shot in planned_camera(plan).shots]
+    assert [next(iter(one.values()))[0] for one in offsets] == [0, 24, 48, 72, 96]
 
 
 def test_a_bracket_is_taken_from_the_shortest_exposure_on():

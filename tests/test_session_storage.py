@@ -10,7 +10,7 @@ from capture_rigs import begun, frame_bytes, plan_and_camera, still_rig
 
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.errors import AppError
-from emmc_rig.session.journal import Journal, decode_line, encode_line
+from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.prune import prune
 from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Session, only_program
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
@@ -164,6 +164,23 @@ def test_a_line_with_any_flipped_bit_does_not_count():
             damaged = bytearray(line)
             damaged[place] ^= 1 << bit
             assert decode_line(bytes(damaged)) is None
+
+
+def test_the_heads_of_a_journal_agree_with_all_of_it():
+    """Lines with awkward names, torn and damaged ones among them."""
+    entries = [
+        {"kind": "created", "frames": 3},
+        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12, "figures": {"x": [1, 2.5]}},
+        {"kind": "frame", "id": 'b"\\', "file": "\u00e9.dng", "bytes": 0},
+        {"kind": "retry", "id": "a", "fault": "x"},
+    ]
+    data = b"".join(encode_line(entry) for entry in entries)
+    data += b"torn\n" + encode_line(entries[1]).replace(b"12", b"13") + encode_line(entries[3])
+    keys = ("kind", "id", "file", "bytes")
+    found = [decode_line(line) for line in data.split(b"\n")]
+    expected = [{k: e[k] for k in keys if k in e} for e in found if e]
+    assert [{k: e[k] for k in keys if k in e} for e in heads(data)] == expected
+    assert len(expected) == 5
 
 
 def test_a_line_after_a_torn_one_is_read(tmp_path):

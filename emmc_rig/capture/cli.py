@@ -84,10 +84,10 @@ def _run(
     from emmc_rig.capture.command import run_capture, wish_from_plan, wish_from_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
-    from emmc_rig.capture.estimate import Estimate, shown_bytes, shown_seconds
-    from emmc_rig.output import parse_size
+    from emmc_rig.capture.estimate import Estimate
+    from emmc_rig.output import parse_size, shown_bytes, shown_seconds
     from emmc_rig.rig_config import ImagedRig, rig_description
-    from emmc_rig.session.contact_sheet import write_sheet
+    from emmc_rig.session.contact_sheet import quick_pictures, write_sheet
     from emmc_rig.session.session import REPORT, is_session
 
     imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time)
@@ -107,7 +107,7 @@ def _run(
                 f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
             )
         with display.aside():
-            typer.prompt(f"please {what}, then press Enter", default="", show_default=False)
+            input(f"please {what}, then press Enter ")
 
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
@@ -119,15 +119,22 @@ def _run(
         return not dry_run
 
     go_on = f"go on with: emmc-rig capture {wish.out}"
+
     try:
         with display.shown():
             captured = run_capture(wish, display, ask, agreed, control)
     except KeyboardInterrupt as stop:
-        raise CaptureStoppedError(f"stopped at once; what was captured is kept, {go_on}") from stop
+        kept = f"what was captured is kept, {go_on}"
+        nothing = "nothing was begun"
+        told = kept if is_session(wish.out) else nothing
+        raise CaptureStoppedError(f"stopped at once; {told}") from stop
     if captured is None:
         return
     session, outcome = captured
-    write_sheet(session, session.folder / REPORT)
+    try:
+        write_sheet(session, session.folder / REPORT, quick_pictures(session))
+    except AppError as fault:
+        display.tell(f"no report: {fault}")
     if not outcome.complete:
         raise CaptureStoppedError(
             f"stopped: {outcome.missing} of {len(session.frames)} frames are still to be taken; "

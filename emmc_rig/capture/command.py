@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.estimate import Estimate, estimate, shown_bytes
+from emmc_rig.capture.estimate import Estimate, estimate
 from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
@@ -30,7 +30,7 @@ from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
-from emmc_rig.output import command_line, versions
+from emmc_rig.output import command_line, shown_bytes, versions
 from emmc_rig.rig_config import Ask, opened_rig
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Frozen, Session, is_session, only_program, wall_time

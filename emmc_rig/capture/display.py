@@ -32,7 +32,6 @@ from emmc_rig.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
 
 KEY_POLL_S = 0.1
-SHOWN_PIXELS = 1 << 16
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
@@ -42,12 +41,12 @@ class CaptureDisplay:
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
         self._progress = Progress(
-            TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=False),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
             console=console,
         )
         self._task: TaskID | None = None
@@ -110,7 +109,7 @@ class CaptureDisplay:
             f"white, saturated {found.saturated:.2%}"
         )
         if self._live is not None:
-            few = replace(frame, mosaic=thinned(frame.mosaic, SHOWN_PIXELS))
+            few = replace(frame, mosaic=thinned(frame.mosaic))
             self._histogram = histogram_text(histogram(few))
             self._line = Text(line)
         elif not self._console.is_terminal:

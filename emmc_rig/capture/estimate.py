@@ -79,21 +79,3 @@ def estimate(
 def _move_s(step_um: float, speed_um_s: float) -> float:
     back_um = 2 * APPROACH_UM if needs_approach(0.0, step_um, APPROACH_UM) else 0.0
     return (abs(step_um) + back_um) / speed_um_s
-
-
-def shown_seconds(seconds: float) -> str:
-    """Return a duration for people."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
-
-
-def shown_bytes(count: float) -> str:
-    """Return a size for people."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} TB"

@@ -18,6 +18,8 @@ from emmc_rig.session.planned import PlannedFrame
 
 APPROACH_UM = 10.0
 ROUNDS = 30
+MOST_SHORTENED = 1000
+"""More places than these, rarely distinct, are left to the nearest neighbour alone."""
 Array = NDArray[np.float64]
 
 
@@ -63,9 +65,11 @@ def _tour(
         [[dict(place).get(axis, start_um.get(axis, 0.0)) for axis in axes] for place in places]
     )
     start = np.array([start_um.get(axis, np.nan) for axis in axes])
-    ways = _ways_um(points[:, None], points[None])
-    from_start = np.nan_to_num(_ways_um(start[None], points), nan=0.0)
-    return [places[i] for i in _shortened(_nearest_first(ways, from_start), ways, from_start)]
+    tour = _nearest_first(points, start)
+    if len(places) <= MOST_SHORTENED:
+        ways = _ways_um(points[:, None], points[None])
+        tour = _shortened(tour, ways, _ways_um(start[None], points))
+    return [places[i] for i in tour]
 
 
 def _ways_um(here: Array, there: Array) -> Array:
@@ -74,13 +78,15 @@ def _ways_um(here: Array, there: Array) -> Array:
     return np.max(np.abs(step) + np.where(step < 0, 2 * APPROACH_UM, 0.0), axis=-1)
 
 
-def _nearest_first(ways: Array, from_start: Array) -> list[int]:
-    left = np.ones(len(ways), dtype=bool)
-    tour = [int(np.argmin(from_start))]
-    left[tour[0]] = False
+def _nearest_first(points: Array, start: Array) -> list[int]:
+    tour: list[int] = []
+    left = np.ones(len(points), dtype=bool)
+    here = start
     while left.any():
-        tour.append(int(np.argmin(np.where(left, ways[tour[-1]], np.inf))))
+        ways = np.where(left, _ways_um(here[None], points), np.inf)
+        tour.append(int(np.argmin(ways)))
         left[tour[-1]] = False
+        here = points[tour[-1]]
     return tour
 
 

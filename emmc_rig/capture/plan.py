@@ -150,10 +150,7 @@ def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
     if beside is not None and (beside / spec).is_file():
         spec = str(beside / spec)
     camera = find_camera(spec)
-    wanted = max(
-        (shot.camera_shot if shot.camera_shot is not None else place)
-        for place, shot in enumerate(plan.shots)
-    )
+    wanted = max(_own_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
     if wanted >= len(camera.shots):
         camera = camera.with_shots(wanted + 1)
     changing = [
@@ -171,8 +168,16 @@ def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
     return camera.model_copy(update={"shots": shots})
 
 
+def _own_shot(camera: Camera, place: int, shot: PlannedShot) -> int:
+    """Return which of the camera's shots a planned one is; one of a place of its own goes round."""
+    if shot.camera_shot is not None:
+        return shot.camera_shot
+    placed = shot.mask_um is not None or shot.mask_cells is not None
+    return place % len(camera.shots) if placed else place
+
+
 def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
-    own = camera.shots[place if shot.camera_shot is None else shot.camera_shot]
+    own = camera.shots[_own_shot(camera, place, shot)]
     if shot.mask_um is None and shot.mask_cells is None:
         return own
     moving = camera.moving_masks or tuple(camera.masks)

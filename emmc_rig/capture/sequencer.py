@@ -143,6 +143,8 @@ class Sequencer:
         self._metered: dict[str, Entry] = {}
         self._began_s = 0.0
         self._taken = self._run = 0
+        # How long the frame before took to hand over: its own line is written by then.
+        self._handed: dict[str, list[float]] = {}
         brackets = _brackets(session.frames)
         self._may_saturate = {name for ids in brackets for name in ids[1:]}
 
@@ -257,7 +259,9 @@ class Sequencer:
             spans.clear()
             frame, found, read_um = self._attempt(planned, spans)
             self._watcher.taken(planned, frame, found)
-            with self._span("hand over", planned, spans):
+            spans.update(self._handed)
+            self._handed = {}
+            with self._span("hand over", planned, self._handed):
                 self._hand_over(planned, frame, found, read_um, spans, attempts)
             self._before = frame.mosaic
 
@@ -530,8 +534,13 @@ class Sequencer:
                 self._note_stop(error)
             raise
         finally:
-            with uninterrupted(), suppress(DriverError):
-                self._rig.attendant.set_lamp("off")
+            with uninterrupted():
+                if self._applied.lamp != "off":
+                    with suppress(DriverError, AppError):
+                        self._rig.attendant.set_lamp("off")
+                if self._camera is not self._rig.camera:
+                    with suppress(DriverError):
+                        self._camera.close()
 
     def _note_stop(self, error: BaseException) -> None:
         """Tell the journal why; where it cannot be written any more that is told already."""

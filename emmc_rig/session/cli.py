@@ -24,13 +24,14 @@ def list_sessions(
     from rich.table import Table
 
     from emmc_rig.errors import AppError
+    from emmc_rig.output import shown_bytes
     from emmc_rig.session.listing import sessions_in
 
     table = Table("session", "state", "frames", "size", "begun", "title", box=SIMPLE)
     count = 0
     for one in sessions_in(folder):
         count += 1
-        size = f"{one.bytes / 1e6:.1f} MB"
+        size = shown_bytes(one.bytes)
         table.add_row(
             one.name, one.state, f"{one.stored}/{one.planned}", size, one.created, one.title
         )
@@ -42,19 +43,18 @@ def list_sessions(
 @app.command()
 def show(session: Folder) -> None:
     """Show what a session holds, without reading its frames."""
+    from emmc_rig.output import shown_bytes
     from emmc_rig.session.contact_sheet import events
     from emmc_rig.session.listing import summary
     from emmc_rig.session.session import Session
     from emmc_rig.session.verify import counts
 
-    opened = Session(session)
-    told = summary(opened)
+    told, opened = summary(session), Session(session)
     typer.echo(f"{told.name}: {told.title}")
-    typer.echo(
-        f"  state    {told.state}, {told.stored} of {told.planned} frames, {opened.runs} run(s)"
-    )
-    typer.echo(f"  begun    {told.created}")
-    typer.echo(f"  size     {told.bytes / 1e6:.1f} MB")
+    typer.echo(f"  {'state':<12} {told.state} after {opened.runs} run(s)")
+    typer.echo(f"  {'begun':<12} {told.created}")
+    typer.echo(f"  {'size':<12} {shown_bytes(told.bytes)}")
+    typer.echo(f"  {'frames':<12} {told.stored} of {told.planned}")
     for kind, (done, planned) in counts(opened).items():
         typer.echo(f"  {kind:<12} {done} of {planned}")
     leftovers, foreign = opened.strangers()
@@ -95,13 +95,14 @@ def export(
     ] = False,
 ) -> None:
     """Write a complete session as one HDF5 file with NeXus names; brackets are fused too."""
+    from emmc_rig.output import shown_bytes
     from emmc_rig.session.export import export_hdf5
     from emmc_rig.session.session import Session
 
     opened = Session(session)
     with _bar("export", len(opened.frames)) as step:
         export_hdf5(opened, out, compress, lambda frame_id: step())
-    typer.echo(f"wrote {out}, {out.stat().st_size / 1e6:.1f} MB")
+    typer.echo(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
 
 
 @app.command()
@@ -110,6 +111,7 @@ def prune(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would go")] = False,
 ) -> None:
     """Remove what a crash left in a session; frames that count and other files stay."""
+    from emmc_rig.output import shown_bytes
     from emmc_rig.session.prune import prune as pruned
     from emmc_rig.session.session import Session, only_program
 
@@ -119,7 +121,7 @@ def prune(
     verb = "would remove" if dry_run else "removed"
     for name in removed:
         typer.echo(f"{verb} {name}")
-    typer.echo(f"{verb} {len(removed)} leftover(s), {size / 1e6:.1f} MB")
+    typer.echo(f"{verb} {len(removed)} leftover(s), {shown_bytes(size)}")
 
 
 @app.command()

@@ -19,6 +19,7 @@ from drivers.errors import DriverError
 from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
+from emmc_rig.output import shown_bytes
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -36,6 +37,7 @@ from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES = 200
+QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
 HEADINGS = {
     "dark": "Darks",
@@ -53,6 +55,12 @@ def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> 
         write_whole(session.disk, path, page)
     except OSError as fault:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+
+
+def quick_pictures(session: Session) -> int:
+    """Return how many pictures can be made without reading more than QUICK_BYTES."""
+    largest = max((entry["bytes"] for entry in session.stored.values()), default=1)
+    return min(MOST_PICTURES, QUICK_BYTES // largest)
 
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
@@ -104,7 +112,7 @@ def _cards(session: Session) -> Iterator[str]:
     )
     yield _card("", "Frames", f"{stored} of {planned}", _kinds(session))
     size = sum(entry["bytes"] for entry in session.stored.values())
-    yield _card("", "Size", f"{size / 1e6:.1f} MB", "the camera's own bytes")
+    yield _card("", "Size", shown_bytes(size), "the camera's own bytes")
     retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
     yield _card("watch" if retries else "", "Retries", str(retries), f"in {session.runs} run(s)")
     runs = run_entries(session.journal.entries)

@@ -1,13 +1,15 @@
-"""Sessions at a glance, from their journals alone: no frame is read."""
+"""Sessions at a glance, from the heads of their journal lines: no frame is read."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.session.session import Session, is_session
+from emmc_rig.session.journal import heads
+from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete, is_session
 
 
 @dataclass(frozen=True)
@@ -23,24 +25,26 @@ class Summary:
     bytes: int
 
 
-def summary(session: Session) -> Summary:
-    """Return a session's summary; raises AppError when it is damaged."""
-    stored = session.stored
-    if session.is_complete:
+def summary(folder: Path) -> Summary:
+    """Return a session's summary; raises AppError when it cannot be read."""
+    try:
+        entries = heads((folder / JOURNAL).read_bytes())
+        header = json.loads((folder / HEADER).read_bytes())
+        title, created = str(header["title"]), str(header["created"])
+    except OSError as fault:
+        raise AppError(f"{folder}: no session, or not readable ({fault.strerror})") from fault
+    except (ValueError, KeyError, TypeError) as fault:
+        raise AppError(f"{folder / HEADER}: is damaged; restore it from a copy") from fault
+    if not entries or entries[0]["kind"] != "created":
+        raise AppError(f"{folder / JOURNAL}: its first line is damaged; restore it from a copy")
+    if found_complete(entries):
         state = "complete"
-    elif session.journal.entries[-1]["kind"] == "stopped":
-        state = "stopped"
     else:
-        state = "unfinished"
-    return Summary(
-        session.folder.name,
-        session.header["title"],
-        session.header["created"],
-        state,
-        len(stored),
-        session.created["frames"],
-        sum(entry["bytes"] for entry in stored.values()),
-    )
+        state = "stopped" if entries[-1]["kind"] == "stopped" else "unfinished"
+    stored = count_stored(entries)
+    size = sum(entry["bytes"] for entry in stored.values())
+    name = folder.resolve().name
+    return Summary(name, title, created, state, len(stored), entries[0]["frames"], size)
 
 
 def sessions_in(folder: Path) -> Iterator[Summary]:
@@ -52,6 +56,6 @@ def sessions_in(folder: Path) -> Iterator[Summary]:
     for one in candidates:
         if is_session(one):
             try:
-                yield summary(Session(one))
+                yield summary(one)
             except AppError as fault:
                 yield Summary(one.resolve().name, str(fault), "", "damaged", 0, 0, 0)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -170,10 +170,7 @@ class Session:
     @cached_property
     def stored(self) -> dict[str, Entry]:
         """The journal line of every frame that counts, by its id, kept up to date."""
-        found: dict[str, Entry] = {}
-        for entry in self.journal.entries:
-            self._count(found, entry)
-        return found
+        return count_stored(self.journal.entries)
 
     @property
     def runs(self) -> int:
@@ -187,11 +184,7 @@ class Session:
     @property
     def is_complete(self) -> bool:
         """Whether every frame was found good after the last one was stored; see `verify`."""
-        last = max(
-            (i for i, e in enumerate(self.journal.entries) if e["kind"] in ("frame", "discarded")),
-            default=-1,
-        )
-        return any(e["kind"] == "complete" for e in self.journal.entries[last + 1 :])
+        return found_complete(self.journal.entries)
 
     def path_of(self, entry: Entry) -> Path:
         """Return where the file of a frame's journal line lies."""
@@ -241,7 +234,7 @@ class Session:
         """Add a line to the journal; raises `OSError`."""
         entry = {"kind": kind, **facts}
         self.journal.append(entry)
-        self._count(self.stored, entry)
+        _count(self.stored, entry)
 
     def discard(self, frame_id: str, reason: str) -> None:
         """Count a frame as not taken; its file stays until it is taken again."""
@@ -268,12 +261,28 @@ class Session:
     def _places(self) -> dict[str, int]:
         return {frame.id: place for place, frame in enumerate(self.frames)}
 
-    @staticmethod
-    def _count(found: dict[str, Entry], entry: Entry) -> None:
-        if entry["kind"] == "frame":
-            found[entry["id"]] = entry
-        elif entry["kind"] == "discarded":
-            found.pop(entry["id"], None)
+
+def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
+    """Return the journal line of every frame that counts, by its id, oldest first."""
+    found: dict[str, Entry] = {}
+    for entry in entries:
+        _count(found, entry)
+    return found
+
+
+def _count(found: dict[str, Entry], entry: Entry) -> None:
+    if entry["kind"] == "frame":
+        found[entry["id"]] = entry
+    elif entry["kind"] == "discarded":
+        found.pop(entry["id"], None)
+
+
+def found_complete(entries: Sequence[Entry]) -> bool:
+    """Return whether every frame was found good after the last one was stored."""
+    for entry in reversed(entries):
+        if entry["kind"] in ("complete", "frame", "discarded"):
+            return entry["kind"] == "complete"
+    return False
 
 
 @contextmanager
