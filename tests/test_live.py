@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from typing import Any
 
 import cv2
 import numpy as np
@@ -79,6 +80,7 @@ def test_the_shift_since_the_reference_is_measured_in_sensor_pixels():
 
     found = measure(bayer((6.0, -3.0)), bayer((0.0, 0.0)))
     assert found.shift_px == pytest.approx((6.0, -3.0), abs=0.1)
+    assert found.match
     assert found.match > 0.5
     assert measure(bayer((0, 0))).shift_px is None
     other = frame_of(np.zeros((8, 8)))
@@ -130,14 +132,15 @@ def test_a_dark_view_is_brightened_until_its_brightest_part_is_white():
 
 def test_views_stay_inside_the_frame_and_refuse_nonsense():
     assert window(View(x=1.0, y=0.0, part=0.25), (100, 200)) == (slice(0, 24), slice(150, 200))
-    for wrong in (
+    wrongs: tuple[dict[str, Any], ...] = (
         {"kind": "xray"},
         {"x": 2.0},
         {"x": float("nan")},
         {"part": 0.0},
         {"part": 3.0},
         {"longest_px": 10**6},
-    ):
+    )
+    for wrong in wrongs:
         with pytest.raises(AppError):
             View(**wrong)
 
@@ -150,7 +153,8 @@ class FakeCamera:
     exposure_limits_s, gain_limits = (0.001, 1.0), (1.0, 1.0)
 
     def __init__(self):
-        self.exposure_s, self.gain, self.taken, self.fault = 0.01, 1.0, 0, None
+        self.exposure_s, self.gain, self.taken = 0.01, 1.0, 0
+        self.fault: RawFrameError | None = None
 
     def set_exposure_s(self, exposure_s):
         if not 0.001 <= exposure_s <= 1:
@@ -251,7 +255,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         place_um = lit["axes"]["mask_x"]["position_um"]
         assert place_um == pytest.approx(rig.zero_um["mask_x"], abs=0.5)
         until(watch, lambda state: state["frame"] > lit["frame"] + 1)
-        before = watch.frame().mosaic
+        before = mosaic_of(watch)
         watch.jog("mask_x", 200.0)
         moved = until(
             watch,
@@ -261,7 +265,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         )
         assert moved["axes"]["mask_x"]["position_um"] == pytest.approx(place_um + 200, abs=0.5)
         until(watch, lambda state: state["frame"] > moved["frame"] + 1)
-        after = watch.frame().mosaic
+        after = mosaic_of(watch)
         assert before.mean() > 2 * rig.camera.snap().black_level_dn.mean()
         assert np.abs(after.astype(float) - before).mean() > 30
         watch.look_at("scene")
@@ -269,6 +273,12 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
             watch.look_at("moon")
         with pytest.raises(AppError, match="no axis 'x'"):
             watch.jog("x", 1.0)
+
+
+def mosaic_of(watch):
+    frame = watch.frame()
+    assert frame is not None
+    return frame.mosaic
 
 
 class SlowStage:
@@ -353,7 +363,7 @@ def test_the_page_its_state_and_its_pictures_are_served():
             assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
         status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
-        assert cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape == (64, 64, 3)
+        assert np.shape(cv2.imdecode(np.frombuffer(data, np.uint8), 1)) == (64, 64, 3)
         state = json.loads(ask("GET", f"/{TOKEN}/state")[2])
         assert state["settings"]["camera"] == "fake"
 
@@ -427,6 +437,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
     ) as running:
+        assert running.stdout is not None
         address = running.stdout.readline().strip()
         assert address.startswith("http://127.0.0.1:")
         host, _, path = address.removeprefix("http://").partition("/")
