@@ -222,11 +222,11 @@ def test_a_camera_in_trouble_is_told_and_asked_again(monkeypatch):
 
 
 def test_no_frame_is_taken_when_nobody_looks(monkeypatch):
-    monkeypatch.setattr(watch_module, "IDLE_S", 0.1)
+    monkeypatch.setattr(watch_module, "IDLE_S", 0.4)
     camera = FakeCamera()
     with watching(camera) as watch:
         until(watch, lambda state: state["frame"])
-        time.sleep(0.5)
+        time.sleep(1.0)
         before = camera.taken
         time.sleep(0.5)
         assert camera.taken == before
