@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.camera import Camera
-from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame
+from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import (
     FrameFigures,
@@ -31,6 +31,8 @@ from emmc_rig.frame_view import (
     histogram_text,
     preview,
 )
+from emmc_rig.session.frame_file import frame_facts, suffix_of
+from emmc_rig.session.storage import SYSTEM_DISK, write_whole
 
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
@@ -109,7 +111,7 @@ def live(
     folder = frames_folder(out) if save_every else None
     console = Console()
     device = open_camera(_chosen(camera, rig))
-    with closing(device), _keys() as pressed, suppress(KeyboardInterrupt):
+    with closing(device), pressed_keys() as pressed, suppress(KeyboardInterrupt):
         choose(device, exposure, gain)
         showing = Live(console=console, auto_refresh=False) if console.is_terminal else None
         with showing or nullcontext(), closing(_frames(device)) as stream:
@@ -198,51 +200,23 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     """
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
-    original = stem.with_suffix(_suffix(frame))
+    original = stem.with_suffix(suffix_of(frame))
     ok, png = cv2.imencode(".png", preview(frame))
     if not ok:
         raise AppError(f"{stem}: its preview cannot be made")
     facts = {
         "camera_bytes": original.name,
         "sha256": frame.sha256,
-        "shape": list(frame.mosaic.shape),
-        "cfa": frame.cfa,
-        "black_level_dn": frame.black_level_dn.tolist(),
-        "white_level_dn": frame.white_level_dn,
-        "exposure_s": frame.exposure_s,
-        "gain": frame.gain,
-        "camera_time_s": frame.camera_time_s,
-        "host_time_s": frame.host_time_s,
-        "metadata": dict(frame.metadata),
+        **frame_facts(frame),
     }
     try:
-        _write_whole(stem.with_suffix(".png"), png.tobytes())
-        _write_whole(stem.with_suffix(".json"), (json.dumps(facts, indent=2) + "\n").encode())
-        _write_whole(original, frame.original)
+        told = (json.dumps(facts, indent=2) + "\n").encode()
+        write_whole(SYSTEM_DISK, stem.with_suffix(".png"), png.tobytes())
+        write_whole(SYSTEM_DISK, stem.with_suffix(".json"), told)
+        write_whole(SYSTEM_DISK, original, frame.original)
     except OSError as fault:
         raise AppError(f"{original}: cannot be written ({fault.strerror})") from fault
     return original
-
-
-def _suffix(frame: RawFrame) -> str:
-    """Return the kind of file that the camera's bytes are."""
-    told = Path(frame.metadata.get("name", "")).suffix.lower()
-    if told in RAW_SUFFIXES:
-        return told
-    return ".dng" if frame.original[:4] in TIFF_MAGICS else ".bin"
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write a file beside its place and rename it there when it is safe on the disk."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(partial, "xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _frames(device: Camera) -> Generator[RawFrame, None, None]:
@@ -273,7 +247,7 @@ def _progress(device: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _keys() -> Iterator[Callable[[], str]]:
+def pressed_keys() -> Iterator[Callable[[], str]]:
     """Yield a function that returns the key just pressed, "" for none, or where none can be."""
     before = _terminal_settings()
     if before is None:

@@ -27,6 +27,7 @@ from emmc_rig.model.camera import (
     draw_plates,
     load_camera,
     sensor_response,
+    shipped_camera_files,
     shipped_cameras,
 )
 from emmc_rig.model.errors import CameraError
@@ -87,9 +88,9 @@ def find_camera(spec: str) -> Camera:
     path = Path(spec)
     if path.suffix.lower() in (".yaml", ".yml") or os.sep in spec:
         return load_camera(path)
-    shipped = shipped_cameras()
+    shipped = shipped_camera_files()
     if spec in shipped:
-        return shipped[spec]
+        return load_camera(shipped[spec])
     nearest = difflib.get_close_matches(spec.lower(), shipped, n=1, cutoff=0)[0]
     raise CameraError(
         f"no camera is called '{spec}': did you mean '{nearest}'? `emmc-rig cameras` lists them; "

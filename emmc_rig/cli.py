@@ -23,9 +23,12 @@ from rich.table import Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
+from emmc_rig.capture.cli import CaptureStoppedError, capture
 from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
+from emmc_rig.live.cli import live
 from emmc_rig.model.errors import ModelError
+from emmc_rig.session.cli import app as session
 from reconstruction.errors import ReconstructionError
 
 if TYPE_CHECKING:
@@ -45,6 +48,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(devices, name="devices")
+app.add_typer(session, name="session")
+app.command()(capture)
+app.command()(live)
 console = Console(stderr=True)
 
 SceneOption = Annotated[
@@ -124,12 +130,9 @@ def _shown(value: object) -> str:
 def _size(
     text: str | None, option: str = "--size", example: str = "192x256"
 ) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    rows, cross, columns = text.lower().partition("x")
-    if not (cross and rows.isdigit() and columns.isdigit()):
-        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
-    return int(rows), int(columns)
+    from emmc_rig.output import parse_size
+
+    return parse_size(text, option, example)
 
 
 def _camera(spec: str, shots: int | None) -> Camera:
@@ -276,7 +279,8 @@ def simulate(
 @app.command()
 def reconstruct(
     frames: Annotated[
-        Path | None, typer.Argument(help="a folder that `demo` or `simulate` wrote")
+        Path | None,
+        typer.Argument(help="a session of `capture`, or a folder that `demo` or `simulate` wrote"),
     ] = None,
     method: MethodOption = "tv",
     list_methods: Annotated[
@@ -575,6 +579,8 @@ def main() -> None:
         sys.exit(code)
     except KeyboardInterrupt:
         _fail("stopped by Ctrl-C; nothing was written", INTERRUPTED)
+    except CaptureStoppedError as stop:
+        _fail(str(stop), INTERRUPTED)
     except ERRORS as fault:
         _fail(str(fault), 1)
     except MemoryError:

@@ -19,7 +19,7 @@ from calibration.whiteboard import (
     lamps_needed,
     measure_psi,
 )
-from emmc_rig.capture import capture_shots, capture_whiteboards, whiteboard_exposures
+from emmc_rig.capture.direct import capture_shots, capture_whiteboards, whiteboard_exposures
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import (

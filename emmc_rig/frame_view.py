@@ -16,6 +16,7 @@ STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
 BLOCKS = " ▁▂▃▄▅▆▇█"
 BINS = 64
 LONGEST_PREVIEW_PX = 1600
+SAMPLED_PIXELS = 1 << 16
 
 Array = NDArray[np.floating]
 
@@ -109,3 +110,13 @@ def preview(frame: RawFrame) -> NDArray[np.uint8]:
         linear = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.round(255 * coded).astype(np.uint8)
+
+
+def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:
+    """Return about so many pixels of a mosaic: whole 2x2 tiles, evenly spread."""
+    step = max(1, int(np.sqrt(mosaic.size / pixels)))
+    if step == 1:
+        return mosaic
+    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
+    tiles = mosaic[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)[::step, :, ::step]
+    return tiles.reshape(2 * tiles.shape[0], 2 * tiles.shape[2])

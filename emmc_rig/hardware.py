@@ -7,10 +7,11 @@ aperture open.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -84,12 +85,18 @@ class Attendant(Protocol):
         ...
 
 
+def _unheard(name: str) -> None:
+    """Take no notice: real noise needs no name."""
+
+
 @dataclass(frozen=True)
 class Rig:
     """The devices of one bench.
 
     zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
+    clock: the devices' own. reopen_camera: opens the camera again after it went away.
+    about_to_expose: told the name of each frame before its exposure.
     """
 
     stage: Stage
@@ -97,6 +104,17 @@ class Rig:
     attendant: Attendant
     zero_um: Mapping[str, float]
     window_um: float
+    clock: Clock = SYSTEM_CLOCK
+    reopen_camera: Callable[[], CameraDevice] | None = None
+    about_to_expose: Callable[[str], None] = _unheard
+
+
+@dataclass(frozen=True)
+class SimulatedRig(Rig):
+    """A rig, and the firmware behind its devices, whose faults can be armed."""
+
+    chain: ZaberChain = field(kw_only=True)
+    still: PtpCameraSimulator = field(kw_only=True)
 
 
 class SimulatedAttendant:
@@ -120,13 +138,19 @@ class SimulatedAttendant:
 
 
 def simulated_rig(
-    camera: Camera, fine_scene: NDArray[np.float32], size: tuple[int, int], seed: int
-) -> tuple[Rig, Bench]:
+    camera: Camera,
+    fine_scene: NDArray[np.float32],
+    size: tuple[int, int],
+    seed: int,
+    clock: Clock | None = None,
+) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
-    fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field.
+    fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
+    real one lets moves and exposures take their time; by default they take none. A frame that is
+    announced by its name has its own noise, whatever was exposed before it.
     """
-    clock = ManualClock()
+    clock = clock or ManualClock()
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
     travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um}
     chain = ZaberChain(
@@ -158,15 +182,33 @@ def simulated_rig(
         bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
     )
     k = camera.sensor.binning
-    still = _ptp_camera(
+    function = PtpUsbFunction(simulator)
+    bus = SimulatedUsb(clock, function)
+
+    def opened() -> CameraDevice:
+        """Open the camera; one whose cable is out is plugged in first."""
+        if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
+            bus.plug(function)
+        # The card lies in this computer's memory, hence from_card.
+        return _ptp_camera(clock, bus, shape=(size[0] // k, size[1] // k), cfa=cfa, from_card=True)
+
+    def announced(name: str) -> None:
+        digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
+        bench.reseed(np.random.default_rng(int.from_bytes(digest)))
+
+    rig = SimulatedRig(
+        stage,
+        opened(),
+        SimulatedAttendant(bench),
+        zero_um,
+        window_um,
         clock,
-        SimulatedUsb(clock, PtpUsbFunction(simulator)),
-        shape=(size[0] // k, size[1] // k),
-        cfa=cfa,
-        # The card lies in this computer's memory.
-        from_card=True,
+        opened,
+        announced,
+        chain=chain,
+        still=simulator,
     )
-    return Rig(stage, still, SimulatedAttendant(bench), zero_um, window_um), bench
+    return rig, bench
 
 
 def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStage:

@@ -10,6 +10,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -67,6 +68,18 @@ def _take_place(partial: Path, out: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def parse_size(
+    text: str | None, option: str = "--size", example: str = "192x256"
+) -> tuple[int, int] | None:
+    """Return rows and columns from ROWSxCOLUMNS; raises AppError."""
+    if text is None:
+        return None
+    rows, cross, columns = text.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
+    return int(rows), int(columns)
+
+
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
     """Write metrics.json; values that are not finite become null, as JSON has none."""
     text = json.dumps(_finite(metrics), indent=2, allow_nan=False)
@@ -99,10 +112,30 @@ def save_frames(
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
-    found = {"emmc-rig": __version__, "python": platform.python_version()}
-    for name in VERSIONED:
-        found[name] = metadata.version(name)
-    return found
+    return {"emmc-rig": __version__, "python": platform.python_version(), **_library_versions()}
+
+
+@cache
+def _library_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in VERSIONED}
+
+
+def shown_seconds(seconds: float) -> str:
+    """Return a duration for people."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def shown_bytes(count: float) -> str:
+    """Return a size for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
 
 
 def command_line() -> str:

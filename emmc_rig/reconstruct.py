@@ -1,7 +1,8 @@
 """Reconstruct a folder of frames by any method: frames.h5 and psi.h5 -> light_field.h5, pictures.
 
 The folder is what `demo` and `simulate` write: readings, their standard deviation, and which
-pixels are usable, with the imaging matrix beside them.
+pixels are usable, with the imaging matrix beside them. Or it is a session of `emmc-rig capture`:
+then the imaging matrix is measured from its whiteboards, and brackets are fused.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import read_yaml, validated
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.scene import open_scene
+from emmc_rig.session.readings import session_readings
+from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
 from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress
@@ -50,8 +53,8 @@ def read_capture(folder: Path) -> Capture:
     path = folder / FRAMES
     if not path.is_file():
         raise AppError(
-            f"{folder}: holds no {FRAMES}; name a folder that `emmc-rig demo` or "
-            "`emmc-rig simulate` wrote"
+            f"{folder}: holds no {FRAMES}; name a folder that `emmc-rig demo`, `simulate` or "
+            "`capture` wrote"
         )
     try:
         with h5py.File(path, "r") as file:
@@ -64,6 +67,30 @@ def read_capture(folder: Path) -> Capture:
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")
+    return _captured(readings, deviation, usable)
+
+
+def read_session(folder: Path, psi_out: Path) -> Capture:
+    """Read the shots of a session, and write the imaging matrix that they were normalised by.
+
+    Raises AppError or CalibrationError, each one line.
+    """
+    taken = session_readings(Session(folder))
+    taken.psi.save(psi_out)
+    return _captured(taken.readings, np.sqrt(taken.variance), taken.usable)
+
+
+def _read(folder: Path, out: Path, psi_path: Path | None) -> tuple[Capture, Path]:
+    """Return what was captured, and where its imaging matrix is."""
+    if is_session(folder):
+        capture = read_session(folder, out / PSI)
+        return capture, psi_path or out / PSI
+    return read_capture(folder), psi_path or folder / PSI
+
+
+def _captured(
+    readings: NDArray[np.float32], deviation: NDArray[np.floating], usable: NDArray[np.bool_]
+) -> Capture:
     judged = deviation[usable]
     sigma = float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
     return Capture(readings, sigma, usable)
@@ -105,8 +132,8 @@ def run_reconstruct(
     compare with.
     """
     needs_dictionary = find_method(method).needs_dictionary
-    capture = read_capture(folder)
-    psi = ImagingMatrix.load(psi_path or folder / PSI)
+    capture, psi_path = _read(folder, out, psi_path)
+    psi = ImagingMatrix.load(psi_path)
     views = psi.light_field_shape[:2]
     dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
     result = reconstruct(
@@ -163,8 +190,8 @@ def run_in_tiles(
     `run_reconstruct`; tile: samples a side.
     """
     needs_dictionary = find_method(method).needs_dictionary
-    capture = read_capture(folder)
-    psi = SavedPsi(psi_path or folder / PSI)
+    capture, psi_path = _read(folder, out, psi_path)
+    psi = SavedPsi(psi_path)
     views = psi.window(slice(0, psi.binning), slice(0, psi.binning)).light_field_shape[:2]
     dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
     started = time.perf_counter()

@@ -200,6 +200,10 @@ class Bench:
         noise, light = self._camera.sensor.noise, self._light[self.shot]
         return noise.expose_dn(self.readings(), exposure_s, light, self._rng)
 
+    def reseed(self, rng: np.random.Generator) -> None:
+        """Draw the noise of the frames that follow from another source."""
+        self._rng = rng
+
     def _trace(self, at_um: Mapping[str, float]) -> Array:
         camera = self._camera
         lens, sensor = camera.lens, camera.sensor

@@ -191,14 +191,19 @@ class Camera(Settings):
         return found
 
 
-def shipped_cameras() -> dict[str, Camera]:
-    """Return the cameras that come with the program, by name."""
+def shipped_camera_files() -> dict[str, Path]:
+    """Return the files of the cameras that come with the program, by name."""
     folder = resources.files("emmc_rig") / "cameras"
     files = sorted(
         (item for item in folder.iterdir() if item.name.endswith(".yaml")),
         key=lambda item: item.name,
     )
-    return {item.name.removesuffix(".yaml"): load_camera(Path(str(item))) for item in files}
+    return {item.name.removesuffix(".yaml"): Path(str(item)) for item in files}
+
+
+def shipped_cameras() -> dict[str, Camera]:
+    """Return the cameras that come with the program, by name."""
+    return {name: load_camera(path) for name, path in shipped_camera_files().items()}
 
 
 def load_camera(path: Path) -> Camera:

@@ -25,8 +25,14 @@ def _keys_beside(cls: type[BaseModel], location: tuple[int | str, ...]) -> list[
     nodes = [root]
     for part in location[:-1]:
         nodes = [child for node in nodes for child in _children(node, part, root)]
-    keys = {key for node in nodes for key in _resolve(node, root).get("properties", {})}
-    return sorted(keys)
+    found = [option for node in nodes for option in (_resolve(node, root), *_options(node, root))]
+    return sorted({key for node in found for key in node.get("properties", {})})
+
+
+def _options(node: dict[str, Any], root: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the alternatives of a node: a setting that may be left out is one of null."""
+    node = _resolve(node, root)
+    return [_resolve(option, root) for option in node.get("oneOf", []) + node.get("anyOf", [])]
 
 
 def _resolve(node: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
@@ -37,7 +43,7 @@ def _resolve(node: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
 
 def _children(node: dict[str, Any], part: int | str, root: dict[str, Any]) -> list[dict[str, Any]]:
     node = _resolve(node, root)
-    options = [_resolve(option, root) for option in node.get("oneOf", []) + node.get("anyOf", [])]
+    options = _options(node, root)
     if options:
         tagged = [o for o in options if part in _tags(o)]
         return tagged or [child for o in options for child in _children(o, part, root)]

@@ -1,4 +1,4 @@
-"""Sequences of exposures: whiteboards through the stepped pinhole, and the shots of a scene."""
+"""Exposures kept in memory: whiteboards through the stepped pinhole, and the shots of a scene."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from calibration.frames import average
 from calibration.whiteboard import Whiteboards
+from emmc_rig.capture.plan import METERING_EXPOSURE_S, mask_offsets_um
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
 
-METERING_EXPOSURE_S = 0.01
 WHITEBOARD_LEVEL = 0.7
 MAX_EXPOSURE_S = 30.0
 REFERENCE_REPEATS = 4
@@ -33,15 +33,9 @@ def move_masks(rig: Rig, camera: Camera, shot: int) -> None:
 
     Raises AppError when a shot wants two of them at different places: there is one mask stage.
     """
-    wanted = {
-        camera.shots[shot].offset_um.get(name, (0.0, 0.0))
-        for name in camera.moving_masks
-        if name in camera.shot_masks(shot)
-    }
-    if len(wanted) > 1:
-        raise AppError(f"shot {shot} moves two masks apart, the rig has one mask stage")
-    for x_um, y_um in wanted:
-        _go(rig, {"mask_x": x_um, "mask_y": y_um})
+    offsets_um = mask_offsets_um(camera, shot)
+    if offsets_um:
+        _go(rig, offsets_um)
 
 
 def open_aperture(rig: Rig) -> None:

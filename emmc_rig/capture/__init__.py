@@ -1,0 +1,1 @@
+"""Capture: a plan, the order it is run in, and the sequencer that fills a session."""

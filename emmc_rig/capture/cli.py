@@ -1,0 +1,148 @@
+"""The command `emmc-rig capture`: options in, a session on the disk."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from emmc_rig.errors import AppError
+
+OptionalPath = Path | None
+
+
+class CaptureStoppedError(AppError):
+    """Somebody stopped the capture; the message says how to go on."""
+
+
+def capture(
+    plan: Annotated[
+        OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
+    ] = None,
+    new: Annotated[
+        str | None, typer.Option("--new", help="write a commented plan for this camera, and end")
+    ] = None,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="print the JSON schema of a plan, for editors, and end")
+    ] = False,
+    rig: Annotated[
+        str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
+    ] = None,
+    scene: Annotated[
+        str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
+    ] = "deep-occlusions",
+    size: Annotated[
+        str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
+    ] = False,
+    out: Annotated[
+        OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
+    ] = None,
+) -> None:
+    """Run a plan on the rig; run it again to go on where it stopped. Ctrl-C: after this frame."""
+    from emmc_rig.capture.plan import schema_text
+
+    if schema:
+        typer.echo(schema_text(), nl=False)
+        return
+    if new is not None:
+        _write_plan(new, out or Path("plan.yaml"))
+        return
+    if plan is None:
+        raise typer.BadParameter("name a plan, or write one with --new CAMERA")
+    _run(plan, rig, scene, size, seed, real_time, dry_run, out)
+
+
+def _write_plan(name: str, path: Path) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.capture.command import write_new
+    from emmc_rig.capture.new_plan import new_plan
+
+    write_new(path, new_plan(name, find_camera(name)))
+    typer.echo(f"wrote {path}; edit it, then: emmc-rig capture {path} --rig simulated")
+
+
+def _run(
+    plan: Path,
+    rig: str | None,
+    scene: str,
+    size: str | None,
+    seed: int,
+    real_time: bool,
+    dry_run: bool,
+    out: Path | None,
+) -> None:
+    from emmc_rig.capture.command import run_capture, wish_from_plan, wish_from_session
+    from emmc_rig.capture.control import Control
+    from emmc_rig.capture.display import CaptureDisplay
+    from emmc_rig.capture.estimate import Estimate
+    from emmc_rig.output import parse_size, shown_bytes, shown_seconds
+    from emmc_rig.rig_config import ImagedRig, rig_description
+    from emmc_rig.session.contact_sheet import quick_pictures, write_sheet
+    from emmc_rig.session.session import REPORT, is_session
+
+    imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time)
+    chosen = None if rig is None else rig_description(rig, imaged)
+    if is_session(plan):
+        wish = wish_from_session(plan, chosen)
+    elif chosen is None:
+        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+    else:
+        wish = wish_from_plan(plan, out, chosen)
+    console, control = Console(stderr=True), Control()
+    display = CaptureDisplay(console, control)
+
+    def ask(what: str) -> None:
+        if not sys.stdin.isatty():
+            raise AppError(
+                f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
+            )
+        with display.aside():
+            input(f"please {what}, then press Enter ")
+
+    def agreed(expected: Estimate) -> bool:
+        if expected.frames:
+            hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
+            display.tell(
+                f"{expected.frames} frames to take, about {shown_seconds(expected.seconds)} and "
+                f"{shown_bytes(expected.bytes)}{hands}"
+            )
+        return not dry_run
+
+    go_on = f"go on with: emmc-rig capture {wish.out}"
+
+    try:
+        with display.shown():
+            captured = run_capture(wish, display, ask, agreed, control)
+    except KeyboardInterrupt as stop:
+        kept = f"what was captured is kept, {go_on}"
+        nothing = "nothing was begun"
+        told = kept if is_session(wish.out) else nothing
+        raise CaptureStoppedError(f"stopped at once; {told}") from stop
+    if captured is None:
+        return
+    session, outcome = captured
+    try:
+        write_sheet(session, session.folder / REPORT, quick_pictures(session))
+    except AppError as fault:
+        display.tell(f"no report: {fault}")
+    if not outcome.complete:
+        raise CaptureStoppedError(
+            f"stopped: {outcome.missing} of {len(session.frames)} frames are still to be taken; "
+            f"{go_on}"
+        )
+    retried = f", {outcome.retries} retries" if outcome.retries else ""
+    typer.echo(
+        f"complete: {len(session.frames)} frames verified, {outcome.taken} taken in "
+        f"{shown_seconds(outcome.seconds)}{retried}; in {session.folder}"
+    )
+    typer.echo(f"open {session.folder / REPORT}")

@@ -1,0 +1,221 @@
+"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from emmc_rig.capture.control import Control, interruptible
+from emmc_rig.capture.estimate import Estimate, estimate
+from emmc_rig.capture.order import ordered
+from emmc_rig.capture.plan import (
+    METERING_EXPOSURE_S,
+    Plan,
+    expand,
+    first_difference,
+    load_plan,
+    planned_camera,
+)
+from emmc_rig.capture.sequencer import Outcome, Sequencer, Watcher
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import Rig
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.settings import validated
+from emmc_rig.output import command_line, shown_bytes, versions
+from emmc_rig.rig_config import Ask, opened_rig
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Frozen, Session, is_session, only_program, wall_time
+from emmc_rig.session.storage import SYSTEM_DISK, Disk
+
+DISK_RESERVE_BYTES = 100_000_000
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What to capture and where to; rig: see `emmc_rig.rig_config`, None on resuming alike."""
+
+    plan_path: Path
+    plan: Plan
+    plan_yaml: str
+    camera: Camera
+    out: Path
+    rig: Mapping[str, Any]
+
+
+def session_folder(plan_path: Path) -> Path:
+    """Return the folder of a plan's session unless another is named."""
+    return plan_path.with_name(f"{plan_path.stem}-session")
+
+
+def wish_from_plan(plan_path: Path, out: Path | None, rig: Mapping[str, Any]) -> Wish:
+    """Return what a plan file asks for; raises AppError."""
+    plan = load_plan(plan_path)
+    camera = planned_camera(plan, plan_path.parent)
+    text = plan_path.read_text(encoding="utf-8")
+    return Wish(plan_path, plan, text, camera, out or session_folder(plan_path), rig)
+
+
+def wish_from_session(folder: Path, rig: Mapping[str, Any] | None) -> Wish:
+    """Return what a session was begun for; raises AppError."""
+    session = Session(folder)
+    plan = validated(Plan, yaml.safe_load(session.plan_yaml), str(folder), AppError)
+    camera = validated(Camera, session.camera, str(folder), CameraError)
+    return Wish(folder, plan, session.plan_yaml, camera, folder, rig or session.rig)
+
+
+def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
+    """Return every frame of a wish in the order of the capture."""
+    return ordered(expand(wish.plan, wish.camera, rig.window_um), wish.plan.order)
+
+
+def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
+    """Return the session that the wish goes on with; None where it is to be begun.
+
+    Raises AppError when the folder is in the way, or the session was begun with another plan,
+    camera or rig.
+    """
+    if is_session(wish.out):
+        session = Session(wish.out, disk)
+        _refuse_changes(wish, session)
+        return session
+    if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
+        raise AppError(
+            f"--out {wish.out}: holds something else than a session; choose another folder"
+        )
+    return None
+
+
+def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK) -> Session:
+    """Begin the wish's session; raises AppError where it cannot be made."""
+    frozen = Frozen(wish.plan_yaml, _camera_data(wish.camera), dict(wish.rig), frames)
+    about = {
+        "title": wish.plan.title or wish.plan_path.stem,
+        "created": wall_time(),
+        "command": command_line(),
+        "versions": versions(),
+    }
+    return Session.create(wish.out, frozen, about, disk)
+
+
+def _camera_data(camera: Camera) -> dict[str, Any]:
+    return camera.model_dump(mode="json")
+
+
+def _refuse_changes(wish: Wish, session: Session) -> None:
+    frozen = validated(Plan, yaml.safe_load(session.plan_yaml), str(session.folder), AppError)
+    difference = first_difference(wish.plan, frozen)
+    if difference:
+        raise AppError(
+            f"{wish.plan_path}: was edited since session {session.folder.name} began with it "
+            f"({difference} as there): take the edit back, or name another --out"
+        )
+    if json.loads(json.dumps(_camera_data(wish.camera))) != session.camera:
+        raise AppError(
+            f"{wish.plan.camera}: the camera was edited since session {session.folder.name} began; "
+            "take the edit back, or name another --out"
+        )
+    if json.loads(json.dumps(dict(wish.rig))) != session.rig:
+        raise AppError(
+            f"session {session.folder.name} was begun with another rig: {json.dumps(session.rig)}; "
+            "name the same, or another --out"
+        )
+
+
+def estimated(frames: tuple[PlannedFrame, ...], plan: Plan, rig: Rig) -> Estimate:
+    """Return what frames will take."""
+    rows, columns = rig.camera.shape
+    speeds = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
+    return estimate(frames, 2 * rows * columns, speeds, plan.settle_s, METERING_EXPOSURE_S)
+
+
+def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
+    """Raise AppError when the frames will not fit."""
+    above = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
+    free = disk.free_bytes(above)
+    if expected.bytes + DISK_RESERVE_BYTES > free:
+        raise AppError(
+            f"{out}: {expected.frames} frames need about {shown_bytes(expected.bytes)}, "
+            f"{shown_bytes(free)} are free; make room, or name another --out"
+        )
+
+
+def refuse_other_camera(session: Session, rig: Rig) -> None:
+    """Raise AppError when the session was begun with another camera body or frame size."""
+    run = next((entry for entry in session.journal.entries if entry["kind"] == "run"), None)
+    if run is None or not session.stored:
+        return
+    then, now = run["camera"], rig.camera.identity
+    if then["serial"] != now.serial or then["shape"] != list(rig.camera.shape):
+        raise AppError(
+            f"session {session.folder.name} was begun with camera {then['model']} "
+            f"{then['serial']} of {then['shape'][0]}x{then['shape'][1]} pixels, this is "
+            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: connect "
+            "that one, or name another --out"
+        )
+
+
+@contextmanager
+def disk_faults_told(session: Session) -> Iterator[None]:
+    """Turn what the disk raises into one line."""
+    try:
+        yield
+    except OSError as fault:
+        why = {
+            errno.ENOSPC: "the disk is full; make room",
+            errno.EDQUOT: "the disk quota is spent; make room",
+            errno.EROFS: "the disk is read-only; make it writable",
+            errno.EACCES: "this user may not write there; change that",
+        }.get(fault.errno or 0, f"{fault.strerror or fault}; mend that")
+        raise AppError(
+            f"{session.folder}: {why}, then run the same command to go on; "
+            f"{len(session.stored)} of {len(session.frames)} frames are safe"
+        ) from fault
+
+
+def run_capture(
+    wish: Wish,
+    watcher: Watcher,
+    ask: Ask,
+    agreed: Callable[[Estimate], bool] = lambda expected: True,
+    control: Control | None = None,
+) -> tuple[Session, Outcome] | None:
+    """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
+
+    agreed: is told what it will take. Raises AppError or a `DriverError`.
+    """
+    control = control or Control()
+    with ExitStack() as open_things:
+        session = begun_session(wish)
+        rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
+        frames = planned_frames(wish, rig) if session is None else session.missing()
+        expected = estimated(frames, wish.plan, rig)
+        refuse_small_disk(wish.out, expected)
+        if not agreed(expected):
+            return None
+        session = session or new_session(wish, frames)
+        open_things.enter_context(only_program(session))
+        refuse_other_camera(session, rig)
+        with interruptible(control, watcher.tell), disk_faults_told(session):
+            return session, Sequencer(session, wish.plan, rig, watcher, control).run()
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a new file; raises AppError when one of that name is there, or it cannot be."""
+    try:
+        with open(path, "x", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+    except FileExistsError as fault:
+        raise AppError(f"{path}: exists already; name another --out") from fault
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault

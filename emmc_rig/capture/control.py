@@ -1,0 +1,87 @@
+"""How a running capture is paused, resumed and stopped: from another thread, a key or a signal."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+STOPPING_NOW = ("SIGTERM", "SIGHUP")
+PAUSE_POLL_S = 0.05
+
+
+class Control:
+    """What somebody wants of a capture; any thread or signal handler may ask for it.
+
+    The sequencer looks between frames. Plain flags: a lock could be held by the very code that a
+    signal interrupts.
+    """
+
+    def __init__(self) -> None:
+        self.paused = False
+        self.stopping = False
+
+    def pause(self) -> None:
+        """Begin no further frame until `resume`."""
+        self.paused = True
+
+    def resume(self) -> None:
+        """Go on."""
+        self.paused = False
+
+    def stop(self) -> None:
+        """End after the present frame, paused or not."""
+        self.stopping = True
+
+    def may_go_on(self) -> bool:
+        """Wait while paused; return False when the capture is to end."""
+        while self.paused and not self.stopping:
+            time.sleep(PAUSE_POLL_S)
+        return not self.stopping
+
+
+@contextmanager
+def interruptible(control: Control, told: Callable[[str], None]) -> Iterator[None]:
+    """Let Ctrl-C stop after the present frame, and the second one, SIGTERM or SIGHUP now.
+
+    "Now" raises `KeyboardInterrupt` in the main thread. Elsewhere than there nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not control.stopping:
+            control.stop()
+            told("stopping after this frame; Ctrl-C again stops now")
+            return
+        raise KeyboardInterrupt
+
+    with _handled(interrupt):
+        yield
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold signals back while the bench is made safe."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with _handled(signal.SIG_IGN):
+        yield
+
+
+@contextmanager
+def _handled(handler: Any) -> Iterator[None]:
+    numbers = [signal.SIGINT]
+    numbers += [getattr(signal, name) for name in STOPPING_NOW if hasattr(signal, name)]
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

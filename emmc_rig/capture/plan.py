@@ -1,0 +1,384 @@
+"""The plan of a capture: frozen, validated, and every frame that follows from it.
+
+Source of the whiteboard procedure: see `calibration.whiteboard`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+
+from calibration.whiteboard import LAMP_COLOURS
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, Shot
+from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.session.planned import Bench, PlannedFrame
+
+METERING_EXPOSURE_S = 0.01
+SCHEMA_FILE = "plan.schema.json"
+
+Lamp = Literal["white", "red", "green", "blue"]
+Positive = Annotated[float, Field(gt=0)]
+Gain = Annotated[float, Field(ge=1, description="1: the camera's lowest ISO")]
+Repeats = Annotated[int, Field(ge=1, le=10_000)]
+
+
+def _several(value: object) -> object:
+    return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+_POSITIVE_SCHEMA = {"type": "number", "exclusiveMinimum": 0}
+Exposures = Annotated[
+    tuple[Positive, ...],
+    BeforeValidator(_several),
+    Field(min_length=1),
+    WithJsonSchema(
+        {"anyOf": [_POSITIVE_SCHEMA, {"type": "array", "items": _POSITIVE_SCHEMA, "minItems": 1}]}
+    ),
+]
+"""One exposure in seconds, or several: a bracket."""
+
+
+class PlannedShot(Settings):
+    """One shot of the scene.
+
+    The masks in the beam, their place and the filter are those of one of the camera's shots;
+    `mask_um` or `mask_cells` (x, y) move every mask on the stage elsewhere.
+    """
+
+    camera_shot: int | None = Field(
+        default=None, ge=0, description="from 0; default: this shot's own place in the list"
+    )
+    mask_um: tuple[float, float] | None = Field(default=None, description="x, y from the axis")
+    mask_cells: tuple[float, float] | None = Field(default=None, description="x, y in mask cells")
+    exposure_s: Exposures | None = Field(
+        default=None, description="seconds; several are a bracket; default: the camera's own"
+    )
+    gain: Gain = 1.0
+    repeats: Repeats = 1
+    lamp: Lamp = "white"
+
+    @model_validator(mode="after")
+    def _one_place(self) -> PlannedShot:
+        if self.mask_um is not None and self.mask_cells is not None:
+            raise ValueError("give mask_um or mask_cells, not both")
+        return self
+
+
+class Boards(Settings):
+    """Whiteboards: the pinhole before every view, and the open aperture without masks."""
+
+    views: Literal["all"] | tuple[tuple[int, int], ...] = Field(
+        default="all", description="all, or a list of [v, u]"
+    )
+    lamps: tuple[Lamp, ...] | None = Field(
+        default=None, min_length=1, description="default: what the sensor needs"
+    )
+    repeats: Repeats = 2
+    references: Annotated[int, Field(ge=2, le=10_000)] = 4
+    level: float = Field(default=0.7, gt=0, lt=1, description="of white, where metering aims")
+    exposure_s: Positive | None = Field(
+        default=None, description="of the references; default: metered"
+    )
+
+
+class Darks(Settings):
+    """Dark frames, the lamp off."""
+
+    exposure_s: Exposures = (METERING_EXPOSURE_S,)
+    repeats: Annotated[int, Field(ge=2, le=10_000)] = 4
+
+
+class Retries(Settings):
+    """How often a frame is tried again before the capture stops, everything kept."""
+
+    per_frame: int = Field(default=4, ge=0)
+    per_session: int = Field(default=200, ge=0, description="between start and end of the program")
+
+
+class Checks(Settings):
+    """What a frame must pass before it counts."""
+
+    largest_saturated_share: float = Field(
+        default=0.02, ge=0, le=1, description="of a frame's pixels; a bracket's shortest exposure"
+    )
+    smallest_signal: float = Field(
+        default=0.002, ge=0, le=1, description="brightest pixels above black, 1 at white"
+    )
+    largest_dark: float = Field(default=0.05, gt=0, le=1, description="mean of a dark frame")
+    stage_um: float = Field(default=2.0, gt=0, description="read-back after the exposure")
+    registration_px: float = Field(
+        default=0.5, gt=0, description="shift against the last good frame, on resuming"
+    )
+
+
+class Plan(Settings):
+    """What to capture; see `new_plan` for a commented one."""
+
+    title: str = ""
+    camera: str = Field(description="a shipped camera (`emmc-rig cameras`), or a YAML file")
+    shots: tuple[PlannedShot, ...] = Field(min_length=1)
+    whiteboards: Boards | None = Boards()
+    darks: Darks | None = Darks()
+    order: Literal["least-travel", "as-planned"] = "least-travel"
+    settle_s: float = Field(
+        default=0.0, ge=0, le=3600, description="after a move, beyond the stage's own"
+    )
+    retries: Retries = Retries()
+    checks: Checks = Checks()
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan; raises AppError with one line naming the nearest valid key."""
+    return validated(Plan, read_yaml(path, AppError), str(path), AppError)
+
+
+def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
+    """Return the camera that the plan makes: one of its shots for each of the plan's.
+
+    beside: the folder that a camera file is looked for in first. Raises AppError or CameraError.
+    """
+    spec = plan.camera
+    if beside is not None and (beside / spec).is_file():
+        spec = str(beside / spec)
+    camera = find_camera(spec)
+    wanted = max(_own_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
+    if wanted >= len(camera.shots):
+        camera = camera.with_shots(wanted + 1)
+    changing = [
+        name
+        for name, mask in camera.masks.items()
+        if mask.pattern.frame_count(len(camera.shots)) > 1
+    ]
+    for place, shot in enumerate(plan.shots):
+        if changing and shot.camera_shot not in (None, place):
+            raise AppError(
+                f"shots.{place}.camera_shot: mask '{changing[0]}' shows another pattern in every "
+                f"shot, so shot {place} is always its own: leave camera_shot out"
+            )
+    shots = tuple(_camera_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
+    return camera.model_copy(update={"shots": shots})
+
+
+def _own_shot(camera: Camera, place: int, shot: PlannedShot) -> int:
+    """Return which of the camera's shots a planned one is; one of a place of its own goes round."""
+    if shot.camera_shot is not None:
+        return shot.camera_shot
+    placed = shot.mask_um is not None or shot.mask_cells is not None
+    return place % len(camera.shots) if placed else place
+
+
+def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
+    own = camera.shots[_own_shot(camera, place, shot)]
+    if shot.mask_um is None and shot.mask_cells is None:
+        return own
+    moving = camera.moving_masks or tuple(camera.masks)
+    if not moving:
+        raise AppError(f"shots.{place}: the camera has no mask to move")
+    if shot.mask_um is not None:
+        offsets = dict.fromkeys(moving, shot.mask_um)
+    else:
+        assert shot.mask_cells is not None
+        x, y = shot.mask_cells
+        offsets = {
+            name: (x * camera.masks[name].cell_um, y * camera.masks[name].cell_um)
+            for name in moving
+        }
+    return own.model_copy(update={"offset_um": offsets})
+
+
+def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...]]:
+    """Return each shot's exposures, shortest first; camera: as planned."""
+    own = camera.exposures_s()
+    return [
+        tuple(sorted(set(shot.exposure_s or (float(own[place]),))))
+        for place, shot in enumerate(plan.shots)
+    ]
+
+
+def expand(plan: Plan, camera: Camera, window_um: float) -> tuple[PlannedFrame, ...]:
+    """Return every frame of a plan, in its order; camera: as planned.
+
+    window_um: what the stage's aperture_x adds to open the aperture. Raises AppError for views
+    that the camera does not have, and for a shot whose masks stand at several places.
+    """
+    frames = [
+        *_darks(plan),
+        *_references(plan, camera, window_um),
+        *_boards(plan, camera, window_um),
+        *_shots(plan, camera, window_um),
+    ]
+    return tuple(frames)
+
+
+def _darks(plan: Plan) -> Iterator[PlannedFrame]:
+    if plan.darks is None:
+        return
+    bench = Bench("scene", "off", 0, 0, masks_in=True)
+    for place, exposure_s in enumerate(sorted(set(plan.darks.exposure_s))):
+        for repeat in range(plan.darks.repeats):
+            name = f"dark-{place}-r{repeat}"
+            yield PlannedFrame(name, "dark", bench, exposure_s, repeat=repeat)
+
+
+def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
+    """Return the lamps of the whiteboards: white alone where a pixel sees one colour only."""
+    if plan.whiteboards is not None and plan.whiteboards.lamps is not None:
+        return plan.whiteboards.lamps
+    several = cfa_tile(camera.sensor.cfa).sum(axis=-1).max() > 1
+    filtered = all(shot.filter != "none" for shot in camera.shots)
+    return LAMP_COLOURS if several and not filtered else ("white",)
+
+
+def _metering_id(shot: int, lamp: str) -> str:
+    return f"meter-s{shot}-{lamp}"
+
+
+def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    window = {"aperture_x": window_um, "aperture_y": 0.0}
+    fitted = fittings(camera)
+    for shot in range(len(camera.shots)):
+        for lamp in lamps_of(plan, camera):
+            bench = Bench("whiteboard", lamp, shot, fitted[shot], False, window)
+            metered_by = None
+            if boards.exposure_s is None:
+                metered_by = _metering_id(shot, lamp)
+                yield PlannedFrame(metered_by, "metering", bench, METERING_EXPOSURE_S)
+            for repeat in range(boards.references):
+                yield PlannedFrame(
+                    f"reference-s{shot}-{lamp}-r{repeat}",
+                    "reference",
+                    bench,
+                    boards.exposure_s,
+                    repeat=repeat,
+                    metered_by=metered_by,
+                )
+
+
+def _boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    rows, columns = camera.views
+    views = boards.views
+    if views == "all":
+        views = tuple((v, u) for v in range(rows) for u in range(columns))
+    for v, u in views:
+        if not (0 <= v < rows and 0 <= u < columns):
+            raise AppError(
+                f"whiteboards.views: [{v}, {u}] is none of the camera's {rows}x{columns} views; "
+                "rows and columns count from 0"
+            )
+    cell_um = camera.lens.aperture_cell_um
+    y_um, x_um = centred_grid(rows, cell_um), centred_grid(columns, cell_um)
+    # The pinhole lets one view's light pass, the reference that of all.
+    light = float(rows * columns)
+    fitted = fittings(camera)
+    for shot in range(len(camera.shots)):
+        masks_um = mask_offsets_um(camera, shot)
+        for v, u in views:
+            pinhole = {"aperture_x": float(x_um[u]), "aperture_y": float(y_um[v])}
+            for lamp in lamps_of(plan, camera):
+                bench = Bench("whiteboard", lamp, shot, fitted[shot], True, masks_um | pinhole)
+                metered = boards.exposure_s is None
+                for repeat in range(boards.repeats):
+                    yield PlannedFrame(
+                        f"board-s{shot}-v{v}-u{u}-{lamp}-r{repeat}",
+                        "whiteboard",
+                        bench,
+                        None if boards.exposure_s is None else boards.exposure_s * light,
+                        repeat=repeat,
+                        view=(v, u),
+                        metered_by=_metering_id(shot, lamp) if metered else None,
+                        light=light,
+                    )
+
+
+def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    fitted = fittings(camera)
+    for place, (shot, bracket) in enumerate(
+        zip(plan.shots, exposures_s(plan, camera), strict=True)
+    ):
+        offsets_um = mask_offsets_um(camera, place)
+        offsets_um |= {"aperture_x": window_um, "aperture_y": 0.0}
+        bench = Bench("scene", shot.lamp, place, fitted[place], True, offsets_um)
+        for step, exposure_s in enumerate(bracket):
+            for repeat in range(shot.repeats):
+                name = f"shot-{place}-e{step}-r{repeat}"
+                yield PlannedFrame(name, "shot", bench, exposure_s, shot.gain, repeat)
+
+
+def fittings(camera: Camera) -> list[int]:
+    """Return, for each shot, the first shot with the same masks, patterns and filter in the beam.
+
+    Nobody has to change anything between shots of one fitting.
+    """
+    keys = []
+    for place, shot in enumerate(camera.shots):
+        names = camera.shot_masks(place)
+        counts = [camera.masks[n].pattern.frame_count(len(camera.shots)) for n in names]
+        keys.append((names, tuple(place % count for count in counts), shot.filter))
+    return [keys.index(key) for key in keys]
+
+
+def mask_offsets_um(camera: Camera, shot: int) -> dict[str, float]:
+    """Return where the mask stage stands for a shot, by axis; none where nothing moves.
+
+    Raises AppError when a shot wants two masks at different places: there is one mask stage.
+    """
+    wanted = {
+        camera.shots[shot].offset_um.get(name, (0.0, 0.0))
+        for name in camera.moving_masks
+        if name in camera.shot_masks(shot)
+    }
+    if len(wanted) > 1:
+        raise AppError(f"shot {shot} moves two masks apart, the rig has one mask stage")
+    return {
+        axis: value for x_um, y_um in wanted for axis, value in (("mask_x", x_um), ("mask_y", y_um))
+    }
+
+
+def plan_schema() -> dict[str, Any]:
+    """Return the JSON schema of a plan, for editors."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Plan.model_json_schema(),
+    }
+
+
+def schema_text() -> str:
+    """Return the schema as it is shipped."""
+    return json.dumps(plan_schema(), indent=2) + "\n"
+
+
+def schema_path() -> Path:
+    """Return where the shipped schema lies."""
+    return Path(str(resources.files("emmc_rig.capture") / SCHEMA_FILE))
+
+
+def first_difference(one: Plan, other: Plan) -> str:
+    """Return what differs first between two plans, "" for equal ones."""
+    return _difference(one.model_dump(), other.model_dump(), "")
+
+
+def _difference(one: Any, other: Any, where: str) -> str:
+    if isinstance(one, dict) and isinstance(other, dict):
+        pairs = [(f"{where}.{key}", one[key], other.get(key)) for key in one]
+    elif isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        if len(one) != len(other):
+            return f"{where.lstrip('.')} has {len(one)} entries, not {len(other)}"
+        pairs = [(f"{where}.{i}", a, b) for i, (a, b) in enumerate(zip(one, other, strict=True))]
+    else:
+        return "" if one == other else f"{where.lstrip('.')} is {one!r}, not {other!r}"
+    return next(filter(None, (_difference(a, b, name) for name, a, b in pairs)), "")

@@ -1,0 +1,596 @@
+"""The sequencer: every missing frame of a session, one after the other, until it is complete.
+
+For each frame: attend (lamp, board, masks), move, settle, expose and download, read the stage
+back, check, hand over. A writer thread stores and journals the frame while the stage already moves
+to the next. A fault is met by mending what it broke and trying again, within a budget. However a
+run ends, the lamp is off and the stage stands when `run` returns or raises.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.camera import Camera as CameraDevice
+from drivers.errors import CameraSettingError, DriverError
+from drivers.raw import RawFrame
+from emmc_rig.capture.checks import (
+    LEAST_LIKENESS,
+    Figures,
+    FrameRefusedError,
+    Shift,
+    check,
+    figures,
+    registered,
+)
+from emmc_rig.capture.control import Control, uninterrupted
+from emmc_rig.capture.plan import Boards, Plan
+from emmc_rig.capture.retries import Budget, mending
+from emmc_rig.capture.writer import Writer
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import Rig
+from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session, wall_time
+from emmc_rig.session.verify import verify_frames
+
+STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+METERING_STEP = 4.0
+METERING_TRIES = 8
+METERING_RANGE = (0.02, 0.95)
+LARGEST_EXPOSURE_RATIO = 1.5
+"""A camera may take the nearest of full stops, which is off by at most half a stop."""
+
+
+class Watcher(Protocol):
+    """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
+
+    def begin(self, done: int, planned: int) -> None:
+        """So many frames are there already."""
+        ...
+
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """A step of a frame begins: one of `STEPS`."""
+        ...
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """A frame passed its checks."""
+        ...
+
+    def stored(self, frame: PlannedFrame) -> None:
+        """A frame is on the disk."""
+        ...
+
+    def tell(self, message: str) -> None:
+        """Something that people should know."""
+        ...
+
+
+class Unwatched:
+    """A watcher that shows nothing."""
+
+    def begin(self, done: int, planned: int) -> None:
+        """Ignore it."""
+
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """Ignore it."""
+
+    def stored(self, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def tell(self, message: str) -> None:
+        """Ignore it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: complete, or stopped by whoever controls it."""
+
+    complete: bool
+    taken: int
+    missing: int
+    retries: int
+    seconds: float
+
+
+@dataclass
+class _Applied:
+    """What the devices were last told; empty: nothing is known."""
+
+    bench: tuple | None = None
+    lamp: str | None = None
+    offsets_um: dict[str, float] = field(default_factory=dict)
+    exposure_s: float | None = None
+    gain: float | None = None
+
+
+class Sequencer:
+    """A run over a session; `run` once.
+
+    timer: seconds that never run backwards, for the timeline; wall: the time of day, for people.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        plan: Plan,
+        rig: Rig,
+        watcher: Watcher | None = None,
+        control: Control | None = None,
+        timer: Callable[[], float] = time.perf_counter,
+        wall: Callable[[], str] = wall_time,
+    ) -> None:
+        self._session, self._plan, self._rig = session, plan, rig
+        self._watcher = watcher or Unwatched()
+        self._control = control or Control()
+        self._timer, self._wall = timer, wall
+        self._camera: CameraDevice = rig.camera
+        self._applied = _Applied()
+        self._budget = Budget(plan.retries)
+        self._writer = Writer()
+        self._before: NDArray[np.uint16] | None = None
+        self._metered: dict[str, Entry] = {}
+        self._began_s = 0.0
+        self._taken = self._run = 0
+        # How long the frame before took to hand over: its own line is written by then.
+        self._handed: dict[str, list[float]] = {}
+        brackets = _brackets(session.frames)
+        self._may_saturate = {name for ids in brackets for name in ids[1:]}
+
+    def run(self) -> Outcome:
+        """Take what is missing.
+
+        Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
+        disk, or `KeyboardInterrupt`; what was stored until then is kept.
+        """
+        session = self._session
+        self._began_s = self._timer()
+        with self._writer, self._bench_left_safe():
+            session.note("run", **self._facts())
+            self._run = session.runs
+            whole = set(session.stored)
+            self._discard_damaged(whole)
+            self._metered = _metered_before(session)
+            frames = session.missing()
+            self._watcher.begin(len(session.frames) - len(frames), len(session.frames))
+            self._preflight(frames)
+            if frames:
+                self._retrying("home", self._home)
+                self._compare_with_last_good()
+            while frames and self._take_all(frames):
+                self._writer.flush()
+                taken = {frame.id for frame in frames}
+                for name, fault in self._discard_damaged(taken).items():
+                    self._budget.spend(name, DriverError(fault), 1)
+                frames = session.missing()
+            self._writer.flush()
+            left = len(session.missing())
+            if not left and not session.is_complete:
+                session.note("complete", frames=len(session.frames), wall=self._wall())
+        return Outcome(
+            not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
+        )
+
+    def _facts(self) -> dict[str, Any]:
+        from emmc_rig.output import command_line, versions
+
+        rig, camera = self._rig, self._camera
+        return {
+            "wall": self._wall(),
+            "versions": versions(),
+            "command": command_line(),
+            "resumed": bool(self._session.stored),
+            "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
+            "stage": {
+                axis: {
+                    "limits_um": list(rig.stage.limits_um(axis)),
+                    "speed_um_s": rig.stage.speed_um_s(axis),
+                    "zero_um": rig.zero_um.get(axis, 0.0),
+                }
+                for axis in rig.stage.axes
+            },
+        }
+
+    def _preflight(self, frames: tuple[PlannedFrame, ...]) -> None:
+        """Raise AppError for what the rig can never do, before anything moves."""
+        rig = self._rig
+        low_s, high_s = self._camera.exposure_limits_s
+        low, high = self._camera.gain_limits
+        for frame in frames:
+            for axis, offset_um in frame.bench.offsets_um.items():
+                if axis not in rig.stage.axes or axis not in rig.zero_um:
+                    raise AppError(
+                        f"frame {frame.id} needs a stage axis '{axis}', the rig has "
+                        f"{', '.join(rig.zero_um) or 'none'}: name it in the rig's file"
+                    )
+                low_um, high_um = rig.stage.limits_um(axis)
+                if not low_um <= rig.zero_um[axis] + offset_um <= high_um:
+                    raise AppError(
+                        f"frame {frame.id}: {axis} cannot go {offset_um:g} um from its zero "
+                        f"({rig.zero_um[axis]:g} um), it reaches {low_um:g} to {high_um:g} um"
+                    )
+            # A camera whose exposure cannot be chosen says for each frame what it is.
+            if (
+                low_s < high_s
+                and frame.exposure_s is not None
+                and not (low_s * (1 - 1e-9) <= frame.exposure_s <= high_s * (1 + 1e-9))
+            ):
+                raise AppError(
+                    f"frame {frame.id}: the camera exposes from {low_s:g} to {high_s:g} s, not "
+                    f"{frame.exposure_s:g} s: change the plan"
+                )
+            if not low * (1 - 1e-9) <= frame.gain <= high * (1 + 1e-9):
+                raise AppError(
+                    f"frame {frame.id}: the camera's gain goes from {low:g} to {high:g}, not to "
+                    f"{frame.gain:g}: change the plan"
+                )
+
+    def _home(self) -> None:
+        if self._rig.stage.axes:
+            self._rig.stage.home()
+        self._applied = _Applied()
+
+    def _take_all(self, frames: tuple[PlannedFrame, ...]) -> bool:
+        """Take the frames; returns False when the capture was told to stop."""
+        for frame in frames:
+            if not self._control.may_go_on():
+                return False
+            self._take(frame)
+        return True
+
+    def _take(self, planned: PlannedFrame) -> None:
+        spans: dict[str, list[float]] = {}
+        attempts = 0
+
+        def attempt() -> None:
+            nonlocal attempts
+            attempts += 1
+            spans.clear()
+            frame, found, read_um = self._attempt(planned, spans)
+            self._watcher.taken(planned, frame, found)
+            spans.update(self._handed)
+            self._handed = {}
+            with self._span("hand over", planned, self._handed):
+                self._hand_over(planned, frame, found, read_um, spans, attempts)
+            self._before = frame.mosaic
+
+        self._retrying(planned.id, attempt)
+        self._taken += 1
+
+    def _retrying(self, name: str, attempt: Callable[[], None]) -> None:
+        """Try until it works or the budget is spent."""
+        faults = 0
+        todo = attempt
+        while True:
+            try:
+                todo()
+                if todo is attempt:
+                    return
+                todo = attempt
+            except DriverError as error:
+                faults += 1
+                self._note("retry", id=name, fault=str(error), attempt=faults, at_s=self._now_s())
+                self._budget.spend(name, error, faults)
+                self._watcher.tell(f"{name}, try {faults}: {error}")
+                todo = partial(self._mend, error, faults)
+
+    def _mend(self, error: DriverError, faults: int) -> None:
+        what = mending(error, faults)
+        self._rig.clock.sleep(what.wait_s)
+        self._applied = _Applied()
+        if what.reopen_camera and self._rig.reopen_camera is not None:
+            with suppress(DriverError):
+                self._camera.close()
+            self._camera = self._rig.reopen_camera()
+        if what.reconnect_stage:
+            self._rig.stage.reconnect()
+        if what.home:
+            self._home()
+
+    def _attempt(
+        self, planned: PlannedFrame, spans: dict[str, list[float]]
+    ) -> tuple[RawFrame, Figures, dict[str, float]]:
+        rig = self._rig
+        with self._span("attend", planned, spans):
+            self._attend(planned)
+        with self._span("move", planned, spans):
+            moved = self._move(planned)
+        if moved and self._plan.settle_s:
+            with self._span("settle", planned, spans):
+                rig.clock.sleep(self._plan.settle_s)
+        with self._span("expose", planned, spans):
+            exposure_s = self._exposure_s(planned)
+            frame, found = self._expose(planned, exposure_s)
+        with self._span("read back", planned, spans):
+            read_um = self._read_back(planned)
+        with self._span("check", planned, spans):
+            may_saturate = planned.kind == "metering" or planned.id in self._may_saturate
+            check(planned, frame, found, self._before, self._plan.checks, may_saturate)
+        return frame, found, read_um
+
+    def _attend(self, planned: PlannedFrame) -> None:
+        rig, bench, applied = self._rig, planned.bench, self._applied
+        if bench.lamp != "off" and applied.bench != bench.set_by_hand:
+            applied.bench = None
+            rig.attendant.place(bench.target)
+            rig.attendant.fit_masks(bench.fitting, bench.masks_in)
+            applied.bench = bench.set_by_hand
+        if applied.lamp != bench.lamp:
+            applied.lamp = None
+            rig.attendant.set_lamp(bench.lamp)
+            applied.lamp = bench.lamp
+
+    def _move(self, planned: PlannedFrame) -> bool:
+        """Bring the stage to its place; returns whether it moved."""
+        applied, zero_um = self._applied.offsets_um, self._rig.zero_um
+        wanted = {
+            axis: um for axis, um in planned.bench.offsets_um.items() if applied.get(axis) != um
+        }
+        if not wanted:
+            return False
+        for axis in wanted:
+            applied.pop(axis, None)
+        self._rig.stage.move_to_um({axis: zero_um[axis] + um for axis, um in wanted.items()})
+        applied |= wanted
+        return True
+
+    def _read_back(self, planned: PlannedFrame) -> dict[str, float]:
+        """Return where the axes stand after the exposure; raises when they do not stand there."""
+        read_um = {}
+        for axis, offset_um in planned.bench.offsets_um.items():
+            at_um = self._rig.stage.position_um(axis) - self._rig.zero_um[axis]
+            if abs(at_um - offset_um) > self._plan.checks.stage_um:
+                raise FrameRefusedError(
+                    planned.id,
+                    f"was exposed while {axis} stood {at_um - offset_um:+.2f} um off its place",
+                    "check that nothing pushes the stage",
+                )
+            read_um[axis] = at_um
+        return read_um
+
+    def _exposure_s(self, planned: PlannedFrame) -> float:
+        """Return the exposure to ask the camera for."""
+        if planned.exposure_s is not None:
+            return planned.exposure_s
+        assert planned.metered_by is not None
+        metered = self._metered[planned.metered_by]
+        level = (self._plan.whiteboards or Boards()).level
+        return metered_exposure_s(metered, level, planned.light, self._camera.exposure_limits_s)
+
+    def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
+        if planned.kind != "metering":
+            return self._snap(planned, exposure_s)
+        low_s, high_s = self._camera.exposure_limits_s
+        for _ in range(METERING_TRIES):
+            frame, found = self._snap(planned, min(max(exposure_s, low_s), high_s))
+            span = frame.white_level_dn - float(frame.black_level_dn.mean())
+            level = found.bright_dn / span
+            if METERING_RANGE[0] <= level <= METERING_RANGE[1]:
+                break
+            next_s = exposure_s * (
+                METERING_STEP if level < METERING_RANGE[0] else 1 / METERING_STEP
+            )
+            if not low_s <= next_s <= high_s:
+                break
+            exposure_s = next_s
+        return frame, found
+
+    def _snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
+        camera, applied = self._camera, self._applied
+        if applied.gain != planned.gain:
+            applied.gain = None
+            camera.set_gain(planned.gain)
+            applied.gain = planned.gain
+        if applied.exposure_s != exposure_s:
+            applied.exposure_s = None
+            camera.set_exposure_s(exposure_s)
+            ratio = camera.exposure_s / exposure_s
+            if not 1 / LARGEST_EXPOSURE_RATIO < ratio < LARGEST_EXPOSURE_RATIO:
+                raise FrameRefusedError(
+                    planned.id,
+                    f"would be exposed for {camera.exposure_s:g} s instead of {exposure_s:g} s",
+                    "set the camera to manual exposure",
+                )
+            applied.exposure_s = exposure_s
+        self._rig.about_to_expose(planned.id)
+        frame = camera.snap()
+        return frame, figures(frame)
+
+    def _hand_over(
+        self,
+        planned: PlannedFrame,
+        frame: RawFrame,
+        found: Figures,
+        read_um: Mapping[str, float],
+        spans: dict[str, list[float]],
+        attempts: int,
+    ) -> None:
+        exposure_s = frame.exposure_s if frame.exposure_s is not None else self._camera.exposure_s
+        entry = {
+            "run": self._run,
+            **frame_facts(frame),
+            "exposure_s": exposure_s,
+            "gain": frame.gain if frame.gain is not None else self._camera.gain,
+            "lamp": planned.bench.lamp,
+            "commanded_um": dict(planned.bench.offsets_um),
+            "read_um": dict(read_um),
+            "figures": found.as_dict(),
+            "attempts": attempts,
+            "wall": self._wall(),
+        }
+        if planned.kind == "metering":
+            self._metered.setdefault(planned.id, entry)
+        kept = dict(spans)
+        self._writer.put(
+            partial(
+                self._store, planned, frame.original, frame.sha256, suffix_of(frame), entry, kept
+            )
+        )
+
+    def _store(
+        self,
+        planned: PlannedFrame,
+        data: bytes,
+        sha256: str,
+        suffix: str,
+        entry: Entry,
+        spans: dict[str, list[float]],
+    ) -> None:
+        """Write a frame and its journal line; runs in the writer's thread."""
+        self._watcher.step("write", planned)
+        began_s = self._now_s()
+
+        def facts() -> Entry:
+            return {**entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
+
+        self._session.store(planned, suffix, data, sha256, facts)
+        self._watcher.stored(planned)
+
+    def _discard_damaged(self, ids: set[str]) -> dict[str, str]:
+        """Read files again; returns, by id, what is wrong with those that no longer count."""
+        session = self._session
+        planned = {frame.id for frame in session.frames} & ids
+        entries = [entry for name, entry in session.stored.items() if name in planned]
+        damaged = verify_frames(session, entries)
+        for name, fault in damaged.items():
+            session.discard(name, fault)
+            self._watcher.tell(f"{fault}; it is taken again")
+        return damaged
+
+    def _compare_with_last_good(self) -> None:
+        """Take the last good whiteboard once more; raises AppError when the bench has shifted.
+
+        Without a whiteboard the last shot of the scene serves; without that either, nothing does.
+        """
+        session = self._session
+        by_id = {frame.id: frame for frame in session.frames}
+        latest = [by_id[name] for name in reversed(session.stored) if name in by_id]
+        candidates = [f for kind in ("whiteboard", "shot") for f in latest if f.kind == kind]
+        if not candidates:
+            return
+        planned = candidates[0]
+        entry = session.stored[planned.id]
+        then = decode_frame(session.read(planned.id), entry)
+        shift = Shift(0.0, 0.0, 0.0)
+
+        def compare() -> None:
+            nonlocal shift
+            self._attend(planned)
+            if self._move(planned) and self._plan.settle_s:
+                self._rig.clock.sleep(self._plan.settle_s)
+            now, _ = self._snap(planned, entry["exposure_s"])
+            shift = registered(now, then)
+
+        self._retrying(planned.id, compare)
+        limit_px = self._plan.checks.registration_px
+        facts = {"id": planned.id, **asdict(shift), "limit_px": limit_px}
+        if shift.likeness < LEAST_LIKENESS or shift.length_px > limit_px:
+            self._note("refused", **facts)
+            what = (
+                f"lies {shift.length_px:.2f} px ({shift.x_px:+.2f}, {shift.y_px:+.2f}) off"
+                if shift.likeness >= LEAST_LIKENESS
+                else f"looks different (likeness {shift.likeness:.2f})"
+            )
+            raise AppError(
+                f"the bench is no longer as it was: frame {planned.id}, taken again, {what}; put "
+                "the masks back and check lamp and board, or begin another session with --out"
+            )
+        self._note("registered", **facts)
+
+    def _note(self, kind: str, **facts: Any) -> None:
+        self._writer.put(partial(self._session.note, kind, **facts))
+
+    def _now_s(self) -> float:
+        return round(self._timer() - self._began_s, 6)
+
+    @contextmanager
+    def _span(
+        self, name: str, planned: PlannedFrame, spans: dict[str, list[float]]
+    ) -> Iterator[None]:
+        self._watcher.step(name, planned)
+        began_s = self._now_s()
+        yield
+        spans[name] = [began_s, self._now_s()]
+
+    @contextmanager
+    def _bench_left_safe(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            with uninterrupted():
+                with suppress(DriverError):
+                    self._rig.stage.stop()
+                self._note_stop(error)
+            raise
+        finally:
+            with uninterrupted():
+                if self._applied.lamp != "off":
+                    with suppress(DriverError, AppError):
+                        self._rig.attendant.set_lamp("off")
+                if self._camera is not self._rig.camera:
+                    with suppress(DriverError):
+                        self._camera.close()
+
+    def _note_stop(self, error: BaseException) -> None:
+        """Tell the journal why; where it cannot be written any more that is told already."""
+        if isinstance(error, Exception | KeyboardInterrupt):
+            with suppress(Exception):
+                reason = str(error) or "stopped at once by the user"
+                self._note("stopped", reason=reason, wall=self._wall())
+
+
+def metered_exposure_s(
+    metered: Entry, level: float, light: float, limits_s: tuple[float, float]
+) -> float:
+    """Return the exposure at which `light` times less light reads `level` of white.
+
+    metered: the journal line of the metering frame. Clipped to the camera's limits. Raises
+    `CameraSettingError` where the board was dark.
+    """
+    black_dn = float(np.mean(metered["black_level_dn"]))
+    bright_dn = metered["figures"]["bright_dn"]
+    if bright_dn < 1:
+        raise CameraSettingError("exposure", "cannot be metered, the board is dark: light the lamp")
+    wanted = level * (metered["white_level_dn"] - black_dn) / bright_dn
+    low_s, high_s = limits_s
+    return min(max(metered["exposure_s"] * wanted * light, low_s), high_s)
+
+
+def _metered_before(session: Session) -> dict[str, Entry]:
+    """Return the first journal line of every metering frame.
+
+    The first counts even where its file is damaged by now: frames exposed by it are there, and
+    those still to come must be exposed alike.
+    """
+    ids = {frame.id for frame in session.frames if frame.kind == "metering"}
+    found: dict[str, Entry] = {}
+    for entry in session.journal.entries:
+        if entry["kind"] == "frame" and entry["id"] in ids:
+            found.setdefault(entry["id"], entry)
+    return found
+
+
+def _brackets(frames: tuple[PlannedFrame, ...]) -> list[list[str]]:
+    """Return, for each shot, the frames of its bracket, shortest exposure first."""
+    shots: dict[int, list[PlannedFrame]] = {}
+    for frame in frames:
+        if frame.kind == "shot":
+            shots.setdefault(frame.bench.shot, []).append(frame)
+    found = []
+    for bracket in shots.values():
+        shortest_s = min(frame.exposure_s or 0.0 for frame in bracket)
+        short = [frame.id for frame in bracket if frame.exposure_s == shortest_s]
+        longer = [frame.id for frame in bracket if frame.exposure_s != shortest_s]
+        found.append([short[0], *longer])
+    return found

@@ -1,0 +1,101 @@
+"""How a mask lies before the sensor, from one frame: its rotation, and how far it has moved."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.raw import RawFrame
+
+LONGEST_PX = 2048
+"""Figures are taken from the middle of the frame: a mask is as askew there as elsewhere."""
+BAYER = ("rggb", "bggr", "grbg", "gbrg")
+NOISE_QUANTILE = 0.9
+"""Of the gradients, the strongest tenth: edges of cells, hardly noise."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """rotation_deg: of straight edges against the sensor's rows, -45 to 45, counterclockwise.
+
+    straightness: 0, edges in all directions, to 1, all along one grid: how far to believe the
+    rotation. shift_px: (x, y), of the picture since the reference frame, in sensor pixels, and
+    match, how alike the two are (0 to 1); None without a reference.
+    """
+
+    rotation_deg: float
+    straightness: float
+    shift_px: tuple[float, float] | None = None
+    match: float | None = None
+
+
+def plane_of(frame: RawFrame) -> tuple[NDArray[np.float32], float]:
+    """Return the middle of a frame without its colours (y, x), and its pitch in sensor pixels.
+
+    A Bayer tile becomes one value: its mean shifts as the picture does, while the pixels of one
+    colour lie too far apart to tell where between them an edge is.
+    """
+    cuts = []
+    for length in frame.mosaic.shape:
+        kept = min(length, LONGEST_PX) // 2 * 2
+        start = (length - kept) // 4 * 2
+        cuts.append(slice(start, start + kept))
+    middle = frame.mosaic[tuple(cuts)].astype(np.float32)
+    if frame.cfa not in BAYER:
+        return middle, 1.0
+    rows, columns = middle.shape
+    return middle.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)), 2.0
+
+
+def grid_direction(plane: NDArray[np.float32]) -> tuple[float, float]:
+    """Return rotation in degrees and straightness of the edges in a picture (y, x).
+
+    The mean of (g_x + i g_y)^4 over the strongest gradients g: the fourth power makes the four
+    directions of a square grid one (the structure tensor's idea, for four-fold symmetry).
+    """
+    smooth = cv2.GaussianBlur(plane, (0, 0), 1.0)
+    along_x = cv2.Scharr(smooth, cv2.CV_32F, 1, 0)[1:-1, 1:-1].ravel()
+    along_y = cv2.Scharr(smooth, cv2.CV_32F, 0, 1)[1:-1, 1:-1].ravel()
+    strength = np.hypot(along_x, along_y)
+    if not strength.size or not strength.max() > 0:
+        return 0.0, 0.0
+    strong = strength >= np.quantile(strength, NOISE_QUANTILE)
+    unit = (along_x[strong] + 1j * along_y[strong]) / strength[strong]
+    mean = np.average(unit**4, weights=strength[strong].astype(np.float64) ** 2)
+    # Rows count downwards: a positive angle from x to y looks clockwise.
+    return float(-np.degrees(np.angle(mean)) / 4), float(np.abs(mean))
+
+
+def measure(frame: RawFrame, reference: RawFrame | None = None) -> Alignment:
+    """Return a frame's alignment; a reference of another size or colour phase is none."""
+    plane, pitch = plane_of(frame)
+    rotation_deg, straightness = grid_direction(plane)
+    if reference is None or (reference.mosaic.shape, reference.cfa) != (
+        frame.mosaic.shape,
+        frame.cfa,
+    ):
+        return Alignment(rotation_deg, straightness)
+    (x, y), match = _shift(plane_of(reference)[0], plane)
+    return Alignment(rotation_deg, straightness, (pitch * x, pitch * y), match)
+
+
+def _shift(
+    before: NDArray[np.float32], after: NDArray[np.float32]
+) -> tuple[tuple[float, float], float]:
+    """Return how far a picture moved, and how alike the two then are.
+
+    Phase correlation finds it to a pixel, wherever it is; enhanced correlation (Evangelidis and
+    Psarakis 2008) refines that. Where the latter diverges, the former stands.
+    """
+    hann = cv2.createHanningWindow(after.shape[::-1], cv2.CV_32F)
+    (x, y), match = cv2.phaseCorrelate(before - before.mean(), after - after.mean(), hann)
+    start = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
+    with suppress(cv2.error):
+        match, found = cv2.findTransformECC(before, after, start, cv2.MOTION_TRANSLATION, stop)
+        x, y = found[:, 2]
+    return (float(x), float(y)), max(0.0, float(match))

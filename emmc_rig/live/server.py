@@ -1,0 +1,219 @@
+"""The set-up page over HTTP: a secret in its address, nothing done by GET, nothing of others.
+
+Every path begins with a random token, and the host must be one of this computer's names for
+itself, so that no other page in the browser can reach it (cross-site requests, DNS rebinding).
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from emmc_rig.errors import AppError
+from emmc_rig.live.picture import KINDS, View, encoded, picture
+from emmc_rig.live.watch import Watch
+
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
+PATIENCE_S = 10.0
+LONGEST_BODY = 4096
+PAGE = {
+    "": ("page.html", "text/html"),
+    "page.css": ("page.css", "text/css"),
+    "page.js": ("page.js", "text/javascript"),
+}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' blob: data:; form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
+    ),
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+def new_token() -> str:
+    """Return a secret for an address."""
+    return secrets.token_urlsafe(18)
+
+
+class _RefusedError(Exception):
+    """A request that is not answered as asked: status and one line."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+
+
+def application(
+    watch: Watch, token: str, read_only: bool = False, hosts: tuple[str, ...] = LOCAL_HOSTS
+) -> Starlette:
+    """Return the ASGI application; hosts: names under which it may be asked for ("*": any)."""
+    actions = _actions(watch)
+
+    def guarded(answer: Callable[[Request], Any]) -> Callable[[Request], Any]:
+        async def endpoint(request: Request) -> Response:
+            try:
+                given = request.path_params.get("token", "")
+                if not secrets.compare_digest(given.encode(), token.encode()):
+                    raise _RefusedError(
+                        403, "wrong token: open the address that `emmc-rig live` printed"
+                    )
+                response = await answer(request)
+            except _RefusedError as refusal:
+                response = PlainTextResponse(f"{refusal}\n", refusal.status)
+            except AppError as fault:
+                response = PlainTextResponse(f"{fault}\n", 400)
+            response.headers.update(HEADERS)
+            return response
+
+        return endpoint
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name", "")
+        if name not in PAGE:
+            raise _RefusedError(404, f"no page {name!r}")
+        file, kind = PAGE[name]
+        text = files("emmc_rig.live").joinpath(file).read_text(encoding="utf-8")
+        return Response(text, media_type=kind)
+
+    async def state(request: Request) -> Response:
+        after = _number(request.query_params, "after", 0, int)
+        told = await run_in_threadpool(watch.state, after, PATIENCE_S)
+        return JSONResponse({**told, "read_only": read_only})
+
+    async def shown(request: Request) -> Response:
+        view = _view(request.query_params)
+        frame = watch.frame()
+        if frame is None:
+            raise _RefusedError(503, "no frame yet")
+        data = await run_in_threadpool(lambda: encoded(picture(frame, view)))
+        return Response(data, media_type="image/jpeg")
+
+    async def act(request: Request) -> Response:
+        if request.method != "POST":
+            raise _RefusedError(405, "nothing is done by GET: send POST")
+        if read_only:
+            raise _RefusedError(403, "read-only: start `emmc-rig live` without --read-only to act")
+        origin = request.headers.get("origin")
+        if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
+            raise _RefusedError(403, f"not from this page but from {origin}")
+        name = request.path_params["action"]
+        if name not in actions:
+            raise _RefusedError(404, f"no action {name!r}: {', '.join(actions)}")
+        values = await _body(request)
+        try:
+            await run_in_threadpool(lambda: actions[name](**values))
+        except TypeError as fault:
+            raise _RefusedError(400, f"{name}: these are not its values ({fault})") from fault
+        return JSONResponse({"done": name})
+
+    async def stranger(request: Request) -> Response:
+        raise _RefusedError(403, "wrong token")
+
+    return Starlette(
+        routes=[
+            Route("/{token}/state", guarded(state), methods=["GET"]),
+            Route("/{token}/picture.jpg", guarded(shown), methods=["GET"]),
+            Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
+            Route("/{token}/", guarded(page), methods=["GET"]),
+            Route("/{token}/{name}", guarded(page), methods=["GET"]),
+            Route("/{rest:path}", guarded(stranger), methods=["GET", "POST"]),
+        ],
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
+    )
+
+
+def _actions(watch: Watch) -> Mapping[str, Callable[..., None]]:
+    def exposure(seconds: float) -> None:
+        watch.set_exposure_s(_finite(seconds))
+
+    def gain(factor: float) -> None:
+        watch.set_gain(_finite(factor))
+
+    def jog(axis: str, distance_um: float) -> None:
+        watch.jog(str(axis), _finite(distance_um))
+
+    def go(axis: str, place_um: float) -> None:
+        watch.go(str(axis), _finite(place_um))
+
+    def home() -> None:
+        watch.home()
+
+    def centre() -> None:
+        watch.centre()
+
+    def stop() -> None:
+        watch.stop()
+
+    def look(target: str) -> None:
+        watch.look_at(target)
+
+    def reference(taken: bool) -> None:
+        watch.take_reference(taken)
+
+    known = (exposure, gain, jog, go, home, centre, stop, look, reference)
+    return {action.__name__: action for action in known}
+
+
+def _finite(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise AppError(f"{value!r} is not a number")
+    if not abs(value) < float("inf"):
+        raise AppError("the value is not finite")
+    return float(value)
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    """Return the JSON object sent; a form of another site cannot send this content type."""
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise _RefusedError(415, "send JSON")
+    data = b""
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > LONGEST_BODY:
+            raise _RefusedError(413, f"more than {LONGEST_BODY} bytes")
+    try:
+        values = json.loads(data or b"{}")
+    except ValueError as fault:
+        raise _RefusedError(400, "not JSON") from fault
+    if not isinstance(values, dict):
+        raise _RefusedError(400, "send a JSON object")
+    return values
+
+
+def _number(query: Mapping[str, str], name: str, default: float, kind: type = float) -> Any:
+    try:
+        return kind(query.get(name, default))
+    except (ValueError, OverflowError) as fault:
+        raise _RefusedError(400, f"{name}={query[name]}: a number is wanted") from fault
+
+
+def _view(query: Mapping[str, str]) -> View:
+    kind = query.get("kind", "colour")
+    if kind not in KINDS:
+        raise _RefusedError(400, f"kind={kind}: choose one of {', '.join(KINDS)}")
+    whole = View()
+    return replace(
+        whole,
+        kind=kind,
+        x=_number(query, "x", whole.x),
+        y=_number(query, "y", whole.y),
+        part=_number(query, "part", whole.part),
+        longest_px=_number(query, "px", whole.longest_px, int),
+        marked=query.get("marked", "1") != "0",
+        bright=query.get("bright", "0") != "0",
+    )

@@ -1,0 +1,1 @@
+"""Sessions: folders of captured frames that neither a crash nor a power cut can spoil."""

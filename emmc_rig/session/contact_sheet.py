@@ -1,0 +1,268 @@
+"""A session as one page: what was captured, how long it took, and a small picture of each frame.
+
+The page is one file that opens offline and asks for nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import cv2
+
+from drivers.errors import DriverError
+from emmc_rig import __version__
+from emmc_rig.errors import AppError
+from emmc_rig.frame_view import preview, thinned
+from emmc_rig.output import shown_bytes
+from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.planned import KINDS, PlannedFrame
+from emmc_rig.session.session import Session
+from emmc_rig.session.storage import write_whole
+from emmc_rig.session.timeline import (
+    COLOURS,
+    LEGEND,
+    SHOWN_FRAMES,
+    overlap,
+    run_entries,
+    timeline_svg,
+)
+from emmc_rig.session.verify import counts
+
+LONGEST_PX, JPEG_QUALITY = 176, 80
+MOST_PICTURES = 200
+QUICK_BYTES = 1 << 30
+PICTURE_PIXELS = 1 << 17
+HEADINGS = {
+    "dark": "Darks",
+    "metering": "Metering",
+    "reference": "References: whiteboard, open aperture, no masks",
+    "whiteboard": "Whiteboards: the pinhole before each view",
+    "shot": "Shots of the scene",
+}
+
+
+def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> None:
+    """Write the page, whole or not at all; raises AppError."""
+    page = sheet(session, pictures).encode()
+    try:
+        write_whole(session.disk, path, page)
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+
+
+def quick_pictures(session: Session) -> int:
+    """Return how many pictures can be made without reading more than QUICK_BYTES."""
+    largest = max((entry["bytes"] for entry in session.stored.values()), default=1)
+    return min(MOST_PICTURES, QUICK_BYTES // largest)
+
+
+def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
+    """Return the page; of more frames than `pictures` only some of each kind are shown."""
+    report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
+    template = resources.files("emmc_rig.session").joinpath("sheet.html").read_text("utf-8")
+    style = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
+    assert style is not None
+    sections = [*_frames(session, pictures), ("timeline", "Timeline", _timeline(session))]
+    sections.append(("events", "Events", _events(session)))
+    sections.append(("provenance", "Provenance", _provenance(session)))
+    parts = {
+        "title": _text(session.header["title"]),
+        "generator": _text(f"emmc-rig {__version__}"),
+        "style": re.sub(r"\{\{\w+\}\}", "", style[1]),
+        "about": _text(_about(session)),
+        "cards": "".join(_cards(session)),
+        "navigation": "".join(
+            f'<li><a href="#{key}">{_text(name.partition(":")[0])}</a></li>'
+            for key, name, _ in sections
+        ),
+        "sections": "".join(
+            f'<section id="{key}"><h2>{_text(name)}</h2>{body}</section>'
+            for key, name, body in sections
+        ),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value), quote=True)
+
+
+def _about(session: Session) -> str:
+    camera = next((e["camera"] for e in session.journal.entries if e["kind"] == "run"), None)
+    by = (
+        ""
+        if camera is None
+        else f", by {camera['model'] or 'a camera'} {camera['serial']}".rstrip()
+    )
+    return f"Session {session.folder.name}, begun {session.header['created']}{by}."
+
+
+def _cards(session: Session) -> Iterator[str]:
+    stored, planned = len(session.stored), len(session.frames)
+    tone, state = ("good", "complete") if session.is_complete else ("watch", "not complete")
+    yield _card(
+        tone, "State", state, "every frame verified" if session.is_complete else "resume it"
+    )
+    yield _card("", "Frames", f"{stored} of {planned}", _kinds(session))
+    size = sum(entry["bytes"] for entry in session.stored.values())
+    yield _card("", "Size", shown_bytes(size), "the camera's own bytes")
+    retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
+    yield _card("watch" if retries else "", "Retries", str(retries), f"in {session.runs} run(s)")
+    runs = run_entries(session.journal.entries)
+    if runs:
+        last = overlap(runs[-1])
+        yield _card(
+            "",
+            "Hidden writing",
+            f"{last.hidden_share:.0%}",
+            f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked",
+        )
+
+
+def _card(tone: str, name: str, value: str, note: str) -> str:
+    return (
+        f'<div class="card {tone}"><h3>{_text(name)}</h3><p class="value">{_text(value)}</p>'
+        f'<p class="note">{_text(note)}</p></div>'
+    )
+
+
+def _kinds(session: Session) -> str:
+    return ", ".join(f"{done} {kind}" for kind, (done, _) in counts(session).items())
+
+
+def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
+    """Yield a section for each kind of frame; shots of the scene get the most room."""
+    left = pictures
+    for kind in reversed(KINDS):
+        frames = [frame for frame in session.frames if frame.kind == kind]
+        if not frames:
+            continue
+        shown = _chosen(frames, left)
+        left -= len(shown)
+        more = (
+            ""
+            if len(shown) == len(frames)
+            else f'<p class="quiet">{len(shown)} of {len(frames)} are shown.</p>'
+        )
+        body = "".join(_picture(session, frame) for frame in shown)
+        yield kind, HEADINGS[kind], f'<div class="sheet">{body}</div>{more}'
+
+
+def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
+    """Return at most `most` frames, evenly spread."""
+    if len(frames) <= most:
+        return list(frames)
+    return [frames[i * len(frames) // max(most, 1)] for i in range(most)]
+
+
+def _picture(session: Session, planned: PlannedFrame) -> str:
+    entry = session.stored.get(planned.id)
+    if entry is None:
+        return _absent(planned, "not captured")
+    try:
+        data = _jpeg(session, planned, entry)
+    except (AppError, DriverError) as fault:
+        return _absent(planned, str(fault))
+    figures = entry["figures"]
+    saturated = f", {figures['saturated']:.1%} saturated" if figures["saturated"] >= 0.001 else ""
+    return (
+        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{_text(planned.id)}">'
+        f"<figcaption><strong>{_text(planned.id)}</strong><br>{entry['exposure_s']:.4g} s"
+        f"{saturated}</figcaption></figure>"
+    )
+
+
+def _absent(planned: PlannedFrame, why: str) -> str:
+    return (
+        f'<figure class="absent"><p>{_text(why)}</p>'
+        f"<figcaption>{_text(planned.id)}</figcaption></figure>"
+    )
+
+
+def _jpeg(session: Session, planned: PlannedFrame, entry: Entry) -> str:
+    frame = decode_frame(session.read(planned.id), entry)
+    picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)))
+    scale = LONGEST_PX / max(picture.shape[:2])
+    size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return base64.b64encode(
+        cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    ).decode()
+
+
+def _timeline(session: Session) -> str:
+    runs = run_entries(session.journal.entries)
+    if not runs:
+        return '<p class="lead">No frame was taken yet.</p>'
+    longest = max(runs, key=len)
+    told = overlap(longest)
+    legend = "".join(
+        f'<li><i style="background:{COLOURS[name]}"></i>{_text(meaning)}</li>'
+        for name, meaning in LEGEND.items()
+    )
+    shown = min(SHOWN_FRAMES, len(longest))
+    return (
+        f'<p class="lead">Run {longest[0]["run"]}, its first {shown} of {len(longest)} frames. '
+        f"In all {told.seconds:.1f} s: {told.moving_s:.1f} s moving and settling, "
+        f"{told.exposing_s:.1f} s exposing and downloading, {told.writing_s:.1f} s hashing and "
+        f"writing, of which {told.hidden_share:.0%} while the bench worked.</p>"
+        f'<ul class="legend">{legend}</ul>'
+        f'<div class="scroll">{timeline_svg(longest)}</div>'
+    )
+
+
+def events(session: Session) -> Iterator[tuple[str, str]]:
+    """Yield kind and text of what happened, besides frames that were taken."""
+    for entry in session.journal.entries:
+        told = _told(entry)
+        if told:
+            yield entry["kind"], told
+    if session.journal.unreadable:
+        yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
+
+
+def _events(session: Session) -> str:
+    rows = "".join(
+        f'<tr><th scope="row">{_text(kind)}</th><td>{_text(told)}</td></tr>'
+        for kind, told in events(session)
+    )
+    return f'<table class="narrow"><tbody>{rows}</tbody></table>'
+
+
+def _told(entry: Entry) -> str:
+    """Return what an entry that is no frame says, "" for a frame."""
+    kind = entry["kind"]
+    if kind == "run":
+        return f"{entry['wall']}: {entry['command']}"
+    if kind == "retry":
+        return f"{entry['id']}, try {entry['attempt']}: {entry['fault']}"
+    if kind == "discarded":
+        return f"{entry['id']}: {entry['reason']}"
+    if kind in ("registered", "refused"):
+        return (
+            f"{entry['id']} taken again: shifted by ({entry['x_px']:+.3f}, {entry['y_px']:+.3f}) "
+            f"px, likeness {entry['likeness']:.3f}"
+        )
+    if kind == "stopped":
+        return f"{entry['wall']}: {entry['reason']}"
+    return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
+
+
+def _provenance(session: Session) -> str:
+    rows = {
+        "command": session.header["command"],
+        **session.header["versions"],
+        **{f"SHA-256 of {name}": digest for name, digest in session.created["sha256"].items()},
+    }
+    body = "".join(
+        f'<tr><th scope="row">{_text(key)}</th><td><code>{_text(value)}</code></td></tr>'
+        for key, value in rows.items()
+    )
+    return f'<table class="narrow"><tbody>{body}</tbody></table>'

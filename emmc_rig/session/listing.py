@@ -1,0 +1,61 @@
+"""Sessions at a glance, from the heads of their journal lines: no frame is read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from emmc_rig.errors import AppError
+from emmc_rig.session.journal import heads
+from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete, is_session
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a session says of itself."""
+
+    name: str
+    title: str
+    created: str
+    state: str
+    stored: int
+    planned: int
+    bytes: int
+
+
+def summary(folder: Path) -> Summary:
+    """Return a session's summary; raises AppError when it cannot be read."""
+    try:
+        entries = heads((folder / JOURNAL).read_bytes())
+        header = json.loads((folder / HEADER).read_bytes())
+        title, created = str(header["title"]), str(header["created"])
+    except OSError as fault:
+        raise AppError(f"{folder}: no session, or not readable ({fault.strerror})") from fault
+    except (ValueError, KeyError, TypeError) as fault:
+        raise AppError(f"{folder / HEADER}: is damaged; restore it from a copy") from fault
+    if not entries or entries[0]["kind"] != "created":
+        raise AppError(f"{folder / JOURNAL}: its first line is damaged; restore it from a copy")
+    if found_complete(entries):
+        state = "complete"
+    else:
+        state = "stopped" if entries[-1]["kind"] == "stopped" else "unfinished"
+    stored = count_stored(entries)
+    size = sum(entry["bytes"] for entry in stored.values())
+    name = folder.resolve().name
+    return Summary(name, title, created, state, len(stored), entries[0]["frames"], size)
+
+
+def sessions_in(folder: Path) -> Iterator[Summary]:
+    """Yield the sessions in a folder by name, itself too where it is one; raises AppError."""
+    try:
+        candidates = [folder, *sorted(folder.iterdir())]
+    except OSError as fault:
+        raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
+    for one in candidates:
+        if is_session(one):
+            try:
+                yield summary(one)
+            except AppError as fault:
+                yield Summary(one.resolve().name, str(fault), "", "damaged", 0, 0, 0)

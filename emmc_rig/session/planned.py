@@ -1,0 +1,96 @@
+"""One frame of a session as planned: how the bench must stand, and how to expose it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Kind = Literal["dark", "metering", "reference", "whiteboard", "shot"]
+KINDS: tuple[Kind, ...] = ("dark", "metering", "reference", "whiteboard", "shot")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """How the bench stands for a frame.
+
+    target: what is before the camera. fitting: the first shot with the same masks and filter;
+    masks_in: whether these masks are in the beam. offsets_um: stage axes by name, from where each
+    is centred; an axis not named stays.
+    """
+
+    target: Literal["scene", "whiteboard"]
+    lamp: str
+    shot: int
+    fitting: int
+    masks_in: bool
+    offsets_um: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def set_by_hand(self) -> tuple[str, int, bool]:
+        """What somebody has to do at the bench: the same for frames that need no hand between."""
+        return self.target, self.fitting, self.masks_in
+
+
+@dataclass(frozen=True)
+class PlannedFrame:
+    """One frame; `id` is unique in its session.
+
+    exposure_s: None where it is metered: then `light` times less light than in the metering
+    frame `metered_by` comes to the sensor. view: (v, u) of a whiteboard's pinhole. Frames of one
+    shot that differ in exposure alone are its bracket; `repeat` counts equal ones.
+    """
+
+    id: str
+    kind: Kind
+    bench: Bench
+    exposure_s: float | None
+    gain: float = 1.0
+    repeat: int = 0
+    view: tuple[int, int] | None = None
+    metered_by: str | None = None
+    light: float = 1.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, for JSON."""
+        bench = self.bench
+        return {
+            "id": self.id,
+            "kind": self.kind,
+            "target": bench.target,
+            "lamp": bench.lamp,
+            "shot": bench.shot,
+            "fitting": bench.fitting,
+            "masks_in": bench.masks_in,
+            "offsets_um": dict(bench.offsets_um),
+            "exposure_s": self.exposure_s,
+            "gain": self.gain,
+            "repeat": self.repeat,
+            "view": None if self.view is None else list(self.view),
+            "metered_by": self.metered_by,
+            "light": self.light,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PlannedFrame:
+        """Return the frame that `as_dict` described; raises `KeyError` or `TypeError`."""
+        bench = Bench(
+            data["target"],
+            data["lamp"],
+            data["shot"],
+            data["fitting"],
+            data["masks_in"],
+            data["offsets_um"],
+        )
+        view = data["view"]
+        return cls(
+            data["id"],
+            data["kind"],
+            bench,
+            data["exposure_s"],
+            data["gain"],
+            data["repeat"],
+            None if view is None else (view[0], view[1]),
+            data["metered_by"],
+            data["light"],
+        )

@@ -1,0 +1,174 @@
+"""From a session to what a reconstruction takes: whiteboards, Psi, and normalised readings.
+
+Frames are decoded one at a time and averaged or fused as they come.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.bracket import LinearFrame, fuse
+from calibration.frames import MeanFrame, SensorGain, average
+from calibration.whiteboard import Calibration, Whiteboards, measure_psi
+from drivers.raw import RawFrame
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import validated
+from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class SessionReadings:
+    """What was captured, normalised as Psi is, all (shot, y, x).
+
+    variance: of the readings; infinite where not usable.
+    """
+
+    psi: ImagingMatrix
+    readings: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+
+
+def camera_of(session: Session) -> Camera:
+    """Return the camera as planned."""
+    return validated(Camera, session.camera, str(session.folder), AppError)
+
+
+def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[tuple[RawFrame, float]]:
+    """Yield frames and their exposures in seconds; raises AppError for one that is not good."""
+    for frame in frames:
+        entry = session.stored.get(frame.id)
+        data = session.read(frame.id)
+        assert entry is not None
+        yield decode_frame(data, entry), float(entry["exposure_s"])
+
+
+def whiteboards(session: Session) -> Whiteboards:
+    """Return the averages that `calibration.whiteboard.measure_psi` takes.
+
+    Raises AppError where the plan has no whiteboards, no darks, or they were not all captured.
+    """
+    references: dict[tuple[int, str], list[PlannedFrame]] = defaultdict(list)
+    pinholes: dict[tuple[int, int, int, str], list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        shot, lamp = frame.bench.shot, frame.bench.lamp
+        if frame.kind == "reference":
+            references[shot, lamp].append(frame)
+        elif frame.kind == "whiteboard" and frame.view is not None:
+            pinholes[shot, *frame.view, lamp].append(frame)
+    if not references:
+        raise AppError(f"{session.folder}: its plan has no whiteboards")
+    return Whiteboards(
+        mean_dark(session),
+        {key: _mean(session, frames) for key, frames in references.items()},
+        {key: _mean(session, frames) for key, frames in pinholes.items()},
+    )
+
+
+def mean_dark(session: Session) -> MeanFrame:
+    """Return the average of the dark frames of the shortest exposure; raises AppError."""
+    darks = [frame for frame in session.frames if frame.kind == "dark"]
+    if not darks:
+        raise AppError(f"{session.folder}: its plan has no darks")
+    shortest_s = min(frame.exposure_s or 0.0 for frame in darks)
+    return _mean(session, [frame for frame in darks if frame.exposure_s == shortest_s])
+
+
+def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
+    first = session.stored.get(frames[0].id)
+    if first is None:
+        raise AppError(f"{session.folder}: frame {frames[0].id} was not captured yet; resume it")
+    mosaics = (frame.mosaic for frame, _ in decoded(session, frames))
+    return average(mosaics, first["exposure_s"], first["white_level_dn"], frames[0].id)
+
+
+def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
+    """Return the frames of each shot of the scene: its bracket and repeats."""
+    shots: dict[int, list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        if frame.kind == "shot":
+            shots[frame.bench.shot].append(frame)
+    return dict(sorted(shots.items()))
+
+
+def fused_shot(
+    session: Session, frames: list[PlannedFrame], dark: MeanFrame, gain: SensorGain
+) -> LinearFrame:
+    """Return a shot's bracket as one linear frame, at a gain of 1."""
+    mosaics, exposures_s, white_dn = [], [], 0
+    for frame, exposure_s in decoded(session, frames):
+        mosaics.append(frame.mosaic)
+        exposures_s.append(exposure_s)
+        white_dn = frame.white_level_dn
+    amplified = {frame.gain for frame in frames}
+    if len(amplified) > 1:
+        raise AppError(f"{session.folder}: the gain differs within one shot; plan it alike")
+    factor = amplified.pop()
+    if factor == 1:
+        return fuse(mosaics, exposures_s, dark, gain, white_dn)
+    # The signal above the black grows with the gain, its shot noise per DN too.
+    amplified_gain = SensorGain(
+        gain.gain_dn_per_electron * factor, gain.dark_variance_dn2 * factor**2
+    )
+    black = np.mean(session.stored[frames[0].id]["black_level_dn"])
+    lifted = MeanFrame(
+        (black + factor * (dark.mean_dn - black)).astype(np.float32),
+        dark.variance_dn2 * factor**2,
+        dark.count,
+        dark.exposure_s,
+    )
+    fused = fuse(mosaics, exposures_s, lifted, amplified_gain, white_dn)
+    return LinearFrame(fused.dn_per_s / factor, fused.variance / factor**2, fused.usable)
+
+
+def session_calibration(session: Session) -> Calibration:
+    """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError."""
+    camera = camera_of(session)
+    boards = whiteboards(session)
+    return measure_psi(boards, _designed(camera, boards.dark.mean_dn.shape))
+
+
+def session_readings(session: Session) -> SessionReadings:
+    """Return what a session's shots read, by the Psi of its whiteboards.
+
+    Without whiteboards, by the designed Psi and the camera's own noise model, which is coarser.
+    """
+    dark = mean_dark(session)
+    if any(frame.kind == "whiteboard" for frame in session.frames):
+        calibration = session_calibration(session)
+        psi, white, gain = calibration.psi, calibration.white_dn_per_s, calibration.gain
+    else:
+        camera = camera_of(session)
+        noise = camera.sensor.noise
+        psi = _designed(camera, dark.mean_dn.shape)
+        gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
+        per_second = noise.gain_dn_per_electron * noise.electrons_per_s
+        white = per_second * pixel_light(camera, psi.size)
+    shots = shot_frames(session)
+    readings = np.empty(psi.frames_shape, dtype=np.float32)
+    variance = np.empty(psi.frames_shape, dtype=np.float32)
+    usable = np.empty(psi.frames_shape, dtype=bool)
+    for shot, frames in shots.items():
+        linear = fused_shot(session, frames, dark, gain)
+        seen = white[shot] > 0
+        scale = np.where(seen, white[shot], 1.0)
+        readings[shot] = linear.dn_per_s / scale
+        variance[shot] = linear.variance / scale**2
+        usable[shot] = linear.usable & seen
+    return SessionReadings(psi, readings, variance, usable)
+
+
+def _designed(camera: Camera, shape: tuple[int, ...]) -> ImagingMatrix:
+    k = camera.sensor.binning
+    return build_imaging_matrix(camera, (shape[0] * k, shape[1] * k))

@@ -1,0 +1,314 @@
+"""A session: the frozen plan, one file per frame with the camera's own bytes, and the journal.
+
+    SESSION/
+        session.json   when, by what command and versions; what the session is for
+        plan.yaml      the plan as the user wrote it
+        camera.json    the camera as planned: each shot with its masks and where they stand
+        rig.json       what stage and camera were asked for, and where the axes are centred
+        frames.json    every frame to be taken, in the order of the capture
+        frames/        00012-shot-02.dng: the camera's own bytes, named by place and frame
+        journal.jsonl  what happened
+
+The first journal line holds the SHA-256 of the frozen files. A frame counts when its journal line
+is readable and its file has the bytes that the line tells of; a frame that was taken twice counts
+by its last line. A file without a line is what a crash left between the two: it is taken again,
+under the same name. So nothing is lost that was counted, and nothing is there twice.
+
+No file is ever changed in place, and nothing that the session did not make is touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from emmc_rig.errors import AppError
+from emmc_rig.session.journal import Entry, Journal, encode_line
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.storage import (
+    SYSTEM_DISK,
+    Disk,
+    is_part,
+    locked,
+    make_folder_whole,
+    read_whole,
+    write_whole,
+)
+
+HEADER, PLAN, CAMERA, RIG, ORDER = (
+    "session.json",
+    "plan.yaml",
+    "camera.json",
+    "rig.json",
+    "frames.json",
+)
+FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
+JOURNAL, FRAMES, REPORT = "journal.jsonl", "frames", "report.html"
+KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT}
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """What a session keeps of how it was begun: texts, and the frames to be taken."""
+
+    plan_yaml: str
+    camera: Mapping[str, Any]
+    rig: Mapping[str, Any]
+    frames: tuple[PlannedFrame, ...]
+
+
+class Session:
+    """An open session. One program at a time may add to it: see `storage.locked`."""
+
+    def __init__(self, folder: Path, disk: Disk = SYSTEM_DISK) -> None:
+        """Open a folder; raises AppError with one line when it is no session, or damaged."""
+        self.folder = Path(os.path.abspath(folder))
+        self.disk = disk
+        try:
+            self.journal = Journal(disk, self.folder / JOURNAL)
+        except (FileNotFoundError, NotADirectoryError) as fault:
+            raise AppError(
+                f"{folder}: no session, it holds no {JOURNAL}; `emmc-rig session list` shows them"
+            ) from fault
+        except OSError as fault:
+            raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        frozen: Frozen,
+        about: Mapping[str, Any],
+        disk: Disk = SYSTEM_DISK,
+    ) -> Session:
+        """Make a session: the whole folder is on the disk when this returns, or nothing of it.
+
+        about: what else the header says. Raises AppError where the folder cannot be made.
+        """
+        folder = Path(os.path.abspath(folder))
+        files = {
+            HEADER: _json({"format": FORMAT, **about}),
+            PLAN: frozen.plan_yaml.encode(),
+            CAMERA: _json(frozen.camera),
+            RIG: _json(frozen.rig),
+            ORDER: _json_lines([frame.as_dict() for frame in frozen.frames]),
+        }
+        begun = {
+            "kind": "created",
+            "format": FORMAT,
+            "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
+            "frames": len(frozen.frames),
+        }
+        try:
+            make_folder_whole(
+                disk, folder, {**files, JOURNAL: encode_line(begun), f"{FRAMES}/": b""}
+            )
+        except OSError as fault:
+            raise AppError(f"{folder}: cannot be made ({fault.strerror})") from fault
+        return cls(folder, disk)
+
+    @cached_property
+    def created(self) -> Entry:
+        """The first entry; raises AppError when it is damaged, or of a later program."""
+        first = next((e for e in self.journal.entries if e.get("kind") == "created"), None)
+        if first is None:
+            raise AppError(
+                f"{self.folder / JOURNAL}: its first line is damaged; restore it from a copy"
+            )
+        if first["format"] > FORMAT:
+            raise AppError(f"{self.folder}: made by a later emmc-rig; update this one")
+        return first
+
+    def frozen_file(self, name: str) -> bytes:
+        """Return a frozen file's bytes; raises AppError when it is not what it was."""
+        path = self.folder / name
+        try:
+            data = read_whole(self.disk, path)
+        except OSError as fault:
+            raise AppError(f"{path}: cannot be read ({fault.strerror})") from fault
+        if hashlib.sha256(data).hexdigest() != self.created["sha256"].get(name):
+            raise AppError(
+                f"{path}: was changed after the session began; restore it, or begin another "
+                "session with the changed plan"
+            )
+        return data
+
+    @cached_property
+    def header(self) -> dict[str, Any]:
+        """What session.json says."""
+        return json.loads(self.frozen_file(HEADER))
+
+    @cached_property
+    def plan_yaml(self) -> str:
+        """The plan as the user wrote it."""
+        return self.frozen_file(PLAN).decode()
+
+    @cached_property
+    def camera(self) -> dict[str, Any]:
+        """The camera as planned, plain data of an `emmc_rig.model.camera.Camera`."""
+        return json.loads(self.frozen_file(CAMERA))
+
+    @cached_property
+    def rig(self) -> dict[str, Any]:
+        """What devices were asked for."""
+        return json.loads(self.frozen_file(RIG))
+
+    @cached_property
+    def frames(self) -> tuple[PlannedFrame, ...]:
+        """Every frame to be taken, in the order of the capture."""
+        return tuple(PlannedFrame.from_dict(one) for one in json.loads(self.frozen_file(ORDER)))
+
+    @cached_property
+    def stored(self) -> dict[str, Entry]:
+        """The journal line of every frame that counts, by its id, kept up to date."""
+        return count_stored(self.journal.entries)
+
+    @property
+    def runs(self) -> int:
+        """How often a capture was started on it."""
+        return sum(entry["kind"] == "run" for entry in self.journal.entries)
+
+    def missing(self) -> tuple[PlannedFrame, ...]:
+        """Return the frames that are still to be taken, in order."""
+        return tuple(frame for frame in self.frames if frame.id not in self.stored)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every frame was found good after the last one was stored; see `verify`."""
+        return found_complete(self.journal.entries)
+
+    def path_of(self, entry: Entry) -> Path:
+        """Return where the file of a frame's journal line lies."""
+        return self.folder / FRAMES / entry["file"]
+
+    def read(self, frame_id: str) -> bytes:
+        """Return the bytes of a stored frame.
+
+        Raises AppError when it is missing, or not what the journal tells of.
+        """
+        entry = self.stored.get(frame_id)
+        if entry is None:
+            raise AppError(f"{self.folder}: frame {frame_id} was not captured yet; resume it")
+        path = self.path_of(entry)
+        try:
+            data = read_whole(self.disk, path)
+        except OSError as fault:
+            raise AppError(f"{path}: cannot be read ({fault.strerror}); resume it") from fault
+        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+            raise AppError(f"{path}: is damaged, its SHA-256 is not the journal's; resume it")
+        return data
+
+    def store(
+        self,
+        frame: PlannedFrame,
+        suffix: str,
+        data: bytes,
+        sha256: str,
+        facts: Callable[[], Mapping[str, Any]],
+    ) -> None:
+        """Keep a frame: its bytes, then its line, are on the disk when this returns.
+
+        sha256: the digest taken when the bytes came from the camera. facts: what the line says
+        besides file, size and digest, asked for when the file is on the disk. Raises `OSError`;
+        AppError when the bytes are no longer those that came.
+        """
+        name = f"{self._places[frame.id]:05d}-{frame.id}{suffix}"
+        write_whole(self.disk, self.folder / FRAMES / name, data)
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise AppError(
+                f"frame {frame.id}: its bytes changed in this computer's memory on the way to the "
+                "disk; test the memory before going on"
+            )
+        self.note("frame", id=frame.id, file=name, bytes=len(data), sha256=sha256, **facts())
+
+    def note(self, kind: str, **facts: Any) -> None:
+        """Add a line to the journal; raises `OSError`."""
+        entry = {"kind": kind, **facts}
+        self.journal.append(entry)
+        _count(self.stored, entry)
+
+    def discard(self, frame_id: str, reason: str) -> None:
+        """Count a frame as not taken; its file stays until it is taken again."""
+        self.note("discarded", id=frame_id, reason=reason)
+
+    def strangers(self) -> tuple[list[str], list[str]]:
+        """Return (leftovers of a crash, files of somebody else), relative to the folder."""
+        ours = {entry["file"] for entry in self.stored.values()}
+        planned = {f"{place:05d}-{name}" for name, place in self._places.items()}
+        leftovers, foreign = [], []
+        for name in self.disk.sizes(self.folder):
+            if is_part(name):
+                leftovers.append(name)
+            elif name not in KNOWN:
+                foreign.append(name)
+        for name in self.disk.sizes(self.folder / FRAMES):
+            if is_part(name) or (name not in ours and Path(name).stem in planned):
+                leftovers.append(f"{FRAMES}/{name}")
+            elif name not in ours:
+                foreign.append(f"{FRAMES}/{name}")
+        return sorted(leftovers), sorted(foreign)
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {frame.id: place for place, frame in enumerate(self.frames)}
+
+
+def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
+    """Return the journal line of every frame that counts, by its id, oldest first."""
+    found: dict[str, Entry] = {}
+    for entry in entries:
+        _count(found, entry)
+    return found
+
+
+def _count(found: dict[str, Entry], entry: Entry) -> None:
+    if entry["kind"] == "frame":
+        found[entry["id"]] = entry
+    elif entry["kind"] == "discarded":
+        found.pop(entry["id"], None)
+
+
+def found_complete(entries: Sequence[Entry]) -> bool:
+    """Return whether every frame was found good after the last one was stored."""
+    for entry in reversed(entries):
+        if entry["kind"] in ("complete", "frame", "discarded"):
+            return entry["kind"] == "complete"
+    return False
+
+
+@contextmanager
+def only_program(session: Session) -> Iterator[None]:
+    """Hold the session; raises AppError where another program holds it."""
+    with locked(session.folder / JOURNAL) as held:
+        if not held:
+            raise AppError(f"{session.folder}: another program works on it; wait, or stop that one")
+        yield
+
+
+def is_session(folder: Path) -> bool:
+    """Return whether a folder is a session."""
+    return (folder / JOURNAL).is_file() and (folder / HEADER).is_file()
+
+
+def wall_time() -> str:
+    """Return the time of day for people; nothing is reckoned with it."""
+    return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
+
+
+def _json(data: Mapping[str, Any]) -> bytes:
+    return (json.dumps(data, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _json_lines(items: Iterable[Mapping[str, Any]]) -> bytes:
+    """Return a JSON list, one item a line."""
+    lines = ",\n".join(json.dumps(item, separators=(",", ":"), allow_nan=False) for item in items)
+    return f"[\n{lines}\n]\n".encode()

@@ -1,0 +1,151 @@
+"""When the bench worked and when the disk did: from the journal's spans to figures and a chart."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from emmc_rig.session.journal import Entry
+
+BENCH = ("attend", "move", "settle", "expose", "read back", "check")
+COLOURS = {
+    "attend": "#8a94a3",
+    "move": "#1d5a9e",
+    "settle": "#7fb0e6",
+    "expose": "#c4720b",
+    "read back": "#8a94a3",
+    "check": "#8a94a3",
+    "hand over": "#b42318",
+    "write": "#18794e",
+}
+LEGEND = {
+    "move": "move",
+    "settle": "settle",
+    "expose": "expose and download",
+    "check": "attend, read back, check",
+    "hand over": "wait for the disk",
+    "write": "hash, write, sync",
+}
+SHOWN_FRAMES = 24
+WIDTH_PX, LANE_PX, LEFT_PX, AXIS_PX = 1380, 26, 56, 22
+
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Of one run: seconds in all, and spent by the disk; of these, while the bench worked too."""
+
+    seconds: float
+    moving_s: float
+    exposing_s: float
+    writing_s: float
+    hidden_s: float
+
+    @property
+    def hidden_share(self) -> float:
+        """Share of the writing that took no time of its own."""
+        return self.hidden_s / self.writing_s if self.writing_s else 0.0
+
+
+def run_entries(entries: Iterable[Entry]) -> list[list[Entry]]:
+    """Return the frames' journal lines, run by run, those without any left out."""
+    runs: dict[int, list[Entry]] = {}
+    for entry in entries:
+        if entry["kind"] == "frame" and "spans_s" in entry:
+            runs.setdefault(entry["run"], []).append(entry)
+    return list(runs.values())
+
+
+def overlap(entries: Sequence[Entry]) -> Overlap:
+    """Return how much of the writing of one run was hidden behind the bench's work."""
+    bench = sorted(
+        (span[0], span[1])
+        for entry in entries
+        for name, span in entry["spans_s"].items()
+        if name in BENCH
+    )
+    writes = sorted((span[0], span[1]) for span in (e["spans_s"]["write"] for e in entries))
+    ends = [end for _, end in (*bench, *writes)]
+    starts = [start for start, _ in (*bench, *writes)]
+
+    def spent(name: str) -> float:
+        spans = [entry["spans_s"][name] for entry in entries if name in entry["spans_s"]]
+        return sum(end - start for start, end in spans)
+
+    return Overlap(
+        max(ends, default=0.0) - min(starts, default=0.0),
+        spent("move") + spent("settle"),
+        spent("expose"),
+        spent("write"),
+        _common(bench, writes),
+    )
+
+
+def _common(ones: Sequence[Span], others: Sequence[Span]) -> float:
+    """Return how long both of two sorted lists of spans last, neither overlapping itself."""
+    total, i, j = 0.0, 0, 0
+    while i < len(ones) and j < len(others):
+        start, end = max(ones[i][0], others[j][0]), min(ones[i][1], others[j][1])
+        total += max(0.0, end - start)
+        if ones[i][1] < others[j][1]:
+            i += 1
+        else:
+            j += 1
+    return total
+
+
+def timeline_svg(entries: Sequence[Entry]) -> str:
+    """Return a chart of the first frames of a run as SVG: the bench above, the disk below."""
+    shown = entries[:SHOWN_FRAMES]
+    spans = [
+        (name, span[0], span[1], entry["id"])
+        for entry in shown
+        for name, span in entry["spans_s"].items()
+        if name in COLOURS
+    ]
+    if not spans:
+        return ""
+    start_s = min(span[1] for span in spans)
+    length_s = max(max(span[2] for span in spans) - start_s, 1e-9)
+    scale = (WIDTH_PX - LEFT_PX - 10) / length_s
+    height = 2 * LANE_PX + AXIS_PX + 14
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH_PX} {height}" width="{WIDTH_PX}" height="{height}" role="img" '
+        'aria-label="What bench and disk did over time" font-size="12" font-family="inherit">'
+    ]
+    for lane, name in enumerate(("bench", "disk")):
+        y = 4 + lane * (LANE_PX + 4)
+        parts.append(f'<text x="0" y="{y + LANE_PX / 2 + 4}" fill="#5b6776">{name}</text>')
+        parts.append(
+            f'<rect x="{LEFT_PX}" y="{y}" width="{WIDTH_PX - LEFT_PX - 10}" height="{LANE_PX}" '
+            'fill="#f3f5f8"/>'
+        )
+    for name, begin_s, end_s, frame_id in spans:
+        y = 4 + (name == "write") * (LANE_PX + 4)
+        x = LEFT_PX + (begin_s - start_s) * scale
+        width = max(0.6, (end_s - begin_s) * scale)
+        told = html.escape(
+            f"{frame_id}: {LEGEND.get(name, name)}, {(end_s - begin_s) * 1e3:.1f} ms"
+        )
+        parts.append(
+            f'<rect x="{x:.2f}" y="{y}" width="{width:.2f}" height="{LANE_PX}" '
+            f'fill="{COLOURS[name]}"><title>{told}</title></rect>'
+        )
+    step_s = _round_step(length_s / 8)
+    ticks = int(length_s / step_s) + 1
+    for tick in range(ticks):
+        x = LEFT_PX + tick * step_s * scale
+        parts.append(
+            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="4" y2="{height - AXIS_PX}" stroke="#0002"/>'
+            f'<text x="{x:.1f}" y="{height - 6}" fill="#5b6776" text-anchor="middle">'
+            f"{tick * step_s:g} s</text>"
+        )
+    return "".join((*parts, "</svg>"))
+
+
+def _round_step(step: float) -> float:
+    """Return the next larger of 1, 2, 5, 10, ... times a power of ten."""
+    power = 10.0 ** int(f"{step:e}".partition("e")[2])
+    return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= step)

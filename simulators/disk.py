@@ -1,0 +1,255 @@
+"""A disk in memory that can lose its power, fill up or fail between any two operations.
+
+What a real disk promises is kept, and nothing more: bytes are there after a power cut once their
+file was synced, names once their folder was. What was not synced may be there, in part, or not:
+`after_power_cut` draws one such outcome. Names of one folder survive in the order in which they
+changed, as on a journaling file system; the bytes of a file that grew may read as zeros.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+
+class PowerCutError(BaseException):
+    """The power went; no program can catch that, so this is no `Exception`."""
+
+
+@dataclass(eq=False)
+class _File:
+    """Bytes as programs see them, and as they are on the platter."""
+
+    data: bytearray = field(default_factory=bytearray)
+    synced: bytes = b""
+
+
+@dataclass(eq=False)
+class _Folder:
+    """Names as programs see them, those on the platter, and the changes between, in order."""
+
+    entries: dict[str, _File | _Folder] = field(default_factory=dict)
+    synced: dict[str, _File | _Folder] = field(default_factory=dict)
+    pending: list[dict[str, _File | _Folder | None]] = field(default_factory=list)
+
+    def change(self, names: dict[str, _File | _Folder | None]) -> None:
+        """Give names to something, or take them away (None), all at once."""
+        _apply(self.entries, names)
+        self.pending.append(names)
+
+    def sync(self) -> None:
+        """Put the names on the platter."""
+        self.synced = dict(self.entries)
+        self.pending.clear()
+
+
+def _apply(entries: dict[str, _File | _Folder], names: dict[str, _File | _Folder | None]) -> None:
+    for name, node in names.items():
+        if node is None:
+            entries.pop(name, None)
+        else:
+            entries[name] = node
+
+
+class SimulatedDisk:
+    """An `emmc_rig.session.storage.Disk`.
+
+    before: called with number and name of every operation that writes, before it; what it raises
+    is what the operation raises. capacity_bytes: more than that gives `ENOSPC`, half written.
+    """
+
+    def __init__(
+        self,
+        before: Callable[[int, str], None] = lambda number, name: None,
+        capacity_bytes: float = float("inf"),
+    ) -> None:
+        self.before = before
+        self.capacity_bytes = capacity_bytes
+        self.operations = 0
+        self._root = _Folder()
+
+    def cut_power_at(self, number: int) -> None:
+        """Lose the power at that operation; it and all later ones raise `PowerCutError`."""
+
+        def before(now: int, name: str) -> None:
+            if now >= number:
+                raise PowerCutError
+
+        self.before = before
+
+    def after_power_cut(self, rng: np.random.Generator) -> SimulatedDisk:
+        """Return a disk with one of the contents that this one may have after a power cut now."""
+        survived = SimulatedDisk(capacity_bytes=self.capacity_bytes)
+        survived._root = _survivor(self._root, rng)
+        return survived
+
+    def create(self, path: Path) -> _Writer:
+        """Begin an empty file; one of that name is emptied."""
+        self._operate("create")
+        folder = self._folder(path.parent)
+        there = folder.entries.get(path.name)
+        if isinstance(there, _Folder):
+            raise _fault(errno.EISDIR)
+        if isinstance(there, _File):
+            del there.data[:]
+            return _Writer(self, there)
+        file = _File()
+        folder.change({path.name: file})
+        return _Writer(self, file)
+
+    def append(self, path: Path) -> _Writer:
+        """Begin to write at the end of a file, made where missing."""
+        there = self._folder(path.parent).entries.get(path.name)
+        return _Writer(self, there) if isinstance(there, _File) else self.create(path)
+
+    def reader(self, path: Path) -> BinaryIO:
+        """Open a file for reading."""
+        node = self._folder(path.parent).entries.get(path.name)
+        if not isinstance(node, _File):
+            raise _fault(errno.ENOENT if node is None else errno.EISDIR)
+        return io.BytesIO(bytes(node.data))
+
+    def replace(self, source: Path, target: Path) -> None:
+        """Rename within a folder, replacing at once what has the name."""
+        self._operate("replace")
+        if source.parent != target.parent:
+            raise ValueError("only names of one folder are replaced at once")
+        folder = self._folder(source.parent)
+        if source.name not in folder.entries:
+            raise _fault(errno.ENOENT)
+        if isinstance(there := folder.entries.get(target.name), _Folder) and there.entries:
+            raise _fault(errno.ENOTEMPTY)
+        folder.change({source.name: None, target.name: folder.entries[source.name]})
+
+    def remove(self, path: Path) -> None:
+        """Remove a file."""
+        self._operate("remove")
+        folder = self._folder(path.parent)
+        if path.name not in folder.entries:
+            raise _fault(errno.ENOENT)
+        folder.change({path.name: None})
+
+    def remove_folder(self, path: Path) -> None:
+        """Remove a folder and what is in it."""
+        self.remove(path)
+
+    def make_folder(self, path: Path) -> None:
+        """Make a folder and those above it."""
+        above = self._root
+        for name in path.parts[1:]:
+            node = above.entries.get(name)
+            if node is None:
+                self._operate("make folder")
+                node = _Folder()
+                above.change({name: node})
+            if not isinstance(node, _Folder):
+                raise _fault(errno.ENOTDIR)
+            above = node
+
+    def sync_folder(self, path: Path) -> None:
+        """Put the names in a folder on the platter."""
+        self._operate("sync folder")
+        self._folder(path).sync()
+
+    def sizes(self, folder: Path) -> dict[str, int]:
+        """Return the size of everything in a folder by name, -1 for a folder."""
+        return {
+            name: len(node.data) if isinstance(node, _File) else -1
+            for name, node in self._folder(folder).entries.items()
+        }
+
+    def free_bytes(self, folder: Path) -> int:
+        """Return how much more can be written."""
+        return int(min(self.capacity_bytes - self.used_bytes, 1 << 60))
+
+    @property
+    def used_bytes(self) -> int:
+        """How much is on it."""
+        return _bytes_in(self._root)
+
+    def _operate(self, name: str) -> None:
+        self.operations += 1
+        self.before(self.operations, name)
+
+    def _folder(self, path: Path) -> _Folder:
+        node: _File | _Folder | None = self._root
+        for name in path.parts[1:]:
+            node = node.entries.get(name) if isinstance(node, _Folder) else None
+            if node is None:
+                raise _fault(errno.ENOENT)
+        if not isinstance(node, _Folder):
+            raise _fault(errno.ENOTDIR)
+        return node
+
+
+class _Writer:
+    """A file open for writing."""
+
+    def __init__(self, disk: SimulatedDisk, file: _File) -> None:
+        self._disk, self._file = disk, file
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Write at the end; half of it when the power goes meanwhile, or the disk is full."""
+        half = len(data) // 2
+        full = self._disk.free_bytes(Path("/")) < len(data)
+        try:
+            self._disk._operate("write")
+            if full:
+                raise _fault(errno.ENOSPC)
+        except BaseException:
+            self._file.data += data[:half]
+            raise
+        self._file.data += data
+
+    def sync(self) -> None:
+        """Put the bytes on the platter."""
+        self._disk._operate("sync")
+        self._file.synced = bytes(self._file.data)
+
+    def close(self) -> None:
+        """Let go of the file; that syncs nothing."""
+
+
+def _survivor(node: _Folder, rng: np.random.Generator) -> _Folder:
+    names = dict(node.synced)
+    for change in node.pending[: rng.integers(len(node.pending) + 1)]:
+        _apply(names, change)
+    kept: dict[str, _File | _Folder] = {}
+    for name, child in names.items():
+        if isinstance(child, _Folder):
+            kept[name] = _survivor(child, rng)
+        else:
+            data = _surviving_bytes(child, rng)
+            kept[name] = _File(bytearray(data), data)
+    return _Folder(kept, dict(kept))
+
+
+def _surviving_bytes(file: _File, rng: np.random.Generator) -> bytes:
+    """Return what may be read of a file: the synced bytes, and any part of what was not."""
+    now, synced = bytes(file.data), file.synced
+    if now == synced:
+        return synced
+    if not now.startswith(synced):
+        # It was emptied and written again, without a sync: either, or nothing.
+        return (synced, now[: rng.integers(len(now) + 1)], b"")[rng.integers(3)]
+    kept = now[: rng.integers(len(synced), len(now) + 1)]
+    zeros = bytes(len(now) - len(kept))
+    return (synced, kept, kept + zeros, now)[rng.integers(4)]
+
+
+def _bytes_in(folder: _Folder) -> int:
+    return sum(
+        len(node.data) if isinstance(node, _File) else _bytes_in(node)
+        for node in folder.entries.values()
+    )
+
+
+def _fault(number: int) -> OSError:
+    return OSError(number, os.strerror(number))

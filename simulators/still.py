@@ -1,0 +1,115 @@
+"""Devices without physics: a stage that is where it is sent, a camera that gives prepared frames.
+
+For what is measured or tested around devices: their own time is none, or exactly as asked for.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+
+from drivers.camera import CameraIdentity, Limits
+from drivers.clock import Clock
+from drivers.errors import LimitExceededError, NotHomedError
+from drivers.raw import RawFrame
+
+TRAVEL_UM = (0.0, 100_000.0)
+
+
+class StillStage:
+    """A `drivers.stage.Stage` whose moves take `move_s` on its clock, however far they go."""
+
+    def __init__(self, axes: Iterable[str], clock: Clock, move_s: float = 0.0) -> None:
+        self.axes = tuple(axes)
+        self.moves = 0
+        self.stops = 0
+        self._at_um: dict[str, float] = {}
+        self._clock, self._move_s = clock, move_s
+
+    def home(self, axes: Iterable[str] | None = None) -> None:
+        """Stand at zero."""
+        self._at_um |= dict.fromkeys(self.axes if axes is None else axes, 0.0)
+
+    def is_homed(self, axis: str) -> bool:
+        """Whether the axis was homed."""
+        return axis in self._at_um
+
+    def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
+        """Be there; raises `LimitExceededError` or `NotHomedError`."""
+        for axis, target_um in targets_um.items():
+            if axis not in self._at_um:
+                raise NotHomedError(axis)
+            if not TRAVEL_UM[0] <= target_um <= TRAVEL_UM[1]:
+                raise LimitExceededError(axis, target_um, TRAVEL_UM)
+        if self._move_s:
+            self._clock.sleep(self._move_s)
+        self._at_um |= targets_um
+        self.moves += 1
+        return dict(targets_um)
+
+    def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
+        """Be that much further."""
+        return self.move_to_um({a: self.position_um(a) + step for a, step in steps_um.items()})
+
+    def position_um(self, axis: str) -> float:
+        """Where the axis is; raises `NotHomedError`."""
+        if axis not in self._at_um:
+            raise NotHomedError(axis)
+        return self._at_um[axis]
+
+    def limits_um(self, axis: str) -> tuple[float, float]:
+        """The travel."""
+        return TRAVEL_UM
+
+    def speed_um_s(self, axis: str) -> float:
+        """A speed to reckon with."""
+        return 1000.0
+
+    def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
+        """Take no notice."""
+
+    def stop(self, axes: Iterable[str] | None = None) -> None:
+        """Count it."""
+        self.stops += 1
+
+    def wait_until_settled(self, axes: Iterable[str] | None = None) -> None:
+        """Stand already."""
+
+    def reconnect(self, wait_s: float = 10.0) -> None:
+        """Forget where the axes are."""
+        self._at_um.clear()
+
+    def close(self) -> None:
+        """Keep nothing open."""
+
+
+class PreparedCamera:
+    """A `drivers.camera.Camera` that takes its frames from `give(exposure_s)`."""
+
+    exposure_limits_s: Limits = (1e-6, 3600.0)
+    gain_limits: Limits = (1.0, 1.0)
+    gain = 1.0
+
+    def __init__(
+        self,
+        give: Callable[[float], RawFrame],
+        shape: tuple[int, int],
+        cfa: str,
+        identity: CameraIdentity | None = None,
+    ) -> None:
+        self.identity = identity or CameraIdentity("EMMC", "prepared frames", "1")
+        self.shape, self.cfa = shape, cfa
+        self.exposure_s = 0.01
+        self._give = give
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Take any exposure."""
+        self.exposure_s = exposure_s
+
+    def set_gain(self, gain: float) -> None:
+        """Take no notice."""
+
+    def snap(self) -> RawFrame:
+        """Return the next frame."""
+        return replace(self._give(self.exposure_s), exposure_s=self.exposure_s, gain=self.gain)
+
+    def close(self) -> None:
+        """Keep nothing open."""

@@ -1,0 +1,112 @@
+"""A rig without time or light: what crash tests run by the hundred.
+
+Every frame is made from its own name, so that two runs of one plan differ in nothing.
+"""
+
+import hashlib
+from functools import cache
+from typing import Any
+
+import numpy as np
+import yaml
+
+from drivers.camera import CameraIdentity, RawFileCamera
+from emmc_rig.capture.command import Wish, new_session, planned_frames
+from emmc_rig.capture.plan import Plan, planned_camera
+from emmc_rig.hardware import Rig
+from simulators.clock import ManualClock
+from simulators.dng import encode_dng
+from simulators.still import StillStage
+
+SIZE = (24, 32)
+BLACK, WHITE = 100, 4000
+AXES = ("mask_x", "mask_y", "aperture_x", "aperture_y")
+ZERO_UM: dict[str, float] = dict.fromkeys(AXES, 20_000.0)
+PLAN_YAML = """
+camera: rgbw-bayer-3shots
+shots:
+  - exposure_s: [0.01, 0.04]
+  - mask_um: [48, 24]
+whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
+darks: {repeats: 2}
+settle_s: 0.1
+"""
+
+
+class NamedFrames:
+    """A camera's wire that gives each announced frame bytes of its own."""
+
+    def __init__(self, size=SIZE):
+        self.size, self.name, self.count = size, "", 0
+
+    def announce(self, name):
+        self.name = name
+
+    def capture(self, exposure_s):
+        self.count += 1
+        return frame_bytes(self.name, exposure_s, self.size)
+
+
+def frame_bytes(name, exposure_s, size=SIZE):
+    digest = hashlib.sha256(name.encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    top = BLACK + 20 if name.startswith("dark") else WHITE - 400
+    return encode_dng(rng.integers(BLACK, top, size, np.uint16), "rggb", BLACK, WHITE, exposure_s)
+
+
+class QuietAttendant:
+    """Does what it is told, and keeps it."""
+
+    def __init__(self):
+        self.told = []
+
+    def set_lamp(self, colour):
+        self.told.append(("lamp", colour))
+
+    def place(self, target):
+        self.told.append(("place", target))
+
+    def fit_masks(self, shot, fitted=True):
+        self.told.append(("masks", shot, fitted))
+
+    @property
+    def lamp(self):
+        return [told[1] for told in self.told if told[0] == "lamp"][-1]
+
+
+def still_rig(size=SIZE) -> Any:
+    """Return a rig on which nothing takes time."""
+    wire = NamedFrames(size)
+    clock = ManualClock()
+
+    def opened():
+        return RawFileCamera(wire, size, "rggb", identity=CameraIdentity("EMMC", "paper", "7"))
+
+    return Rig(
+        StillStage(AXES, clock),
+        opened(),
+        QuietAttendant(),
+        ZERO_UM,
+        40_000.0,
+        clock,
+        opened,
+        wire.announce,
+    )
+
+
+@cache
+def plan_and_camera(text=PLAN_YAML):
+    plan = Plan.model_validate(yaml.safe_load(text))
+    return plan, planned_camera(plan)
+
+
+def wish_for(folder, text=PLAN_YAML):
+    """Return what a plan asks for, without a plan file."""
+    plan, camera = plan_and_camera(text)
+    return Wish(folder / "plan.yaml", plan, text, camera, folder / "s", {"kind": "x"})
+
+
+def begun(folder, disk, rig, text=PLAN_YAML):
+    """Return a new session on a disk, and its plan."""
+    wish = wish_for(folder, text=text)
+    return new_session(wish, planned_frames(wish, rig), disk), wish.plan

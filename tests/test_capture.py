@@ -1,0 +1,558 @@
+"""The sequencer: what it takes, retries, refuses, and how it leaves the bench."""
+
+import os
+import signal
+import threading
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from capture_rigs import begun, plan_and_camera, still_rig, wish_for
+
+from drivers.errors import DriverError
+from drivers.raw import decode_raw
+from emmc_rig.capture.checks import check, figures, registered
+from emmc_rig.capture.command import (
+    begun_session,
+    disk_faults_told,
+    estimated,
+    new_session,
+    planned_frames,
+    refuse_other_camera,
+    refuse_small_disk,
+)
+from emmc_rig.capture.control import Control, interruptible
+from emmc_rig.capture.plan import Checks, Retries
+from emmc_rig.capture.retries import GaveUpError, Mending, mending
+from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import simulated_rig
+from emmc_rig.scene import fine_scene
+from emmc_rig.session.planned import Bench, PlannedFrame
+from emmc_rig.session.session import Session
+from emmc_rig.session.verify import verify
+from simulators.clock import ManualClock
+from simulators.disk import SimulatedDisk
+from simulators.dng import encode_dng
+
+ROOT = Path("/disk")
+SIZE = (24, 32)
+SMALL = """
+camera: rgbw-bayer-3shots
+shots: [{}, {}]
+whiteboards: {views: [[2, 2], [0, 4]], repeats: 1, references: 2}
+darks: {repeats: 2}
+"""
+ONE_SHOT = """
+camera: rgbw-bayer-1shot
+shots: [{exposure_s: 0.05, repeats: 3}]
+whiteboards: null
+darks: null
+"""
+
+
+class HelpfulClock(ManualClock):
+    """Somebody at the bench plugs the stage in again while the program waits."""
+
+    chain: Any = None
+
+    def sleep(self, duration_s):
+        super().sleep(duration_s)
+        if self.chain is not None and self.chain.unplugged:
+            self.chain.replug()
+
+
+@cache
+def scene_samples():
+    return fine_scene("near-planar", 1, 1, size=SIZE).samples
+
+
+def bench_rig(text=SMALL, seed=0):
+    """Return the simulated rig before a scene: real drivers on simulated wires."""
+    camera = plan_and_camera(text)[1]
+    clock = HelpfulClock()
+    rig, bench = simulated_rig(camera, scene_samples(), SIZE, seed, clock)
+    clock.chain = rig.chain
+    return rig, bench
+
+
+def started(rig, text=SMALL, disk: Any = None, **changes):
+    disk = SimulatedDisk() if disk is None else disk
+    session, plan = begun(ROOT, disk, rig, text)
+    return session, plan.model_copy(update=changes)
+
+
+def contents(session):
+    return {frame.id: session.read(frame.id) for frame in session.frames}
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    outcome = Sequencer(session, plan, rig).run()
+    return session, outcome
+
+
+def test_a_session_holds_every_frame_that_the_plan_asks_for(undisturbed):
+    session, outcome = undisturbed
+    assert outcome.complete
+    assert outcome.taken == len(session.frames) == 2 + 2 * 3 + 2 * 2 + 2
+    assert verify(session).is_complete
+
+
+def test_the_journal_tells_where_everything_stood_and_by_what_it_was_taken(undisturbed):
+    session, _ = undisturbed
+    entry = session.stored["board-s1-v0-u4-white-r0"]
+    assert entry["commanded_um"]["mask_x"] == 270
+    assert entry["read_um"]["aperture_x"] == pytest.approx(2 * 5000, abs=0.5)
+    assert entry["lamp"] == "white"
+    assert entry["shape"] == list(SIZE)
+    assert set(entry["spans_s"]) >= {"attend", "move", "expose", "read back", "check", "write"}
+    run = next(e for e in session.journal.entries if e["kind"] == "run")
+    assert run["camera"]["serial"] == "S1"
+    assert run["stage"]["mask_x"]["zero_um"] == 12_700
+    assert "numpy" in run["versions"]
+
+
+def test_references_are_exposed_where_metering_aims(undisturbed):
+    session, _ = undisturbed
+    for frame in session.frames:
+        if frame.kind in ("reference", "whiteboard"):
+            entry = session.stored[frame.id]
+            level = entry["figures"]["bright_dn"] / (65_535 - 256)
+            assert 0.55 < level < 0.8
+            assert entry["figures"]["saturated"] == 0
+
+
+def test_the_lamp_is_off_when_a_capture_ends(undisturbed):
+    rig = still_rig()
+    session, plan = started(rig)
+    Sequencer(session, plan, rig).run()
+    assert rig.attendant.lamp == "off"
+
+
+def stopped_after(count, text=SMALL):
+    """Return a session that was stopped by Ctrl-C once, and what a resume needs."""
+    rig, bench = bench_rig(text)
+    session, plan = started(rig, text)
+    control = Control()
+
+    class Stopper(Unwatched):
+        def taken(self, planned, frame, found):
+            if len(taken) + 1 == count:
+                control.stop()
+            taken.append(planned.id)
+
+    taken = []
+    outcome = Sequencer(session, plan, rig, Stopper(), control).run()
+    assert not outcome.complete
+    assert len(session.stored) == count
+    return session, plan, rig, bench
+
+
+def test_stopping_ends_after_the_frame_and_a_resume_takes_only_what_is_missing(undisturbed):
+    session, plan, _, _ = stopped_after(9)
+    before = dict(session.stored)
+    rig, _ = bench_rig()
+    again = Session(session.folder, session.disk)
+    outcome = Sequencer(again, plan, rig).run()
+    assert outcome.complete
+    assert outcome.taken == len(session.frames) - 9
+    assert contents(again) == contents(undisturbed[0])
+    assert all(again.stored[name] == entry for name, entry in before.items())
+
+
+def test_a_resume_agrees_with_the_last_whiteboard_under_other_noise(undisturbed):
+    session, plan, _, _ = stopped_after(10)
+    rig, _ = bench_rig(seed=1)
+    again = Session(session.folder, session.disk)
+    Sequencer(again, plan, rig).run()
+    assert again.read("shot-0-e0-r0") != contents(undisturbed[0])["shot-0-e0-r0"]
+    entry = next(e for e in again.journal.entries if e["kind"] == "registered")
+    assert entry["id"].startswith("board")
+    assert np.hypot(entry["x_px"], entry["y_px"]) < 0.05
+    assert entry["likeness"] > 0.9
+
+
+def test_a_resume_refuses_a_bench_whose_mask_has_slipped():
+    session, plan, _, _ = stopped_after(10)
+    rig, _ = bench_rig()
+    slipped = replace(rig, zero_um={**rig.zero_um, "mask_x": rig.zero_um["mask_x"] + 72.0})
+    again = Session(session.folder, session.disk)
+    with pytest.raises(AppError, match="no longer as it was"):
+        Sequencer(again, plan, slipped).run()
+    assert len(again.stored) == 10
+    assert any(entry["kind"] == "refused" for entry in again.journal.entries)
+
+
+def test_a_shift_is_registered_to_a_tenth_of_a_pixel():
+    rng = np.random.default_rng(0)
+    fine = cv2.blur(rng.uniform(0, 1, (130 * 4, 170 * 4)), (12, 12))
+
+    def frame(dx_quarter):
+        cut = fine[16 : 16 + 480, 16 - dx_quarter : 16 - dx_quarter + 640]
+        dn = 300 + 3000 * cut.reshape(120, 4, 160, 4).mean(axis=(1, 3))
+        return decode_raw(encode_dng(dn.astype(np.uint16), "mono", 100, 4000, 0.01))
+
+    for quarters in (-8, -3, 0, 1, 6):
+        shift = registered(frame(quarters), frame(0))
+        assert shift.x_px == pytest.approx(quarters / 4, abs=0.1)
+        assert shift.y_px == pytest.approx(0, abs=0.1)
+        assert shift.likeness > 0.9
+
+
+def test_another_camera_is_refused_on_resuming():
+    session, _, rig, _ = stopped_after(9)
+    other = still_rig()
+    with pytest.raises(AppError, match="begun with camera EMMC simulated camera S1"):
+        refuse_other_camera(session, other)
+    refuse_other_camera(session, rig)
+
+
+def test_pausing_holds_the_next_frame_until_it_goes_on():
+    rig = still_rig()
+    session, plan = started(rig)
+    control = Control()
+    control.pause()
+    counts = []
+
+    def go_on():
+        counts.append(len(session.stored))
+        control.resume()
+
+    timer = threading.Timer(0.15, go_on)
+    timer.start()
+    assert Sequencer(session, plan, rig, control=control).run().complete
+    assert counts == [0]
+
+
+def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
+    rig = still_rig()
+    session, plan = started(rig)
+
+    class Impatient(Unwatched):
+        def step(self, name, frame):
+            if name == "expose" and frame.id == "reference-s1-white-r0":
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Sequencer(session, plan, rig, Impatient()).run()
+    assert rig.attendant.lamp == "off"
+    assert rig.stage.stops == 1
+    assert session.journal.entries[-1]["kind"] == "stopped"
+    assert not verify(session).damaged
+    assert 0 < len(session.stored) < len(session.frames)
+
+
+def test_ctrl_c_stops_after_the_frame_and_the_second_one_now():
+    control, told = Control(), []
+    with interruptible(control, told.append):
+        signal.raise_signal(signal.SIGINT)
+        assert control.stopping
+        assert "stopping after this frame" in told[0]
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+CAMERA_FAULTS = (
+    "torn_raw",
+    "wrong_size",
+    "drop_event",
+    "drop_complete",
+    "unplug_in_download",
+    "stall_in_download",
+    "lost_bytes",
+    "garbled_header",
+    "silent",
+    "stuck_exposure",
+)
+STAGE_FAULTS = ("drop_reply", "garble_reply", "late_reply", "unplug", "stall")
+
+
+@pytest.mark.parametrize("fault", CAMERA_FAULTS)
+def test_a_fault_of_the_camera_costs_a_try_and_no_frame(undisturbed, fault):
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    rig.still.faults.inject(fault, skip=5)
+    assert Sequencer(session, plan, rig).run().complete
+    assert contents(session) == contents(undisturbed[0])
+
+
+@pytest.mark.parametrize("fault", STAGE_FAULTS)
+def test_a_fault_of_the_stage_costs_a_try_and_no_frame(undisturbed, fault):
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    rig.chain.faults.inject(fault, skip=5 if fault == "stall" else 30)
+    assert Sequencer(session, plan, rig).run().complete
+    assert contents(session) == contents(undisturbed[0])
+
+
+def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    pushed = []
+
+    class Clumsy(Unwatched):
+        def step(self, name, frame):
+            if name == "read back" and frame.kind == "whiteboard" and not pushed:
+                rig.chain.displace(1, 1, 30.0)
+                pushed.append(frame.id)
+
+    assert Sequencer(session, plan, rig, Clumsy()).run().complete
+    retry = next(e for e in session.journal.entries if e["kind"] == "retry")
+    assert retry["id"] == pushed[0]
+    assert "off its place" in retry["fault"] or "home" in retry["fault"]
+    assert contents(session) == contents(undisturbed[0])
+
+
+def test_a_stage_that_moves_for_ever_stops_the_capture_with_a_reason():
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    rig.chain.faults.inject("busy_forever", skip=5)
+    with pytest.raises(GaveUpError, match="still moves after"):
+        Sequencer(session, plan, rig).run()
+    assert session.journal.entries[-1]["kind"] == "stopped"
+    assert not verify(session).damaged
+
+
+def test_a_fault_that_stays_stops_the_capture_with_everything_kept():
+    rig, _ = bench_rig()
+    session, plan = started(rig, retries=Retries(per_frame=2))
+    rig.still.faults.inject("torn_raw", times=float("inf"), skip=4)
+    with pytest.raises(GaveUpError, match="gave up after 3 tries"):
+        Sequencer(session, plan, rig).run()
+    assert len(session.stored) == 4
+    assert not verify(session).damaged
+    rig.still.faults.clear()
+    assert Sequencer(session, plan, rig).run().complete
+
+
+def test_the_budget_of_the_session_ends_it_too():
+    rig, _ = bench_rig()
+    session, plan = started(rig, retries=Retries(per_session=3))
+    for skip in range(0, 40, 2):
+        rig.still.faults.inject("torn_raw", skip=skip)
+    with pytest.raises(GaveUpError, match="all 3 retries"):
+        Sequencer(session, plan, rig).run()
+    assert session.stored
+
+
+def test_an_emergency_stop_is_never_argued_with():
+    rig, _ = bench_rig()
+    session, plan = started(rig)
+    rig.chain.faults.inject("emergency_stop", skip=40)
+    with pytest.raises(GaveUpError, match="emergency"):
+        Sequencer(session, plan, rig).run()
+    assert not any(e["kind"] == "retry" and e["attempt"] > 1 for e in session.journal.entries)
+
+
+def test_what_has_to_be_mended_follows_from_the_fault():
+    first = mending(DriverError("x"), 1)
+    assert first == Mending(wait_s=0.1)
+    assert mending(DriverError("x"), 3).reopen_camera
+    assert mending(DriverError("x"), 9).wait_s == 5.0
+
+
+def planned(kind):
+    return PlannedFrame("f", kind, Bench("scene", "white", 0, 0, True), 0.01)
+
+
+def frame_at(level, seed=0):
+    rng = np.random.default_rng(seed)
+    dn = np.clip(100 + rng.normal(level, 20, SIZE), 0, 4000)
+    return decode_raw(encode_dng(dn.astype(np.uint16), "rggb", 100, 4000, 0.01))
+
+
+@pytest.mark.parametrize(
+    ("kind", "level", "line"),
+    [
+        ("shot", 6000, "saturated in"),
+        ("shot", -100, "is black"),
+        ("whiteboard", 6000, "shorten the exposure"),
+        ("dark", 900, "not dark"),
+    ],
+)
+def test_a_frame_that_cannot_be_right_is_refused(kind, level, line):
+    frame = frame_at(level)
+    with pytest.raises(DriverError, match=line):
+        check(planned(kind), frame, figures(frame), None, Checks())
+
+
+def test_a_frame_that_comes_twice_is_refused_and_another_one_is_not():
+    one, other = frame_at(900), frame_at(900, seed=1)
+    check(planned("shot"), other, figures(other), one.mosaic, Checks())
+    with pytest.raises(DriverError, match="once more, bit by bit"):
+        check(planned("shot"), one, figures(one), one.mosaic.copy(), Checks())
+
+
+def test_the_longer_exposures_of_a_bracket_may_saturate():
+    frame = frame_at(6000)
+    check(planned("shot"), frame, figures(frame), None, Checks(), may_saturate=True)
+
+
+def test_a_camera_that_repeats_itself_once_costs_a_try():
+    rig = still_rig()
+    session, plan = started(rig, ONE_SHOT)
+    wire = rig.camera._transport
+    honest = wire.capture
+    seen = []
+
+    def repeating(exposure_s):
+        data = seen[-1] if len(seen) == 1 else honest(exposure_s)
+        seen.append(data)
+        return data
+
+    wire.capture = repeating
+    assert Sequencer(session, plan, rig).run().complete
+    faults = [e["fault"] for e in session.journal.entries if e["kind"] == "retry"]
+    assert len(faults) == 1
+    assert "bit by bit" in faults[0]
+    assert len(set(contents(session).values())) == 3
+
+
+def test_the_stage_moves_on_while_a_frame_is_written():
+    """The disk holds each frame's write back until the stage has moved to another place."""
+    rig = still_rig()
+    places = "[[0, 0], [1, 1], [2, 2], [3, 3]]"
+    text = SMALL.replace("[[2, 2], [0, 4]]", places).replace("[{}, {}]", "[{}]")
+    disk = SimulatedDisk()
+    session, plan = started(rig, text, disk)
+    moves_when_written = []
+    moved = threading.Event()
+    move = rig.stage.move_to_um
+
+    def moving(targets_um):
+        done = move(targets_um)
+        moved.set()
+        return done
+
+    boards = [frame.id for frame in session.frames if frame.kind == "whiteboard"]
+    last = boards[-1]
+
+    class Holding(Unwatched):
+        def step(self, name, frame):
+            if name == "hand over" and frame.kind == "whiteboard":
+                moved.clear()
+            if name == "write" and frame.kind == "whiteboard" and frame.id != last:
+                moves_when_written.append(moved.wait(10))
+
+    rig.stage.move_to_um = moving
+    assert Sequencer(session, plan, rig, Holding()).run().complete
+    assert moves_when_written == [True] * (len(boards) - 1)
+
+
+def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
+    rig = still_rig()
+    session, plan = started(rig)
+    days = iter(range(1000, 0, -1))
+    outcome = Sequencer(session, plan, rig, wall=lambda: f"day {next(days)}").run()
+    assert outcome.complete
+    for entry in session.stored.values():
+        for began_s, ended_s in entry["spans_s"].values():
+            assert 0 <= began_s <= ended_s
+    names = [e["id"] for e in session.journal.entries if e["kind"] == "frame"]
+    assert names == [frame.id for frame in session.frames]
+
+
+def test_a_full_disk_is_told_in_one_line_with_what_is_safe():
+    rig = still_rig()
+    session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
+    line = "disk is full; make room, then run the same"
+    with pytest.raises(AppError, match=line) as told, disk_faults_told(session):
+        Sequencer(session, plan, rig).run()
+    assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(told.value)
+    assert rig.attendant.lamp == "off"
+    assert rig.stage.stops == 1
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_is_made():
+    rig = still_rig()
+    wish = wish_for(Path("/"))
+    expected = estimated(planned_frames(wish, rig), wish.plan, rig)
+    refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1e12))
+    with pytest.raises(AppError, match="frames need about"):
+        refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1000))
+
+
+def test_an_axis_out_of_reach_is_told_before_anything_moves():
+    rig = still_rig()
+    rig = replace(rig, zero_um={**rig.zero_um, "mask_x": 99_990.0})
+    session, plan = started(rig)
+    with pytest.raises(AppError, match="mask_x cannot go 270 um"):
+        Sequencer(session, plan, rig).run()
+    assert rig.stage.moves == 0
+
+
+def test_an_exposure_beyond_the_camera_is_told_before_anything_moves():
+    rig = still_rig()
+    session, plan = started(rig, ONE_SHOT.replace("0.05", "7200"))
+    with pytest.raises(AppError, match="the camera exposes from"):
+        Sequencer(session, plan, rig).run()
+    assert rig.stage.moves == 0
+
+
+def test_an_edited_plan_is_refused_and_named(tmp_path):
+    rig = still_rig()
+    wish = wish_for(tmp_path, text=SMALL)
+    new_session(wish, planned_frames(wish, rig))
+    assert begun_session(wish) is not None
+    edited = replace(wish, plan=wish.plan.model_copy(update={"settle_s": 2.0}))
+    with pytest.raises(AppError, match=r"was edited since .*settle_s is 2.0, not 0.0"):
+        begun_session(edited)
+    with pytest.raises(AppError, match="another rig"):
+        begun_session(replace(wish, rig={"kind": "y"}))
+
+
+def resident_bytes():
+    """How much memory this process has now; 0 where the system does not tell so simply."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
+
+
+def test_a_thousand_shots_with_faults_in_one_operation_in_twenty_complete():
+    text = """
+camera: rgbw-bayer-1shot
+shots: [SHOTS]
+whiteboards: null
+darks: null
+retries: {per_frame: 8, per_session: 2000}
+""".replace("SHOTS", ", ".join(f"{{mask_um: [{24 * i}, 0], repeats: 50}}" for i in range(20)))
+    rig, _ = bench_rig(text)
+    disk = SimulatedDisk()
+    session, plan = started(rig, text, disk)
+    rng = np.random.default_rng(11)
+    injected = []
+
+    class Saboteur(Unwatched):
+        count = 0
+
+        def step(self, name, frame):
+            where = {
+                "move": (rig.chain.faults, STAGE_FAULTS),
+                "read back": (rig.chain.faults, ("drop_reply", "garble_reply", "unplug")),
+                "expose": (rig.still.faults, CAMERA_FAULTS),
+            }.get(name)
+            if where is not None and rng.random() < 0.05:
+                fault = str(rng.choice(where[1]))
+                where[0].inject(fault)
+                injected.append(fault)
+
+        def stored(self, frame):
+            self.count += 1
+            if self.count in (200, 1000):
+                memory.append(resident_bytes())
+
+    memory = []
+    outcome = Sequencer(session, plan, rig, Saboteur()).run()
+    assert outcome.complete
+    assert outcome.taken == 1000
+    assert verify(session).is_complete
+    assert len(injected) > 80
+    assert outcome.retries > 40
+    # What grows is the journal, some kB for each frame, and the disk, which is in memory too.
+    assert memory[1] - memory[0] < disk.used_bytes + 800 * 20_000

@@ -1,0 +1,405 @@
+"""`emmc-rig capture` and `emmc-rig session`: whole sessions, and one clear line for every fault."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from emmc_rig import cli
+from emmc_rig.session.listing import sessions_in
+from emmc_rig.session.session import Session, only_program
+from emmc_rig.session.storage import part_of
+
+RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
+PATIENCE_S = 60.0
+PLAN = {
+    "title": "two shots, one of them a bracket",
+    "camera": "rgbw-bayer-2shots",
+    "shots": [{"exposure_s": [0.02, 0.08]}, {"repeats": 2}],
+    "whiteboards": {"repeats": 1, "references": 2},
+    "darks": {"repeats": 2},
+}
+
+
+def caller(monkeypatch, capsys, folder):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("COLUMNS", "160")
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        shown = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else code), shown.out, shown.err
+
+    return call
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run the program in-process: returns exit code, standard output and standard error."""
+    return caller(monkeypatch, capsys, tmp_path)
+
+
+def one_line(text):
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
+def plan_file(folder, **changes):
+    path = folder / "plan.yaml"
+    path.write_text(yaml.safe_dump({**PLAN, **changes}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """A folder with a plan and its complete session."""
+    folder = tmp_path_factory.mktemp("captured")
+    out, _ = capture(plan_file(folder))
+    assert "complete: 62 frames verified" in out
+    return folder
+
+
+def capture(*arguments):
+    """Capture without a terminal; returns standard output and standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["emmc-rig", "capture", *map(str, arguments), *RIG])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    assert not stop.value.code, err.getvalue()
+    return out.getvalue(), err.getvalue()
+
+
+def test_two_captures_of_one_plan_are_the_same_byte_for_byte(captured):
+    _, err = capture(captured / "plan.yaml", "--out", captured / "again")
+    # Without a terminal there is a plain line for every frame.
+    lines = [line for line in err.splitlines() if "of white, saturated" in line]
+    assert len(lines) == 62
+    assert "\x1b" not in err
+    assert "62 frames to take, about" in err
+    one, other = (contents(captured / name) for name in ("plan-session", "again"))
+    assert one == other
+
+
+def contents(folder):
+    session = Session(folder)
+    return {frame.id: session.read(frame.id) for frame in session.frames}
+
+
+def test_running_a_complete_session_again_takes_nothing(captured, run):
+    os.chdir(captured)
+    code, out, err = run("capture", "plan-session")
+    assert code == 0
+    assert "0 taken" in out
+    assert "62 of 62 frames are there already" in err
+
+
+def test_a_session_is_listed_shown_and_verified(captured, run):
+    os.chdir(captured)
+    code, out, _ = run("session", "list")
+    assert code == 0
+    assert "plan-session" in out
+    assert "62/62" in out
+    code, out, _ = run("session", "show", "plan-session")
+    assert "two shots, one of them a bracket" in out
+    assert "whiteboard   50 of 50" in out
+    code, out, _ = run("session", "verify", "plan-session")
+    assert code == 0
+    assert "complete: 62 frames" in out
+
+
+def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    session = Session(copy)
+    path = session.path_of(session.stored["shot-1-e0-r1"])
+    good = path.read_bytes()
+    path.write_bytes(good[:-100])
+    code, out, err = run("session", "verify", copy)
+    assert code == 1
+    assert "shot-1-e0-r1" in out
+    assert "61 of 62 frames are good" in one_line(err)
+    code, out, err = run("capture", copy)
+    assert code == 0, err
+    assert "1 taken" in out
+    assert path.read_bytes() == good
+
+
+def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured, run):
+    os.chdir(captured)
+    code, _, err = run("session", "export", "plan-session", "--out", "x.h5", "--compress")
+    assert code == 0, err
+    with h5py.File("x.h5") as file:
+        entry: Any = file[file.attrs["default"]]
+        kinds = {}
+        entry.visititems(lambda name, one: kinds.update({name: one.attrs.get("NX_class")}))
+        assert entry.attrs["NX_class"] == "NXentry"
+        assert kinds["instrument/detector"] == "NXdetector"
+        assert kinds["instrument/mask"] == "NXpositioner"
+        assert entry["data"].attrs["signal"] == "data"
+        frames = entry["data/data"]
+        assert frames.shape == (62, 24, 32)
+        ids = entry["data/frame_id"].asstr()[:].tolist()
+        assert entry["instrument/mask/x"].attrs["units"] == "um"
+        places = entry["instrument/mask/x"][:]
+        assert places[ids.index("shot-1-e0-r0")] == pytest.approx(270, abs=0.5)
+        times_s = entry["instrument/detector/count_time"][:]
+        assert times_s[ids.index("shot-0-e1-r0")] == pytest.approx(0.08)
+        fused, errors = entry["fused/data"][:], entry["fused/data_errors"][:]
+        alone = frames[ids.index("shot-0-e1-r0")].astype(float)
+        dark = frames[[i for i, name in enumerate(ids) if name.startswith("dark")]].mean(axis=0)
+    rate = (alone - dark) / 0.08
+    assert fused.shape == (2, 24, 32)
+    assert np.median(np.abs(fused[0] - rate) / errors[0]) < 1
+    assert np.corrcoef(fused[0].ravel(), rate.ravel())[0, 1] > 0.99
+
+
+def test_the_report_opens_offline_and_shows_frames_and_timeline(captured):
+    page = (captured / "plan-session" / "report.html").read_text()
+    assert page.count("<img ") == 62
+    assert "data:image/jpeg;base64," in page
+    assert "<svg" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert 'src="http' not in page
+    assert "{{" not in page
+
+
+def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
+    settings = tmp_path / "s.yaml"
+    settings.write_text("tv: {max_steps: 3}")
+    session = captured / "plan-session"
+    code, _, err = run("reconstruct", session, "--settings", settings, "--out", "r")
+    assert code == 0, err
+    metrics = json.loads(Path("r/metrics.json").read_text())
+    assert metrics["shots"] == 2
+    assert 0 < metrics["noise_sigma"] < 0.1
+    assert Path("r/psi.h5").is_file()
+
+
+def test_the_psi_of_a_session_is_that_of_the_demo_s_road(captured):
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.model.camera import build_imaging_matrix
+    from emmc_rig.session.readings import session_readings
+
+    taken = session_readings(Session(captured / "plan-session"))
+    design = build_imaging_matrix(find_camera("rgbw-bayer-2shots"), (24, 32))
+    # The masks sit off by 6.5 um and more, which the design does not know.
+    assert 0 < design.relative_difference(taken.psi) < 0.6
+    assert taken.usable.all()
+    assert np.isfinite(taken.variance).all()
+
+
+def test_a_plan_for_a_camera_is_written_once(run, tmp_path):
+    code, out, _ = run("capture", "--new", "rgbw-bayer-3shots")
+    assert code == 0
+    assert "wrote plan.yaml" in out
+    assert yaml.safe_load((tmp_path / "plan.yaml").read_text())["camera"] == "rgbw-bayer-3shots"
+    code, _, err = run("capture", "--new", "rgbw-bayer-3shots")
+    assert code == 1
+    assert "exists already" in one_line(err)
+
+
+def test_a_dry_run_tells_what_it_will_take_and_makes_nothing(run, tmp_path):
+    plan_file(tmp_path)
+    code, _, err = run("capture", "plan.yaml", *RIG, "--dry-run")
+    assert code == 0
+    assert "62 frames to take, about" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
+
+
+def test_the_schema_is_printed(run):
+    code, out, _ = run("capture", "--schema")
+    assert code == 0
+    assert json.loads(out)["title"] == "Plan"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["capture", "nothing.yaml", *RIG], "no such file"),
+        (["capture", "plan.yaml"], "say which rig"),
+        (["capture", "plan.yaml", "--rig", "real"], "name of a YAML file of devices"),
+        (["capture", "plan.yaml", "--rig", "no.yaml"], "no.yaml: no such file"),
+        (["capture", "plan.yaml", "--rig", "simulated", "--size", "x"], "write ROWSxCOLUMNS"),
+        (["capture", "plan.yaml", "--rig", "simulated", "--scene", "drak"], "did you mean 'dark'"),
+        (["capture", "--new", "rgbw"], "did you mean"),
+        (["capture", "plan.yaml", *RIG, "--out", "occupied"], "something else than a session"),
+        (["capture", "plan.yaml", *RIG, "--out", "plan.yaml"], "something else than a session"),
+        (["session", "show", "occupied"], "no session"),
+        (["session", "list", "occupied"], "holds no session"),
+        (["session", "list", "nowhere"], "cannot be read"),
+        (["session", "verify", "nowhere"], "no session"),
+        (["session", "export", "occupied", "--out", "x.h5"], "no session"),
+    ],
+)
+def test_bad_input_gives_one_line_and_makes_nothing(run, tmp_path, arguments, line):
+    plan_file(tmp_path)
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "thesis.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert line in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_misspelt_key_in_a_plan_names_the_nearest(run, tmp_path):
+    plan_file(tmp_path, retrys={"per_frame": 3})
+    code, _, err = run("capture", "plan.yaml", *RIG)
+    assert code == 1
+    assert "did you mean 'retries'" in one_line(err)
+
+
+def test_an_edited_plan_does_not_go_on_with_the_session(captured, run, tmp_path):
+    session = captured / "plan-session"
+    plan_file(tmp_path, settle_s=0.25)
+    code, _, err = run("capture", "plan.yaml", *RIG, "--out", session)
+    assert code == 1
+    assert "settle_s is 0.25, not 0.0" in one_line(err)
+    other_scene = ["--rig", "simulated", "--scene", "dark", "--size", "24x32"]
+    plan_file(tmp_path)
+    code, _, err = run("capture", "plan.yaml", *other_scene, "--out", session)
+    assert code == 1
+    assert "another rig" in one_line(err)
+
+
+def test_a_plan_edited_inside_the_session_is_told(captured, run, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    (copy / "plan.yaml").write_text("camera: conventional\nshots: [{}]\n")
+    code, _, err = run("capture", copy)
+    assert code == 1
+    assert "was changed after the session began" in one_line(err)
+    code, out, err = run("session", "verify", copy)
+    assert code == 1
+    assert "was changed after the session began" in out
+
+
+def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
+    session = Session(captured / "plan-session")
+    with only_program(session):
+        code, _, err = run("capture", captured / "plan-session")
+    assert code == 1
+    assert "another program" in one_line(err)
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written_is_told(run, tmp_path):
+    plan_file(tmp_path)
+    (tmp_path / "locked").mkdir(mode=0o500)
+    code, _, err = run("capture", "plan.yaml", *RIG, "--out", "locked/s")
+    assert code == 1
+    assert "cannot be made" in one_line(err)
+
+
+def test_a_disk_without_room_is_told_before_anything_is_made(run, tmp_path, monkeypatch):
+    from emmc_rig.session.storage import SystemDisk
+
+    plan_file(tmp_path)
+    monkeypatch.setattr(SystemDisk, "free_bytes", lambda self, folder: 1000)
+    code, _, err = run("capture", "plan.yaml", *RIG)
+    assert code == 1
+    assert "62 frames need about" in one_line(err)
+    assert not (tmp_path / "plan-session").exists()
+
+
+def test_work_by_hand_without_a_terminal_is_told(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    plan_file(tmp_path)
+    axes = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0)
+    rig = {"stage": "simulated", "camera": "simulated", "zero_um": axes, "window_um": 1000.0}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
+    assert code == 1
+    assert "somebody has to switch the lamp off" in one_line(err)
+
+
+def test_a_recorded_session_is_replayed_through_the_folder_camera(captured, run, tmp_path):
+    recorded = tmp_path / "recorded"
+    recorded.mkdir()
+    for path in (captured / "plan-session" / "frames").iterdir():
+        if path.name[6:].startswith(("dark", "shot-0")):
+            (recorded / path.name).write_bytes(path.read_bytes())
+    rig = {
+        "stage": "simulated",
+        "camera": f"folder:{recorded}",
+        "zero_um": dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0),
+        "window_um": 1000.0,
+        "by_hand": False,
+    }
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    plan_file(tmp_path, whiteboards=None, shots=[{"exposure_s": [0.02, 0.08]}])
+    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
+    assert code == 0, err
+    again = Session(tmp_path / "plan-session")
+    for frame in again.frames:
+        assert again.read(frame.id) == contents(captured / "plan-session")[frame.id]
+
+
+def test_prune_removes_a_crash_s_leftovers(captured, run, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    part = part_of(copy / "frames" / "00001-x.dng")
+    part.write_bytes(b"half a frame")
+    code, out, _ = run("session", "prune", copy, "--dry-run")
+    assert "would remove 1 leftover(s)" in out
+    assert part.exists()
+    code, out, _ = run("session", "prune", copy)
+    assert code == 0
+    assert not part.exists()
+    assert run("session", "verify", copy)[0] == 0
+
+
+def wait_until(condition):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def started_capture(folder):
+    """Start a capture that takes its time, and return it when it has taken some frames."""
+    plan_file(folder, darks={"repeats": 300})
+    command = [*PROGRAM, "capture", "plan.yaml", *RIG, "--real-time"]
+    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
+    journal = folder / "plan-session" / "journal.jsonl"
+    wait_until(lambda: journal.exists() and journal.read_bytes().count(b'"kind":"frame"') > 2)
+    return process
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are sent")
+@pytest.mark.parametrize(
+    ("signals", "line"),
+    [
+        ([signal.SIGINT], "frames are still to be taken; go on with"),
+        ([signal.SIGTERM], "stopped at once; what was captured is kept"),
+    ],
+)
+def test_an_interrupted_capture_says_how_to_go_on(tmp_path, signals, line):
+    process = started_capture(tmp_path)
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.02)
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, err
+    assert line in one_line(err)
+    session = Session(tmp_path / "plan-session")
+    assert 2 < len(session.stored) < 300
+    assert next(sessions_in(tmp_path)).name == "plan-session"

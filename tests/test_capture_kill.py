@@ -1,0 +1,109 @@
+"""Captures killed by SIGKILL, at every step and at random lines: a resume makes them whole."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_kills import capture_into
+
+from emmc_rig.session.session import FRAMES, Session
+from emmc_rig.session.verify import verify
+
+RANDOM_LINES = 220
+CHUNKS = 4
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+
+
+@pytest.fixture(scope="module")
+def place():
+    """A folder in memory where there is one: a kill loses no bytes that a disk was given."""
+    memory = Path("/dev/shm")
+    where = memory if os.access(memory, os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=where) as folder:
+        yield Path(folder)
+
+
+@pytest.fixture(scope="module")
+def killed():
+    """Run a capture that kills itself at an event; returns its exit code and their number."""
+    program = [sys.executable, str(Path(__file__).with_name("capture_kills.py"))]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
+        assert one.stdin is not None
+        assert one.stdout is not None
+
+        def call(kind, number, folder):
+            assert one.stdin is not None
+            assert one.stdout is not None
+            one.stdin.write(f"{kind} {number} {folder}\n")
+            one.stdin.flush()
+            code, count = one.stdout.readline().split()
+            return int(code), int(count)
+
+        yield call
+        one.stdin.close()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(place):
+    session = capture_into(place / "undisturbed")
+    return contents(session)
+
+
+def contents(session):
+    """Every file of the frames folder, and its bytes."""
+    return {path.name: path.read_bytes() for path in (session.folder / FRAMES).iterdir()}
+
+
+def assert_made_whole(folder, expected):
+    session = capture_into(folder)
+    assert contents(session) == expected
+    opened = Session(session.folder)
+    verdict = verify(opened)
+    assert verdict.is_complete
+    assert not verdict.leftovers
+    assert opened.is_complete
+    assert len(opened.stored) == len(expected)
+
+
+def check(killed, place, kind, numbers, expected):
+    for number in numbers:
+        folder = place / f"{kind}-{number}"
+        code, _ = killed(kind, number, folder)
+        assert code == -signal.SIGKILL, number
+        assert_made_whole(folder, expected)
+        shutil.rmtree(folder)
+
+
+def test_a_capture_killed_at_any_step_is_made_whole(killed, place, undisturbed):
+    code, steps = killed("step", 0, place / "all-steps")
+    assert code == 0
+    assert steps >= 9 * len(undisturbed)
+    check(killed, place, "step", range(1, steps + 1), undisturbed)
+
+
+@pytest.mark.parametrize("chunk", range(CHUNKS))
+def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
+    killed, place, undisturbed, chunk
+):
+    code, lines = killed("line", 0, place / f"all-lines-{chunk}")
+    assert code == 0
+    rng = np.random.default_rng(chunk)
+    chosen = rng.choice(np.arange(1, lines - 20), RANDOM_LINES // CHUNKS, replace=False)
+    check(killed, place, "line", chosen.tolist(), undisturbed)
+
+
+def test_a_capture_killed_again_and_again_is_made_whole(killed, place, undisturbed):
+    rng = np.random.default_rng(5)
+    folder = place / "again"
+    for _ in range(100):
+        code, _ = killed("line", int(rng.integers(50, 700)), folder)
+        if code == 0:
+            break
+    assert_made_whole(folder, undisturbed)

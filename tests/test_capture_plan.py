@@ -1,0 +1,235 @@
+"""Plans: every frame that follows from one, in a good order, and one clear line for a bad one."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import yaml
+
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.capture.estimate import estimate
+from emmc_rig.capture.new_plan import new_plan
+from emmc_rig.capture.order import ordered, travel_um
+from emmc_rig.capture.plan import (
+    Plan,
+    expand,
+    exposures_s,
+    first_difference,
+    fittings,
+    load_plan,
+    plan_schema,
+    planned_camera,
+    schema_path,
+    schema_text,
+)
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import shipped_cameras
+from emmc_rig.output import shown_bytes, shown_seconds
+from emmc_rig.session.planned import Bench, PlannedFrame
+
+WINDOW_UM = 40_000.0
+
+
+def plan_of(**changes):
+    base = {"camera": "rgbw-bayer-3shots", "shots": [{}, {}, {}]}
+    return Plan.model_validate({**base, **changes})
+
+
+def frames_of(plan):
+    return expand(plan, planned_camera(plan), WINDOW_UM)
+
+
+def plan_file(tmp_path, **changes):
+    base = {"camera": "rgbw-bayer-3shots", "shots": [{}]}
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump({**base, **changes}))
+    return path
+
+
+def test_a_plan_of_three_shots_has_a_frame_for_every_view_lamp_and_repeat():
+    kinds = [frame.kind for frame in frames_of(plan_of())]
+    assert kinds.count("dark") == 4
+    assert kinds.count("metering") == 3
+    assert kinds.count("reference") == 3 * 4
+    assert kinds.count("whiteboard") == 3 * 25 * 2
+    assert kinds.count("shot") == 3
+
+
+def test_frames_have_names_of_their_own():
+    frames = frames_of(plan_of(shots=[{"exposure_s": [0.01, 0.1], "repeats": 3}, {}, {}]))
+    assert len({frame.id for frame in frames}) == len(frames)
+    assert all(frame.id.replace("-", "").isalnum() for frame in frames)
+
+
+def test_a_monochrome_sensor_behind_a_colour_mask_needs_three_lamps():
+    plan = plan_of(camera="moving-colour-mask")
+    lamps = {frame.bench.lamp for frame in frames_of(plan) if frame.kind == "whiteboard"}
+    assert lamps == {"red", "green", "blue"}
+
+
+def test_mask_places_in_cells_are_those_in_micrometres():
+    in_cells = planned_camera(plan_of(shots=[{"mask_cells": [2, -1]}]))
+    in_um = planned_camera(plan_of(shots=[{"mask_um": [72, -36]}]))
+    assert in_cells == in_um
+    assert in_um.shots[0].offset_um["mask"] == (72, -36)
+
+
+def test_a_plan_may_take_the_camera_s_shots_in_any_order():
+    camera = planned_camera(plan_of(shots=[{"camera_shot": 2}, {"camera_shot": 0}]))
+    own = find_camera("rgbw-bayer-3shots")
+    assert camera.shots == (own.shots[2], own.shots[0])
+
+
+def test_more_shots_than_the_camera_has_are_placed_by_the_plan():
+    places = [{"mask_um": [24 * i, 0]} for i in range(5)]
+    plan = plan_of(camera="sensor-side-binary", shots=places)
+    offsets = [shot.offset_um for shot in planned_camera(plan).shots]
+    assert [next(iter(one.values()))[0] for one in offsets] == [0, 24, 48, 72, 96]
+
+
+def test_a_bracket_is_taken_from_the_shortest_exposure_on():
+    plan = plan_of(shots=[{"exposure_s": [0.1, 0.01]}, {"exposure_s": 0.02}])
+    assert exposures_s(plan, planned_camera(plan)) == [(0.01, 0.1), (0.02,)]
+
+
+def test_shots_with_equal_masks_and_filter_need_no_hand_between_them():
+    assert fittings(planned_camera(plan_of())) == [0, 0, 0]
+    sequence = Plan.model_validate({"camera": "programmable-aperture", "shots": [{}] * 25})
+    assert fittings(planned_camera(sequence)) == list(range(25))
+
+
+def test_least_travel_goes_less_far_and_takes_the_same_frames():
+    frames = frames_of(plan_of())
+    short = ordered(frames, "least-travel")
+    assert sorted(f.id for f in short) == sorted(f.id for f in frames)
+    assert travel_um(short) < 0.5 * travel_um(frames)
+    assert ordered(frames, "as-planned") == frames
+
+
+def test_a_metered_exposure_comes_after_its_metering():
+    for order in ("least-travel", "as-planned"):
+        names = [frame.id for frame in ordered(frames_of(plan_of()), order)]
+        for frame in frames_of(plan_of()):
+            if frame.metered_by:
+                assert names.index(frame.metered_by) < names.index(frame.id)
+
+
+def test_a_line_of_places_is_visited_from_end_to_end():
+    rng = np.random.default_rng(0)
+    places_um = rng.permutation(np.arange(60) * 100.0)
+    frames = [
+        PlannedFrame(f"f{i}", "shot", Bench("scene", "white", 0, 0, True, {"mask_x": um}), 0.1)
+        for i, um in enumerate(places_um)
+    ]
+    assert travel_um(ordered(frames, "least-travel")) == pytest.approx(5900, rel=0.05)
+
+
+def test_the_bench_is_changed_by_hand_as_rarely_as_can_be():
+    def changes(frames):
+        stood = [f.bench.set_by_hand for f in frames if f.bench.lamp != "off"]
+        return sum(a != b for a, b in pairwise(stood))
+
+    assert changes(ordered(frames_of(plan_of()), "least-travel")) == 2
+
+
+def test_frames_survive_the_way_through_json():
+    for frame in frames_of(plan_of(shots=[{"exposure_s": [0.01, 0.1]}])):
+        assert PlannedFrame.from_dict(json.loads(json.dumps(frame.as_dict()))) == frame
+
+
+def test_an_estimate_counts_exposures_moves_and_bytes():
+    bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0)]
+    frames = [PlannedFrame(f"f{i}", "shot", one, 2.0) for i, one in enumerate(bench)]
+    told = estimate(frames, 1_000_000, {"mask_x": 1000.0}, settle_s=1.0, metered_s=0.1)
+    assert told.exposing_s == 4.0
+    # Two moves settle for 1 s each and the second goes 4 mm at 1 mm/s.
+    assert 6.0 <= told.moving_s <= 7.0
+    assert 2e6 <= told.bytes <= 2.1e6
+    assert told.by_hand == 0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(12.4, "12 s"), (600, "10 min"), (7200 * 2, "4.0 h")]
+)
+def test_durations_are_shown_for_people(seconds, shown):
+    assert shown_seconds(seconds) == shown
+
+
+def test_sizes_are_shown_for_people():
+    assert [shown_bytes(n) for n in (12, 4.2e6, 4.8e10)] == ["12 B", "4.2 MB", "48 GB"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"setle_s": 1}, "did you mean 'settle_s'"),
+        ({"shots": [{"exposures_s": 1}]}, "did you mean 'exposure_s'"),
+        ({"whiteboards": {"lamp": ["white"]}}, "did you mean 'lamps'"),
+        ({"checks": {"stage_mm": 2}}, "did you mean 'stage_um'"),
+        ({"shots": []}, "at least 1 item"),
+        ({"shots": [{"exposure_s": 0}]}, "greater than 0"),
+        ({"shots": [{"exposure_s": float("nan")}]}, "finite"),
+        ({"shots": [{"mask_um": [1, 2], "mask_cells": [1, 2]}]}, "not both"),
+        ({"shots": [{"lamp": "purple"}]}, "'white'"),
+        ({"order": "fastest"}, "least-travel"),
+        ({"darks": {"repeats": 1}}, "greater than or equal to 2"),
+    ],
+)
+def test_a_bad_plan_gives_one_line_that_names_what_is_wrong(tmp_path, changes, line):
+    with pytest.raises(AppError) as told:
+        load_plan(plan_file(tmp_path, **changes))
+    assert line in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_view_that_the_camera_has_not_is_told():
+    plan = plan_of(whiteboards={"views": [[5, 0]]})
+    with pytest.raises(AppError, match="5x5 views"):
+        frames_of(plan)
+
+
+def test_a_mask_to_move_that_is_not_there_is_told():
+    plan = plan_of(camera="conventional", shots=[{"mask_um": [1, 1]}])
+    with pytest.raises(AppError, match="no mask to move"):
+        planned_camera(plan)
+
+
+def test_a_pattern_that_changes_from_shot_to_shot_is_not_reordered():
+    plan = Plan.model_validate(
+        {"camera": "programmable-aperture", "shots": [{"camera_shot": 3}, {}]}
+    )
+    with pytest.raises(AppError, match="leave camera_shot out"):
+        planned_camera(plan)
+
+
+def test_a_camera_file_is_looked_for_beside_the_plan(tmp_path):
+    text = yaml.safe_dump({"title": "mine", "sensor": {"cfa": "rggb"}})
+    (tmp_path / "mine.yaml").write_text(text)
+    plan = load_plan(plan_file(tmp_path, camera="mine.yaml"))
+    assert planned_camera(plan, tmp_path).title == "mine"
+
+
+def test_the_schema_that_is_shipped_is_that_of_the_plan():
+    assert schema_path().read_text(encoding="utf-8") == schema_text()
+    assert plan_schema()["properties"]["shots"]["minItems"] == 1
+
+
+@pytest.mark.parametrize("name", list(shipped_cameras()))
+def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
+    camera = find_camera(name)
+    path = tmp_path / "plan.yaml"
+    path.write_text(new_plan(name, camera), encoding="utf-8")
+    plan = load_plan(path)
+    assert planned_camera(plan).shots == camera.shots
+    assert Plan(camera=name, shots=plan.shots, title=name) == plan
+    np.testing.assert_allclose(
+        [bracket[0] for bracket in exposures_s(plan, camera)], camera.exposures_s(), rtol=1e-5
+    )
+
+
+def test_what_differs_between_two_plans_is_named():
+    one, other = plan_of(), plan_of(settle_s=0.5)
+    assert first_difference(one, one) == ""
+    assert first_difference(other, one) == "settle_s is 0.5, not 0.0"
+    assert "shots has 3 entries, not 1" in first_difference(one, plan_of(shots=[{}]))

@@ -1,0 +1,486 @@
+"""The set-up page: what it measures of a frame, what it does, and whom it refuses."""
+
+import http.client
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import uvicorn
+
+from drivers.camera import CameraIdentity
+from drivers.errors import RawFrameError
+from drivers.raw import RawFrame
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.cli import main
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import simulated_rig
+from emmc_rig.live import watch as watch_module
+from emmc_rig.live.alignment import grid_direction, measure
+from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
+from emmc_rig.live.server import application
+from emmc_rig.live.watch import Watch
+from emmc_rig.scene import fine_scene
+
+BLACK, WHITE = 256, 4095
+PATIENCE_S = 20.0
+TOKEN = "secret"
+
+
+def frame_of(mosaic, cfa="rggb"):
+    return RawFrame(
+        mosaic=mosaic.astype(np.uint16),
+        cfa=cfa,
+        black_level_dn=np.full(4, BLACK, np.float64),
+        white_level_dn=WHITE,
+        exposure_s=0.01,
+        original=b"",
+        sha256="",
+    )
+
+
+def cells(angle_deg, shape=(300, 400), side=9.0, shift=(0.0, 0.0), seed=0):
+    """A random binary mask of square cells, turned counterclockwise, each pixel 4x4 samples."""
+    y, x = np.mgrid[: shape[0] * 4, : shape[1] * 4] / 4.0
+    x, y = x - shift[0] - shape[1] / 2, y - shift[1] - shape[0] / 2
+    angle = np.radians(angle_deg)
+    across = np.cos(angle) * x - np.sin(angle) * y
+    down = np.sin(angle) * x + np.cos(angle) * y
+    pattern = np.random.default_rng(seed).integers(0, 2, (256, 256))
+    seen = pattern[
+        np.floor(down / side).astype(int) % 256, np.floor(across / side).astype(int) % 256
+    ]
+    return cv2.resize(seen.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize("angle_deg", [-20.0, -1.0, -0.2, 0.0, 0.5, 3.0, 30.0])
+def test_the_rotation_of_mask_cells_is_measured_to_a_tenth_of_a_degree(angle_deg):
+    noise = np.random.default_rng(1).normal(0, 0.03, (300, 400))
+    turned, straightness = grid_direction((cells(angle_deg) + noise).astype(np.float32))
+    assert turned == pytest.approx(angle_deg, abs=0.1)
+    assert straightness > 0.5
+
+
+def test_edges_in_all_directions_have_no_straightness():
+    noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
+    assert grid_direction(noise)[1] < 0.1
+    assert grid_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
+
+
+def test_the_shift_since_the_reference_is_measured_in_sensor_pixels():
+    def bayer(shift):
+        return frame_of(BLACK + 3000 * cells(0.0, side=24.0, shift=shift))
+
+    found = measure(bayer((6.0, -3.0)), bayer((0.0, 0.0)))
+    assert found.shift_px == pytest.approx((6.0, -3.0), abs=0.1)
+    assert found.match
+    assert found.match > 0.5
+    assert measure(bayer((0, 0))).shift_px is None
+    other = frame_of(np.zeros((8, 8)))
+    assert measure(bayer((0, 0)), other).shift_px is None
+
+
+@pytest.mark.parametrize("cfa", ["rggb", "bggr", "grbg", "gbrg"])
+def test_a_red_scene_is_shown_red_whatever_the_colour_phase(cfa):
+    tile = np.array([3000.0 if letter == "r" else BLACK for letter in cfa]).reshape(2, 2)
+    shown = picture(frame_of(np.tile(tile, (16, 16)), cfa), View(longest_px=32))
+    blue, green, red = shown[8:-8, 8:-8].reshape(-1, 3).mean(axis=0)
+    assert red > 200
+    assert max(blue, green) < 10
+
+
+def test_one_saturated_pixel_of_a_large_frame_is_seen():
+    mosaic = np.full((1200, 1600), 1000)
+    mosaic[601, 801] = WHITE
+    mosaic[3, 5] = 0
+    shown = picture(frame_of(mosaic), View(kind="mosaic", longest_px=200))
+    assert (shown == SATURATED_BGR).all(axis=2).sum() in (1, 2, 4)
+    assert (shown == CLIPPED_BGR).all(axis=2).sum() in (1, 2, 4)
+    plain = picture(frame_of(mosaic), View(kind="mosaic", longest_px=200, marked=False))
+    assert not (plain == SATURATED_BGR).all(axis=2).any()
+
+
+def test_a_zoomed_view_shows_its_part_pixel_by_pixel():
+    mosaic = np.full((64, 64), BLACK)
+    mosaic[40:44, 20:24] = WHITE - 1
+    view = View(kind="mosaic", x=22 / 64, y=42 / 64, part=1 / 16, longest_px=64)
+    assert window(view, (64, 64)) == (slice(40, 44), slice(20, 24))
+    shown = picture(frame_of(mosaic), view)
+    assert shown.shape == (64, 64, 3)
+    assert (shown > 250).all()
+    assert encoded(shown)[:2] == b"\xff\xd8"
+
+
+def test_a_dark_view_is_brightened_until_its_brightest_part_is_white():
+    mosaic = np.full((64, 64), BLACK)
+    mosaic[:, 32:] = BLACK + 40
+    dark, bright = (
+        picture(frame_of(mosaic), View(kind="mosaic", longest_px=64, bright=chosen))
+        for chosen in (False, True)
+    )
+    assert dark[:, 40:].max() < 40
+    assert bright[:, 40:].min() > 250
+    assert bright[:, :24].max() == 0
+
+
+def test_views_stay_inside_the_frame_and_refuse_nonsense():
+    assert window(View(x=1.0, y=0.0, part=0.25), (100, 200)) == (slice(0, 24), slice(150, 200))
+    wrongs: tuple[dict[str, Any], ...] = (
+        {"kind": "xray"},
+        {"x": 2.0},
+        {"x": float("nan")},
+        {"part": 0.0},
+        {"part": 3.0},
+        {"longest_px": 10**6},
+    )
+    for wrong in wrongs:
+        with pytest.raises(AppError):
+            View(**wrong)
+
+
+class FakeCamera:
+    """Frames at once; `fault` is raised instead of one when set."""
+
+    identity = CameraIdentity(model="fake")
+    shape, cfa = (16, 16), "rggb"
+    exposure_limits_s, gain_limits = (0.001, 1.0), (1.0, 1.0)
+
+    def __init__(self):
+        self.exposure_s, self.gain, self.taken = 0.01, 1.0, 0
+        self.fault: RawFrameError | None = None
+
+    def set_exposure_s(self, exposure_s):
+        if not 0.001 <= exposure_s <= 1:
+            raise ValueError(f"the exposure {exposure_s:g} s is not offered")
+        self.exposure_s = exposure_s
+
+    def set_gain(self, gain):
+        self.gain = gain
+
+    def snap(self):
+        if self.fault is not None:
+            raise self.fault
+        self.taken += 1
+        return frame_of(np.full((16, 16), 1000.0 * min(4, 100 * self.exposure_s)))
+
+    def close(self):
+        pass
+
+
+@contextmanager
+def watching(*arguments):
+    watch = Watch(*arguments)
+    watch.start()
+    try:
+        yield watch
+    finally:
+        watch.close()
+
+
+def until(watch, holds):
+    """Return the first state of which that holds."""
+    version, end_s = 0, time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        state = watch.state(version, 1.0)
+        version = state["version"]
+        if holds(state):
+            return state
+    raise AssertionError(f"never came: {state}")
+
+
+def test_frames_follow_each_other_and_wishes_are_carried_out_between_them():
+    with watching(FakeCamera()) as watch:
+        first = until(watch, lambda state: state["frame"] >= 2)
+        assert first["figures"]["histogram"].keys() == {"red", "green", "blue"}
+        watch.set_exposure_s(0.02)
+        until(watch, lambda state: state["settings"]["exposure_s"] == 0.02)
+        watch.set_exposure_s(5.0)
+        refused = until(watch, lambda state: state["trouble"]["setting"])
+        assert "5 s is not offered" in refused["trouble"]["setting"]
+        assert refused["settings"]["exposure_s"] == 0.02
+        watch.set_exposure_s(0.03)
+        until(watch, lambda state: not state["trouble"]["setting"])
+
+
+def test_a_camera_in_trouble_is_told_and_asked_again(monkeypatch):
+    monkeypatch.setattr(watch_module, "RETRY_S", 0.01)
+    camera = FakeCamera()
+    with watching(camera) as watch:
+        until(watch, lambda state: state["frame"])
+        camera.fault = RawFrameError("torn")
+        until(watch, lambda state: "torn" in state["trouble"]["camera"])
+        camera.fault = None
+        until(watch, lambda state: not state["trouble"]["camera"])
+
+
+def test_no_frame_is_taken_when_nobody_looks(monkeypatch):
+    monkeypatch.setattr(watch_module, "IDLE_S", 0.4)
+    camera = FakeCamera()
+    with watching(camera) as watch:
+        until(watch, lambda state: state["frame"])
+        time.sleep(1.0)
+        before = camera.taken
+        time.sleep(0.5)
+        assert camera.taken == before
+        until(watch, lambda state: state["frame"] > before)
+
+
+@pytest.fixture
+def rig():
+    camera, size = find_camera("rgbw-bayer-1shot"), (32, 48)
+    fine = fine_scene("near-planar", 2, 2, size=size, views=camera.views)
+    made, _ = simulated_rig(camera, fine.samples, size, 0)
+    made.attendant.set_lamp("white")
+    return made
+
+
+def centred_um(rig):
+    return {**rig.zero_um, "aperture_x": rig.zero_um["aperture_x"] + rig.window_um}
+
+
+def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
+    with watching(rig.camera, rig.stage, rig.attendant.place, ("scene",), centred_um(rig)) as watch:
+        watch.jog("mask_x", 100.0)
+        told = until(watch, lambda state: state["trouble"]["stage"])
+        assert "home" in told["trouble"]["stage"]
+        watch.centre()
+        lit = until(watch, lambda state: not state["busy"] and not state["trouble"]["stage"])
+        place_um = lit["axes"]["mask_x"]["position_um"]
+        assert place_um == pytest.approx(rig.zero_um["mask_x"], abs=0.5)
+        until(watch, lambda state: state["frame"] > lit["frame"] + 1)
+        before = mosaic_of(watch)
+        watch.jog("mask_x", 200.0)
+        moved = until(
+            watch,
+            lambda state: (
+                not state["busy"] and (state["axes"]["mask_x"]["position_um"] or 0) > place_um + 100
+            ),
+        )
+        assert moved["axes"]["mask_x"]["position_um"] == pytest.approx(place_um + 200, abs=0.5)
+        until(watch, lambda state: state["frame"] > moved["frame"] + 1)
+        after = mosaic_of(watch)
+        assert before.mean() > 2 * rig.camera.snap().black_level_dn.mean()
+        assert np.abs(after.astype(float) - before).mean() > 30
+        watch.look_at("scene")
+        with pytest.raises(AppError, match="cannot look at"):
+            watch.look_at("moon")
+        with pytest.raises(AppError, match="no axis 'x'"):
+            watch.jog("x", 1.0)
+
+
+def mosaic_of(watch):
+    frame = watch.frame()
+    assert frame is not None
+    return frame.mosaic
+
+
+class SlowStage:
+    """A stage of one axis whose moves end only when it is stopped."""
+
+    axes = ("mask_x",)
+
+    def __init__(self):
+        self.moving, self.stopped = threading.Event(), threading.Event()
+
+    def move_by_um(self, steps_um):
+        self.moving.set()
+        assert self.stopped.wait(PATIENCE_S)
+        return steps_um
+
+    def stop(self, axes=None):
+        self.stopped.set()
+
+    def limits_um(self, axis):
+        return 0.0, 1.0
+
+    def position_um(self, axis):
+        return 0.5
+
+
+def test_stop_works_in_the_middle_of_a_move_and_a_second_move_is_refused():
+    stage = SlowStage()
+    with watching(FakeCamera(), stage) as watch:
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        with pytest.raises(AppError, match="busy"):
+            watch.jog("mask_x", 1.0)
+        watch.stop()
+        until(watch, lambda state: not state["busy"])
+
+
+def test_the_end_stops_a_moving_stage():
+    stage = SlowStage()
+    with watching(FakeCamera(), stage) as watch:
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+    assert stage.stopped.is_set()
+
+
+@contextmanager
+def served(watch, **options):
+    """Serve; yield a function of method, path, body, headers to status, headers, body."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    port = listening.getsockname()[1]
+    config = uvicorn.Config(
+        application(watch, TOKEN, **options), log_level="warning", lifespan="off"
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+
+    def ask(method, path, body=None, headers=None):
+        link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        sent = {"Content-Type": "application/json"} if method == "POST" else {}
+        link.request(method, path, body, {**sent, **(headers or {})})
+        answer = link.getresponse()
+        data = answer.read()
+        link.close()
+        return answer.status, answer.headers, data
+
+    try:
+        yield ask
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE_S)
+
+
+def test_the_page_its_state_and_its_pictures_are_served():
+    with watching(FakeCamera()) as watch, served(watch) as ask:
+        until(watch, lambda state: state["frame"])
+        status, headers, page = ask("GET", f"/{TOKEN}/")
+        assert (status, headers["Referrer-Policy"]) == (200, "no-referrer")
+        assert b"emmc-rig live" in page
+        assert b"http://" not in page
+        assert b"https://" not in page
+        for name in ("page.js", "page.css"):
+            assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
+        status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
+        assert (status, headers["Content-Type"]) == (200, "image/jpeg")
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), 1)
+        assert decoded is not None
+        assert decoded.shape == (64, 64, 3)
+        state = json.loads(ask("GET", f"/{TOKEN}/state")[2])
+        assert state["settings"]["camera"] == "fake"
+
+
+def test_strangers_are_refused():
+    camera = FakeCamera()
+    good = json.dumps({"seconds": 0.05})
+    with watching(camera) as watch, served(watch) as ask:
+        until(watch, lambda state: state["frame"])
+        assert ask("GET", "/")[0] == 403
+        assert ask("GET", "/wrong/state")[0] == 403
+        assert ask("POST", "/wrong/do/exposure", good)[0] == 403
+        assert ask("GET", f"/{TOKEN}/do/exposure?seconds=0.05")[0] == 405
+        assert ask("GET", f"/{TOKEN}/state", headers={"Host": "evil.example"})[0] == 400
+        evil = {"Origin": "http://evil.example"}
+        assert ask("POST", f"/{TOKEN}/do/exposure", good, evil)[0] == 403
+        form = {"Content-Type": "application/x-www-form-urlencoded"}
+        assert ask("POST", f"/{TOKEN}/do/exposure", "seconds=1", form)[0] == 415
+        assert ask("GET", f"/{TOKEN}/..%2f..%2fetc%2fpasswd")[0] in (403, 404)
+        assert camera.exposure_s == 0.01
+        assert ask("POST", f"/{TOKEN}/do/exposure", good)[0] == 200
+        until(watch, lambda state: state["settings"]["exposure_s"] == 0.05)
+
+
+def test_values_that_make_no_sense_are_refused_in_one_line():
+    with watching(FakeCamera()) as watch, served(watch) as ask:
+        until(watch, lambda state: state["frame"])
+        for path, body in (
+            ("exposure", "not json"),
+            ("exposure", "[1]"),
+            ("exposure", "{}"),
+            ("exposure", '{"seconds": "1"}'),
+            ("exposure", '{"seconds": NaN}'),
+            ("exposure", '{"seconds": true}'),
+            ("exposure", '{"seconds": 1, "more": 2}'),
+            ("jog", '{"axis": "mask_x", "distance_um": 1}'),
+            ("centre", "{}"),
+            ("look", '{"target": "moon"}'),
+        ):
+            status, _, told = ask("POST", f"/{TOKEN}/do/{path}", body)
+            assert status == 400, (path, body)
+            assert told.endswith(b"\n")
+            assert told.count(b"\n") == 1
+        assert ask("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
+        assert ask("POST", f"/{TOKEN}/do/exposure", " " * 10_000)[0] == 413
+        assert ask("GET", f"/{TOKEN}/picture.jpg?part=x")[0] == 400
+        assert ask("GET", f"/{TOKEN}/picture.jpg?part=nan")[0] == 400
+        assert ask("GET", f"/{TOKEN}/picture.jpg?kind=xray")[0] == 400
+
+
+def test_read_only_shows_and_does_nothing():
+    camera = FakeCamera()
+    with watching(camera) as watch, served(watch, read_only=True) as ask:
+        until(watch, lambda state: state["frame"])
+        status, _, told = ask("POST", f"/{TOKEN}/do/exposure", '{"seconds": 0.05}')
+        assert status == 403
+        assert b"read-only" in told
+        assert json.loads(ask("GET", f"/{TOKEN}/state")[2])["read_only"]
+        assert ask("GET", f"/{TOKEN}/picture.jpg")[0] == 200
+    assert camera.exposure_s == 0.01
+
+
+def program(*arguments):
+    code = "from emmc_rig.cli import main; main()"
+    return [sys.executable, "-c", code, "live", *arguments]
+
+
+def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
+    (tmp_path / "one").mkdir()
+    command = program("--rig", "simulated", "--size", "32x48", "--scene", "near-planar")
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    ) as running:
+        assert running.stdout is not None
+        address = running.stdout.readline().strip()
+        assert address.startswith("http://127.0.0.1:")
+        host, _, path = address.removeprefix("http://").partition("/")
+        link = http.client.HTTPConnection(host, timeout=PATIENCE_S)
+        link.request("GET", f"/{path}state")
+        assert link.getresponse().status == 200
+        link.close()
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=PATIENCE_S)
+    assert running.returncode == 0, err
+    assert "the stage stands" in out
+    assert err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (("--camera", "nonsense:"), 1, "no such kind of camera"),
+        (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
+        (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
+        (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(arguments, code, told, monkeypatch, capsys):
+    assert ended(arguments, monkeypatch) == code
+    shown = capsys.readouterr().err
+    assert told in shown.replace("\n", " ")
+    assert "Traceback" not in shown
+
+
+def ended(arguments, monkeypatch):
+    """Run the command in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["emmc-rig", "live", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return stop.value.code
+
+
+def test_a_port_in_use_is_told(monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert ended(("--rig", "simulated", "--port", port), monkeypatch) == 1
+    assert "choose another --port" in capsys.readouterr().err

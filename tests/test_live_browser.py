@@ -1,0 +1,154 @@
+"""The set-up page in a browser: it follows the camera, jogs the stage, and says what goes wrong."""
+
+import re
+import socket
+import threading
+
+import pytest
+import uvicorn
+from browsers import MARKS, open_browser
+
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.hardware import simulated_rig
+from emmc_rig.live.server import application
+from emmc_rig.live.watch import Watch
+from emmc_rig.scene import fine_scene
+
+pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
+from selenium.common.exceptions import StaleElementReferenceException  # noqa: E402
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+pytestmark = MARKS
+
+TOKEN = "a-secret"
+PATIENCE_S = 30
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def rig():
+    camera, size = find_camera("rgbw-bayer-1shot"), (48, 64)
+    fine = fine_scene("near-planar", 2, 2, size=size, views=camera.views)
+    made, _ = simulated_rig(camera, fine.samples, size, 0)
+    made.attendant.set_lamp("white")
+    return made
+
+
+@pytest.fixture(scope="module")
+def address(rig):
+    centre_um = {**rig.zero_um, "aperture_x": rig.zero_um["aperture_x"] + rig.window_um}
+    watch = Watch(rig.camera, rig.stage, rig.attendant.place, ("scene", "whiteboard"), centre_um)
+    listening = socket.create_server(("127.0.0.1", 0))
+    config = uvicorn.Config(application(watch, TOKEN), log_level="warning", lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    watch.start()
+    thread.start()
+    yield f"http://127.0.0.1:{listening.getsockname()[1]}/{TOKEN}/"
+    server.should_exit = True
+    watch.close()
+    thread.join(PATIENCE_S)
+
+
+@pytest.fixture
+def page(browser, address):
+    browser.get_log("browser")
+    browser.get(address)
+    wait(browser, lambda: frame_number(browser) > 0)
+    return browser
+
+
+def wait(driver, holds):
+    """Wait until that holds; what is drawn anew in between is looked up again."""
+    patient = WebDriverWait(driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException])
+    patient.until(lambda _: holds())
+
+
+def text(driver, name):
+    return driver.find_element(By.ID, name).text
+
+
+def frame_number(driver):
+    found = re.search(r"\d+", text(driver, "frame"))
+    return int(found.group()) if found else 0
+
+
+def click(driver, css):
+    def clicked():
+        driver.find_element(By.CSS_SELECTOR, css).click()
+        return True
+
+    wait(driver, clicked)
+
+
+def place_um(driver, axis):
+    found = re.search(
+        r"-?[\d.]+(?= um)", driver.find_element(By.CSS_SELECTOR, f"tr[data-axis={axis}]").text
+    )
+    return float(found.group()) if found else None
+
+
+def test_the_page_opens_and_its_frame_updates_without_a_complaint(page):
+    before = frame_number(page)
+    wait(page, lambda: frame_number(page) > before)
+    picture = page.find_element(By.ID, "picture")
+    wait(page, lambda: int(picture.get_attribute("naturalWidth")) > 0)
+    shown = int(picture.get_attribute("data-frame"))
+    wait(page, lambda: int(picture.get_attribute("data-frame")) > shown)
+    assert "48x64 rggb" in text(page, "camera")
+    assert page.get_log("browser") == []
+
+
+def test_centring_lights_the_picture_and_jogging_moves_the_simulated_stage(page, rig):
+    click(page, "#centre")
+    wait(page, lambda: place_um(page, "mask_x") == pytest.approx(rig.zero_um["mask_x"], abs=0.5))
+    wait(page, lambda: text(page, "busy") == "")
+    step = page.find_element(By.ID, "step")
+    step.clear()
+    step.send_keys("25")
+    click(page, "button[aria-label='mask_x up']")
+    wanted = pytest.approx(rig.zero_um["mask_x"] + 25, abs=0.5)
+    wait(page, lambda: place_um(page, "mask_x") == wanted)
+    assert rig.stage.position_um("mask_x") == wanted
+    wait(page, lambda: "0.0 %" not in page.find_element(By.CSS_SELECTOR, "#levels tr").text)
+
+
+def test_zoom_view_and_exposure_answer(page, rig):
+    click(page, "#closer")
+    assert text(page, "zoom") == "2x"
+    click(page, "#whole")
+    assert text(page, "zoom") == "1x"
+    click(page, "[data-kind=mosaic]")
+    assert (
+        page.find_element(By.CSS_SELECTOR, "[data-kind=mosaic]").get_attribute("aria-pressed")
+        == "true"
+    )
+    exposure = page.find_element(By.ID, "exposure")
+    exposure.clear()
+    exposure.send_keys("40")
+    click(page, "#exposure-form button")
+    wait(page, lambda: rig.camera.exposure_s == pytest.approx(0.04))
+
+
+def test_what_is_refused_is_told_on_the_page(page):
+    step = page.find_element(By.ID, "step")
+    step.clear()
+    step.send_keys("ten")
+    wait(
+        page,
+        lambda: page.find_element(By.CSS_SELECTOR, "button[aria-label='mask_y up']").is_enabled(),
+    )
+    click(page, "button[aria-label='mask_y up']")
+    wait(page, lambda: "not a number" in text(page, "trouble"))
+
+
+def test_a_wrong_token_is_refused(browser, address):
+    browser.get(address.replace(TOKEN, "guess"))
+    assert "wrong token" in browser.find_element(By.TAG_NAME, "body").text
+    browser.get_log("browser")

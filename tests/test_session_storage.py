@@ -1,0 +1,297 @@
+"""What a session keeps through power cuts, full disks and damage: everything it counted."""
+
+import errno
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_rigs import begun, frame_bytes, plan_and_camera, still_rig
+
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.errors import AppError
+from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
+from emmc_rig.session.prune import prune
+from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Session, only_program
+from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
+from emmc_rig.session.verify import verify
+from simulators.disk import PowerCutError, SimulatedDisk
+
+ROOT = Path("/disk")
+
+
+def run_on(disk, folder=ROOT):
+    """Begin a session, or go on with it, as a program would that knows only the disk."""
+    rig = still_rig()
+    try:
+        session, plan = Session(folder / "s", disk), plan_and_camera()[0]
+    except AppError:
+        session, plan = begun(folder, disk, rig)
+    Sequencer(session, plan, rig).run()
+    return session
+
+
+def frames_on(disk, folder=ROOT):
+    session = Session(folder / "s", disk)
+    return {frame.id: session.read(frame.id) for frame in session.frames}
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    disk = SimulatedDisk()
+    run_on(disk)
+    return disk.operations, frames_on(disk)
+
+
+def assert_whole(disk, expected):
+    """Every frame is there once, byte for byte, and the journal counts each once."""
+    session = Session(ROOT / "s", disk)
+    assert verify(session).is_complete
+    assert session.is_complete
+    assert frames_on(disk) == expected
+    files = [name for name in disk.sizes(ROOT / "s" / FRAMES) if not name.startswith(".")]
+    assert len(files) == len(expected)
+
+
+def test_a_frame_is_the_bytes_that_the_camera_gave(undisturbed):
+    _, frames = undisturbed
+    assert frames["shot-0-e1-r0"] == frame_bytes("shot-0-e1-r0", 0.04)
+    assert len(frames) == 2 + 2 * 2 + 2 * 1 + 3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_power_cut_at_any_operation_loses_and_doubles_nothing(undisturbed, seed):
+    operations, expected = undisturbed
+    rng = np.random.default_rng(seed)
+    for cut in range(1, operations + 1):
+        disk = SimulatedDisk()
+        disk.cut_power_at(cut)
+        with pytest.raises(PowerCutError):
+            run_on(disk)
+        survived = disk.after_power_cut(rng)
+        counted = _counted(survived)
+        run_on(survived)
+        assert_whole(survived, expected)
+        # What had been counted before the cut was not taken again.
+        retaken = [e["id"] for e in _frame_lines(survived)]
+        assert all(retaken.count(name) == 1 for name in counted), cut
+
+
+def _frame_lines(disk):
+    entries = Session(ROOT / "s", disk).journal.entries
+    return [entry for entry in entries if entry["kind"] == "frame"]
+
+
+def _counted(disk):
+    try:
+        session = Session(ROOT / "s", disk)
+    except AppError:
+        return []
+    return list(session.stored)
+
+
+def test_power_cuts_in_every_run_after_another_still_end_complete(undisturbed):
+    _, expected = undisturbed
+    rng = np.random.default_rng(7)
+    disk = SimulatedDisk()
+    for _ in range(200):
+        disk.cut_power_at(int(rng.integers(1, 60)))
+        try:
+            run_on(disk)
+            break
+        except PowerCutError:
+            disk = disk.after_power_cut(rng)
+    assert_whole(disk, expected)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_any_operation_that_fails_stops_the_run_and_a_resume_completes_it(undisturbed, number):
+    operations, expected = undisturbed
+    for failing in range(1, operations + 1, 4):
+        disk = SimulatedDisk()
+
+        def fail(now, name, failing=failing):
+            if now >= failing:
+                raise OSError(number, "injected")
+
+        disk.before = fail
+        with pytest.raises((OSError, AppError)):
+            run_on(disk)
+        disk.before = lambda now, name: None
+        run_on(disk)
+        assert_whole(disk, expected)
+
+
+def test_a_full_disk_keeps_what_was_counted(undisturbed):
+    _, expected = undisturbed
+    disk = SimulatedDisk(capacity_bytes=20_000)
+    with pytest.raises(OSError, match="space"):
+        run_on(disk)
+    session = Session(ROOT / "s", disk)
+    assert 0 < len(session.stored) < len(expected)
+    assert not verify(session).damaged
+    disk.capacity_bytes = float("inf")
+    run_on(disk)
+    assert_whole(disk, expected)
+
+
+def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
+    rng = np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(200):
+        disk = SimulatedDisk()
+        write_whole(disk, Path("/kept"), b"kept")
+        disk.create(Path("/loose")).write(b"loose")
+        survived = disk.after_power_cut(rng)
+        assert read_whole(survived, Path("/kept")) == b"kept"
+        names = survived.sizes(Path("/"))
+        outcomes.add(read_whole(survived, Path("/loose")) if "loose" in names else None)
+    assert {None, b"", b"loose"} <= outcomes
+    assert any(data and data != b"loose" for data in outcomes)
+
+
+def test_a_line_that_is_torn_anywhere_does_not_count():
+    line = encode_line({"kind": "frame", "id": "a", "x": 1.5})
+    assert decode_line(line[:-1]) == {"kind": "frame", "id": "a", "x": 1.5}
+    for length in range(len(line) - 1):
+        assert decode_line(line[:length]) is None
+
+
+def test_a_line_with_any_flipped_bit_does_not_count():
+    line = encode_line({"kind": "frame", "id": "a"})[:-1]
+    for place in range(len(line)):
+        for bit in range(8):
+            damaged = bytearray(line)
+            damaged[place] ^= 1 << bit
+            assert decode_line(bytes(damaged)) is None
+
+
+def test_the_heads_of_a_journal_agree_with_all_of_it():
+    """Lines with awkward names, torn and damaged ones among them."""
+    entries = [
+        {"kind": "created", "frames": 3},
+        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12, "figures": {"x": [1, 2.5]}},
+        {"kind": "frame", "id": 'b"\\', "file": "\u00e9.dng", "bytes": 0},
+        {"kind": "retry", "id": "a", "fault": "x"},
+    ]
+    data = b"".join(encode_line(entry) for entry in entries)
+    data += b"torn\n" + encode_line(entries[1]).replace(b"12", b"13") + encode_line(entries[3])
+    keys = ("kind", "id", "file", "bytes")
+    found = [decode_line(line) for line in data.split(b"\n")]
+    expected = [{k: e[k] for k in keys if k in e} for e in found if e]
+    assert [{k: e[k] for k in keys if k in e} for e in heads(data)] == expected
+    assert len(expected) == 5
+
+
+def test_a_line_after_a_torn_one_is_read(tmp_path):
+    path = tmp_path / "j"
+    path.write_bytes(encode_line({"n": 1}) + encode_line({"n": 2})[:-9])
+    Journal(SYSTEM_DISK, path).append({"n": 3})
+    again = Journal(SYSTEM_DISK, path)
+    assert [entry["n"] for entry in again.entries] == [1, 3]
+    assert again.unreadable == 1
+
+
+def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path):
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"precious")
+    target = tmp_path / "frame.dng"
+    part_of(target).symlink_to(outside)
+    with pytest.raises(OSError, match=r"."):
+        write_whole(SYSTEM_DISK, target, b"new")
+    assert outside.read_bytes() == b"precious"
+
+
+@pytest.fixture
+def on_disk(tmp_path):
+    return run_on(SYSTEM_DISK, tmp_path)
+
+
+def test_a_session_on_a_real_disk_is_complete(on_disk, undisturbed):
+    assert verify(on_disk).is_complete
+    assert {name: on_disk.read(name) for name in undisturbed[1]} == undisturbed[1]
+
+
+def test_a_torn_raw_file_is_found_and_taken_again(on_disk, tmp_path, undisturbed):
+    path = on_disk.path_of(on_disk.stored["shot-1-e0-r0"])
+    path.write_bytes(path.read_bytes()[:-7])
+    verdict = verify(Session(on_disk.folder))
+    assert "has" in verdict.damaged["shot-1-e0-r0"]
+    assert not verdict.is_complete
+    again = run_on(SYSTEM_DISK, tmp_path)
+    assert verify(again).is_complete
+    assert path.read_bytes() == undisturbed[1]["shot-1-e0-r0"]
+
+
+def test_a_flipped_bit_in_a_raw_file_is_found(on_disk):
+    path = on_disk.path_of(on_disk.stored["dark-0-r1"])
+    data = bytearray(path.read_bytes())
+    data[900] ^= 4
+    path.write_bytes(data)
+    assert "SHA-256" in verify(Session(on_disk.folder)).damaged["dark-0-r1"]
+    with pytest.raises(AppError, match="damaged"):
+        Session(on_disk.folder).read("dark-0-r1")
+
+
+def test_a_torn_journal_line_costs_one_frame(on_disk, tmp_path):
+    path = on_disk.folder / JOURNAL
+    lines = path.read_bytes().splitlines(keepends=True)
+    last_frame = max(i for i, line in enumerate(lines) if b'"kind":"frame"' in line)
+    path.write_bytes(b"".join(lines[:last_frame]) + lines[last_frame][:100])
+    torn = Session(on_disk.folder)
+    assert len(torn.missing()) == 1
+    assert verify(torn).unreadable == 1
+    again = run_on(SYSTEM_DISK, tmp_path)
+    assert verify(again).is_complete
+    assert json.loads(path.read_bytes().splitlines()[-1])["kind"] == "complete"
+
+
+def test_an_edited_plan_in_the_session_is_told(on_disk):
+    with open(on_disk.folder / PLAN, "a") as file:
+        file.write("# an afterthought\n")
+    verdict = verify(Session(on_disk.folder))
+    assert "was changed after the session began" in verdict.frozen[0]
+    assert not verdict.is_complete
+
+
+def test_a_foreign_file_is_named_and_left_alone(on_disk, tmp_path):
+    notes, stray = on_disk.folder / "notes.txt", on_disk.folder / FRAMES / "IMG_0001.DNG"
+    notes.write_text("mine")
+    stray.write_bytes(b"mine too")
+    verdict = verify(Session(on_disk.folder))
+    assert verdict.foreign == ("frames/IMG_0001.DNG", "notes.txt")
+    assert verdict.is_complete
+    run_on(SYSTEM_DISK, tmp_path)
+    prune(Session(on_disk.folder))
+    assert notes.read_text() == "mine"
+    assert stray.read_bytes() == b"mine too"
+
+
+def test_pruning_removes_leftovers_and_nothing_else(on_disk):
+    entry = on_disk.stored["dark-0-r0"]
+    on_disk.discard("dark-0-r0", "for the test")
+    part = part_of(on_disk.folder / FRAMES / "x.dng")
+    part.write_bytes(b"half")
+    before = set((on_disk.folder / FRAMES).iterdir())
+    opened = Session(on_disk.folder)
+    names, size = prune(opened, dry_run=True)
+    assert set((on_disk.folder / FRAMES).iterdir()) == before
+    assert names == sorted([f"{FRAMES}/{part.name}", f"{FRAMES}/{entry['file']}"])
+    assert size == 4 + entry["bytes"]
+    prune(opened)
+    gone = before - set((on_disk.folder / FRAMES).iterdir())
+    assert {path.name for path in gone} == {part.name, entry["file"]}
+
+
+def test_two_programs_do_not_work_on_one_session(on_disk):
+    with (
+        only_program(on_disk),
+        pytest.raises(AppError, match="another program"),
+        only_program(Session(on_disk.folder)),
+    ):
+        pass
+
+
+def test_a_folder_that_is_no_session_is_told(tmp_path):
+    with pytest.raises(AppError, match="no session"):
+        Session(tmp_path)
