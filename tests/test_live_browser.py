@@ -15,7 +15,7 @@ from emmc_rig.live.watch import Watch
 from emmc_rig.scene import fine_scene
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
-from selenium.common.exceptions import StaleElementReferenceException  # noqa: E402
+from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
