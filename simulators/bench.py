@@ -211,7 +211,7 @@ class Bench:
         self.shot = 0
         self.masks_in = True
         self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
-        self._positions_um, self._window_um, self._rng = positions_um, window_um, rng
+        self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
         self._sensor = sensor
         axes = 4 if self._errors.edge_blur_um == 0 else 6
@@ -240,8 +240,12 @@ class Bench:
         """Return one noisy frame (pixel_y, pixel_x) in DN."""
         noise, light = self._camera.sensor.noise, self._light[self.shot]
         if self._sensor is PERFECT_SENSOR:
-            return noise.expose_dn(self.readings(), exposure_s, light, self._rng)
-        return self._sensor.expose_dn(noise, self.readings(), exposure_s, light, self._rng)
+            return noise.expose_dn(self.readings(), exposure_s, light, self.rng)
+        return self._sensor.expose_dn(noise, self.readings(), exposure_s, light, self.rng)
+
+    def light(self, shot: int) -> NDArray[np.float32]:
+        """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
+        return self._light[shot]
 
     def _trace(self, at_um: Mapping[str, float]) -> Array:
         camera = self._camera

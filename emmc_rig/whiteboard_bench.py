@@ -1,0 +1,222 @@
+"""Whiteboards of a simulated bench that is wrong in every way the calibration is not told of.
+
+The only part of the calibration that knows a simulator: whoever reads whiteboards from a rig or a
+session makes the same `BoardSet`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.boards import BoardFrame, BoardSet
+from calibration.frames import average
+from calibration.whiteboard import Whiteboards, lamps_needed, measure_psi
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.sensing import ImagingMatrix
+from simulators.bench import Bench, MountingErrors
+from simulators.flaws import OpticsFlaws, SensorFlaws
+
+Array = NDArray[np.floating]
+REFERENCE_REPEATS = 4
+BOARD_LEVEL = 0.7
+RAYS_PER_VIEW = 512
+HARSH_MOUNTING = MountingErrors(
+    offset_um=(23.7, -14.2),
+    rotation_deg=0.11,
+    stretch=1.0012,
+    skew=0.0006,
+    distance_share=0.045,
+    distortion_um=1.5,
+    edge_blur_um=2.5,
+)
+HARSH_OPTICS = OpticsFlaws(
+    aperture_spread=0.04, vignetting=2.0, clear=0.94, leak=0.03, dust_specks=6
+)
+HARSH_SENSOR = SensorFlaws(
+    response_spread=0.01,
+    offset_spread_dn=1.0,
+    dark_electrons_per_s=20.0,
+    bad_share=0.002,
+    full_well_electrons=80_000.0,
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One whiteboard to take: how the bench stands, and how many frames.
+
+    stage_um: beyond the shot's own offset of the mask.
+    """
+
+    shot: int = 0
+    pinhole: tuple[int, int] | None = None
+    lamp: str = "white"
+    stage_um: tuple[float, float] = (0.0, 0.0)
+    repeats: int = 2
+
+
+@dataclass(frozen=True)
+class BenchTruth:
+    """What is wrong with the simulated bench."""
+
+    mounting: MountingErrors = HARSH_MOUNTING
+    optics: OpticsFlaws = HARSH_OPTICS
+    sensor: SensorFlaws = HARSH_SENSOR
+    rays_per_view: int = RAYS_PER_VIEW
+
+
+@dataclass
+class WhiteboardBench:
+    """A simulated bench before a white board; `scene` lets it look at a light field too."""
+
+    camera: Camera
+    size: tuple[int, int]
+    truth: BenchTruth = field(default_factory=BenchTruth)
+    seed: int = 0
+    scene: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        rows, columns = self.size
+        self._at_um = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 0.0)
+        self._window_um = 2 * max(self.camera.views) * self.camera.lens.aperture_cell_um
+        shape = (*self.camera.views, rows, columns, 3)
+        scene = np.ones(shape, np.float32) if self.scene is None else self.scene
+        self.bench = Bench(
+            self.camera,
+            scene,
+            self.size,
+            lambda: self._at_um,
+            self._window_um,
+            np.random.default_rng(self.seed),
+            self.truth.mounting,
+            self.truth.rays_per_view,
+            self.truth.optics,
+            self.truth.sensor,
+        )
+        self.bench.target = "whiteboard"
+        self._readings: dict[tuple[Setting, bool], Array] = {}
+
+    def reading(self, setting: Setting, masks_in: bool = True) -> Array:
+        """Return the noise-free reading of a setting, (pixel_y, pixel_x); the lens' falloff in it."""
+        key = (Setting(**{**vars(setting), "repeats": 1}), masks_in)
+        if key not in self._readings:
+            self._stand(setting, masks_in)
+            self._readings[key] = self.bench.readings()
+        return self._readings[key]
+
+    def _stand(self, setting: Setting, masks_in: bool) -> None:
+        moving = [
+            self.camera.shots[setting.shot].offset_um.get(name, (0.0, 0.0))
+            for name in self.camera.moving_masks
+        ]
+        shot_x, shot_y = moving[0] if moving else (0.0, 0.0)
+        self._at_um["mask_x"] = shot_x + setting.stage_um[0]
+        self._at_um["mask_y"] = shot_y + setting.stage_um[1]
+        if setting.pinhole is None:
+            self._at_um["aperture_x"], self._at_um["aperture_y"] = self._window_um, 0.0
+        else:
+            cell_um = self.camera.lens.aperture_cell_um
+            v, u = setting.pinhole
+            self._at_um["aperture_y"] = float(centred_grid(self.camera.views[0], cell_um)[v])
+            self._at_um["aperture_x"] = float(centred_grid(self.camera.views[1], cell_um)[u])
+        self.bench.shot, self.bench.lamp = setting.shot, setting.lamp
+        self.bench.masks_in = masks_in
+
+    def exposures_s(self) -> tuple[float, float]:
+        """Return the exposure of a reference, and of a whiteboard through the open aperture."""
+        noise = self.camera.sensor.noise
+        range_electrons = (noise.white_level_dn - noise.black_level_dn) / noise.gain_dn_per_electron
+        well = self.truth.sensor.full_well_electrons or range_electrons
+        light = 3 * self.camera.sensor.binning**2 if self.camera.sensor.cfa_name == "mono" else 1
+        white_s = BOARD_LEVEL * min(well, range_electrons) / (noise.electrons_per_s * light)
+        return white_s, white_s
+
+    def _frames(self, setting: Setting, exposure_s: float, masks_in: bool, count: int, what: str):
+        sensor, noise = self.truth.sensor, self.camera.sensor.noise
+        reading = self.reading(setting, masks_in)
+        light = self.bench.light(setting.shot)
+        frames = (
+            sensor.expose_dn(noise, reading, exposure_s, light, self.bench.rng)
+            for _ in range(count)
+        )
+        return average(frames, exposure_s, noise.white_level_dn, what)
+
+    def capture(
+        self, settings: Sequence[Setting], on_frame: Callable[[str], None] = lambda label: None
+    ) -> BoardSet:
+        """Return the dark frames, the references and the whiteboards asked for."""
+        reference_s, board_s = self.exposures_s()
+        dark = self._dark(board_s)
+        references, frames = {}, []
+        for shot, lamp in sorted({(one.shot, one.lamp) for one in settings}):
+            alike = next(
+                (
+                    frame
+                    for (other, named), frame in references.items()
+                    if named == lamp and self.camera.shots[other].filter
+                    == self.camera.shots[shot].filter
+                ),
+                None,
+            )
+            if alike is None:
+                label = f"reference, shot {shot + 1}, {lamp} lamp"
+                setting = Setting(shot, lamp=lamp)
+                alike = self._frames(setting, reference_s, False, REFERENCE_REPEATS, label)
+                on_frame(label)
+            references[shot, lamp] = alike
+        views = self.camera.views[0] * self.camera.views[1]
+        for setting in settings:
+            exposure_s = board_s if setting.pinhole is None else board_s * views
+            label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
+            frame = self._frames(setting, exposure_s, True, setting.repeats, label)
+            on_frame(label)
+            moved = self._stage_of(setting)
+            frames.append(BoardFrame(frame, moved, setting.shot, setting.pinhole, setting.lamp))
+        return BoardSet(dark, references, tuple(frames))
+
+    def _stage_of(self, setting: Setting) -> tuple[float, float]:
+        moving = [
+            self.camera.shots[setting.shot].offset_um.get(name, (0.0, 0.0))
+            for name in self.camera.moving_masks
+        ]
+        x, y = moving[0] if moving else (0.0, 0.0)
+        return (x + setting.stage_um[0], y + setting.stage_um[1])
+
+    def _dark(self, exposure_s: float):
+        noise = self.camera.sensor.noise
+        nothing = np.zeros_like(self.reading(Setting(), False))
+        frames = (
+            self.truth.sensor.expose_dn(noise, nothing, exposure_s, 1.0, self.bench.rng)
+            for _ in range(REFERENCE_REPEATS)
+        )
+        return average(frames, exposure_s, noise.white_level_dn, "dark frame")
+
+    def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
+        """Return the true Psi: what a noise-free sensor measures through the pinhole."""
+        lamps = lamps_needed(design)
+        ideal: Mapping = {
+            (shot, v, u, lamp): self.reading(Setting(shot, (v, u), lamp))
+            for shot, v, u in np.ndindex(design.weights.shape[:3])
+            for lamp in lamps
+        }
+        return measure_psi(self._ideal(ideal, lamps, design), design).psi
+
+    def _ideal(self, readings: Mapping, lamps: tuple[str, ...], design: ImagingMatrix):
+        from calibration.frames import MeanFrame
+        from calibration.whiteboard import IDEAL_DN
+
+        def frame(reading: Array) -> MeanFrame:
+            return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
+
+        references = {
+            (shot, lamp): frame(self.reading(Setting(shot, lamp=lamp), False))
+            for shot in range(design.shots)
+            for lamp in lamps
+        }
+        dark = frame(np.zeros(design.frames_shape[1:]))
+        return Whiteboards(dark, references, {k: frame(r) for k, r in readings.items()})
