@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,26 +42,54 @@ class BoardFrame:
 class BoardSet:
     """All that was captured at the whiteboard, whatever wrote it: a rig, a session, a simulation.
 
+    darks: lamp off, at one exposure or more; between two the dark current is drawn as a line.
     references[shot, lamp]: aperture open, masks out.
     """
 
-    dark: MeanFrame
+    darks: tuple[MeanFrame, ...]
     references: Mapping[tuple[int, str], MeanFrame]
     frames: tuple[BoardFrame, ...]
+
+    def __post_init__(self) -> None:
+        if not self.darks:
+            raise CalibrationError("no dark frame: switch the lamp off and capture at least two")
+
+    @property
+    def dark(self) -> MeanFrame:
+        """The dark frame of the shortest exposure."""
+        return min(self.darks, key=lambda frame: frame.exposure_s)
+
+    def dark_at(self, exposure_s: float) -> MeanFrame:
+        """Return the dark frame of an exposure: black level and dark current of every pixel."""
+        first, last = self.dark, max(self.darks, key=lambda frame: frame.exposure_s)
+        if last.exposure_s == first.exposure_s:
+            return first
+        share = (exposure_s - first.exposure_s) / (last.exposure_s - first.exposure_s)
+        mean = first.mean_dn + np.float32(share) * (last.mean_dn - first.mean_dn)
+        spread = first.variance_dn2 + share * (last.variance_dn2 - first.variance_dn2)
+        return MeanFrame(mean, max(spread, 0.0), min(first.count, last.count), exposure_s)
 
     @property
     def exposures(self) -> int:
         """How many frames were taken for it."""
-        taken = [self.dark, *self.references.values(), *(one.frame for one in self.frames)]
+        # One reference may serve several shots.
+        references = {id(frame): frame for frame in self.references.values()}.values()
+        taken = [*self.darks, *references, *(one.frame for one in self.frames)]
         return sum(frame.count for frame in taken)
 
     def pinholes(self) -> Whiteboards:
         """Return what the free route takes: the frames through the pinhole."""
+        dark = self.dark
+
+        def as_if_dark(frame: MeanFrame) -> MeanFrame:
+            more = self.dark_at(frame.exposure_s).mean_dn - dark.mean_dn
+            return replace(frame, mean_dn=frame.mean_dn - more)
+
         return Whiteboards(
-            self.dark,
-            self.references,
+            dark,
+            {key: as_if_dark(frame) for key, frame in self.references.items()},
             {
-                (one.shot, *one.pinhole, one.lamp): one.frame
+                (one.shot, *one.pinhole, one.lamp): as_if_dark(one.frame)
                 for one in self.frames
                 if one.pinhole is not None
             },
@@ -69,7 +97,7 @@ class BoardSet:
 
     def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:
         """Return the same dark and reference frames with other whiteboards."""
-        return BoardSet(self.dark, self.references, tuple(frames))
+        return BoardSet(self.darks, self.references, tuple(frames))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,20 +155,20 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        found.append(_board(one, reference, boards.dark, gain, design, good))
+        found.append(_board(one, reference, boards, gain, design, good))
     return found
 
 
 def _board(
     one: BoardFrame,
     reference: MeanFrame,
-    dark: MeanFrame,
+    boards: BoardSet,
     gain: SensorGain,
     design: ImagingMatrix,
     good: NDArray[np.bool_],
 ) -> Board:
-    signal, signal_variance = _signal(one.frame, dark, gain)
-    white, white_variance = _signal(reference, dark, gain)
+    signal, signal_variance = _signal(one.frame, boards, gain)
+    white, white_variance = _signal(reference, boards, gain)
     bright = white * reference.exposure_s > DARKEST_REFERENCE_DN
     if bright.mean() < 0.5:
         raise CalibrationError(
@@ -177,8 +205,9 @@ def _board(
     )
 
 
-def _signal(frame: MeanFrame, dark: MeanFrame, gain: SensorGain) -> tuple[Array, Array]:
+def _signal(frame: MeanFrame, boards: BoardSet, gain: SensorGain) -> tuple[Array, Array]:
     """Return DN per second above the dark, and its variance."""
+    dark = boards.dark_at(frame.exposure_s)
     signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
     variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
     return signal / frame.exposure_s, variance / frame.exposure_s**2
@@ -192,7 +221,10 @@ def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
     at least a fifth of its level.
     """
     dark = boards.dark.mean_dn.astype(np.float64)
-    good = np.abs(dark - np.median(dark)) <= 10 * max(_spread(dark), 0.5)
+    good = np.ones(dark.shape, dtype=bool)
+    for one in boards.darks:
+        level = one.mean_dn.astype(np.float64)
+        good &= np.abs(level - np.median(level)) <= 10 * max(_spread(level), 0.5)
     for reference in boards.references.values():
         signal = reference.mean_dn - dark
         for y in range(2):

@@ -7,9 +7,10 @@ scale. The mask is seen through the convolution of three kernels: the pixel's bo
 cell's box, and a Gaussian of deviation blur_um (rounded cells, diffraction).
 
 The coefficient of view j at pixel p is w_j(p) (leak + (clear - leak) T_j(p)), T the design's
-transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j) / sum over the views, x and u
-as shares of the picture's corner and of the aperture's: what falls off evenly over the views
-cancels against the white board seen without masks.
+transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j + falloff |u_j|^2) / sum over the
+views, x and u as shares of the picture's corner and of the aperture's: what falls off evenly over
+the views cancels against the white board seen without masks. The falloff could be part of the
+a_j; told apart, what is left of those is small.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ SCALARS = (
     "clear",
     "leak",
     "vignetting",
+    "falloff",
 )
 LEAST_BLUR_UM = 0.3
 
@@ -56,6 +58,7 @@ class Placement:
     clear: float = 1.0
     leak: float = 0.0
     vignetting: float = 0.0
+    falloff: float = 0.0
     aperture: tuple[tuple[float, ...], ...] = ()
 
     def vector(self) -> NDArray[np.float64]:
@@ -72,6 +75,7 @@ def placement_of(vector: NDArray[np.float64], views: tuple[int, ...]) -> Placeme
     scalars = dict(zip(SCALARS, map(float, vector), strict=False))
     scalars["blur_um"] = max(scalars["blur_um"], LEAST_BLUR_UM)
     scalars["distance_share"] = min(max(scalars["distance_share"], -0.9), 3.0)
+    scalars["falloff"] = min(max(scalars["falloff"], -0.9), 3.0)
     scalars["scale"] = min(max(scalars["scale"], 0.5), 2.0)
     weights = np.maximum(vector[len(SCALARS) :], 1e-3).reshape(views)
     return Placement(**scalars, aperture=tuple(tuple(map(float, row)) for row in weights))
@@ -105,7 +109,8 @@ class Tolerances:
     clear: float = 0.2
     leak: float = 0.1
     vignetting: float = 0.2
-    aperture: float = 0.3
+    falloff: float = 0.5
+    aperture: float = 0.05
 
     def deviations(self, views: tuple[int, int]) -> NDArray[np.float64]:
         """Return the deviations in the order of the parameter vector."""

@@ -186,17 +186,17 @@ def _read(
     """Set out (n,) to the readings of pixels (n, 2), and slope (n, parameter) if it has rows.
 
     numbers: size (rows, columns), binning. lengths: cell, rho, d / D, pitch, aperture cell, corner,
-    aperture corner, offset x, y, bend, clear, leak, vignetting.
+    aperture corner, offset x, y, bend, clear, leak, vignetting, falloff.
     """
     cell_um, ratio, designed, pitch_um, view_um, corner_um, far_um = lengths[:7]
-    off_x, off_y, bend, clear, leak, vignetting = lengths[7:]
+    off_x, off_y, bend, clear, leak, vignetting, falloff = lengths[7:]
     rows, columns, binning = numbers
     height, width = cells.shape[0], cells.shape[1]
     views_v, views_u = aperture.shape
     count = tables.shape[2]
     steps = tables.shape[1] - 1
     wanted = slope.shape[0] > 0
-    scalars = 11
+    scalars = 12
     parts = binning * binning
     for n in prange(pixels.shape[0]):
         across = np.empty((4, count))
@@ -211,14 +211,16 @@ def _read(
             y_um = (y - (rows - 1) / 2) * pitch_um
             x_um = (x - (columns - 1) / 2) * pitch_um
             cube = (x_um * x_um + y_um * y_um) / corner_um**3
-            weight_sum, leaning_sum = 0.0, 0.0
+            weight_sum, leaning_sum, far_sum = 0.0, 0.0, 0.0
             for v in range(views_v):
                 for u in range(views_u):
                     v_um = (v - (views_v - 1) / 2) * view_um
                     u_um = (u - (views_u - 1) / 2) * view_um
                     lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
-                    weight_sum += aperture[v, u] * (1 + vignetting * lean)
+                    far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
+                    weight_sum += aperture[v, u] * (1 + vignetting * lean + falloff * far)
                     leaning_sum += aperture[v, u] * lean
+                    far_sum += aperture[v, u] * far
             here = 0.0
             here_gradient = np.zeros(scalars + views_v * views_u)
             for v in range(views_v):
@@ -266,7 +268,8 @@ def _read(
                             by_ratio += down[0, a] * value[2] + down[2, a] * value[0]
                             by_blur += down[0, a] * value[3] + down[3, a] * value[0]
                     lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
-                    share = aperture[v, u] * (1 + vignetting * lean) / weight_sum
+                    far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
+                    share = aperture[v, u] * (1 + vignetting * lean + falloff * far) / weight_sum
                     through = leak + (clear - leak) * passed
                     here += share * through
                     if not wanted:
@@ -293,19 +296,22 @@ def _read(
                     here_gradient[8] += share * passed
                     here_gradient[9] += share * (1 - passed)
                     here_gradient[10] += aperture[v, u] * lean / weight_sum * through
+                    here_gradient[11] += aperture[v, u] * far / weight_sum * through
                     here_gradient[scalars + v * views_u + u] += (
                         share / aperture[v, u] * through
                     )
             reading += here / parts
             if wanted:
                 here_gradient[10] -= here * leaning_sum / weight_sum
+                here_gradient[11] -= here * far_sum / weight_sum
                 for v in range(views_v):
                     for u in range(views_u):
                         v_um = (v - (views_v - 1) / 2) * view_um
                         u_um = (u - (views_u - 1) / 2) * view_um
                         lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
+                        far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
                         here_gradient[scalars + v * views_u + u] -= (
-                            here * (1 + vignetting * lean) / weight_sum
+                            here * (1 + vignetting * lean + falloff * far) / weight_sum
                         )
                 for p in range(gradient.shape[0]):
                     gradient[p] += here_gradient[p] / parts
@@ -379,6 +385,7 @@ class Shadow:
                 at.clear,
                 at.leak,
                 at.vignetting,
+                at.falloff,
             ]
         )
         _read(

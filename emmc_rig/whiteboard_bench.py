@@ -22,6 +22,7 @@ from simulators.bench import Bench, MountingErrors
 from simulators.flaws import OpticsFlaws, SensorFlaws
 
 Array = NDArray[np.floating]
+DARK_REPEATS = 2
 REFERENCE_REPEATS = 4
 BOARD_LEVEL = 0.7
 RAYS_PER_VIEW = 512
@@ -151,7 +152,9 @@ class WhiteboardBench:
     ) -> BoardSet:
         """Return the dark frames, the references and the whiteboards asked for."""
         reference_s, board_s = self.exposures_s()
-        dark = self._dark(board_s)
+        views = self.camera.views[0] * self.camera.views[1]
+        exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
+        darks = tuple(self._dark(exposure_s) for exposure_s in sorted({board_s, *exposures}))
         references, frames = {}, []
         for shot, lamp in sorted({(one.shot, one.lamp) for one in settings}):
             alike = next(
@@ -169,7 +172,6 @@ class WhiteboardBench:
                 alike = self._frames(setting, reference_s, False, REFERENCE_REPEATS, label)
                 on_frame(label)
             references[shot, lamp] = alike
-        views = self.camera.views[0] * self.camera.views[1]
         for setting in settings:
             exposure_s = board_s if setting.pinhole is None else board_s * views
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
@@ -177,7 +179,7 @@ class WhiteboardBench:
             on_frame(label)
             moved = self._stage_of(setting)
             frames.append(BoardFrame(frame, moved, setting.shot, setting.pinhole, setting.lamp))
-        return BoardSet(dark, references, tuple(frames))
+        return BoardSet(darks, references, tuple(frames))
 
     def _stage_of(self, setting: Setting) -> tuple[float, float]:
         moving = [
@@ -192,7 +194,7 @@ class WhiteboardBench:
         nothing = np.zeros_like(self.reading(Setting(), False))
         frames = (
             self.truth.sensor.expose_dn(noise, nothing, exposure_s, 1.0, self.bench.rng)
-            for _ in range(REFERENCE_REPEATS)
+            for _ in range(DARK_REPEATS)
         )
         return average(frames, exposure_s, noise.white_level_dn, "dark frame")
 
