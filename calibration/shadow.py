@@ -357,6 +357,62 @@ class Shadow:
         """Return the readings (n,) and their derivatives (n, parameter), as `readings`."""
         return self._both(pixels, channels, views_open, stage_um, frame, len(pixels))
 
+    def footprints(
+        self, pixels: Pixels, views_open: NDArray[np.bool_], stage_um: tuple[float, float]
+    ) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Return where the footprints of pixels (n, 2) lie on the mask, view by open view.
+
+        Corners (n, view, 2), the first row and column of cells; shares of the cells from there
+        down and across, (n, view, cell) each; and what each view counts in the reading (n, view).
+        Pixels must be samples (binning 1).
+        """
+        mask, at = self.mask, self.placement
+        if mask.binning != 1:
+            raise CalibrationError("defects are sought on sensors whose pixels are samples")
+        ratio = mask.distance_um * (1 + at.distance_share) / mask.lens_um
+        y, x = (
+            (pixels[:, axis] - (mask.size[axis] - 1) / 2)[:, None] * mask.pitch_um
+            for axis in (0, 1)
+        )
+        chosen = np.argwhere(views_open)
+        grid_v, grid_u = (
+            (np.arange(count) - (count - 1) / 2) * mask.aperture_cell_um for count in mask.views
+        )
+        bend = at.distortion_um * (x**2 + y**2) / mask.corner_um**3
+        xi_x = (1 - ratio) * x + ratio * grid_u[chosen[:, 1]] + bend * x
+        xi_y = (1 - ratio) * y + ratio * grid_v[chosen[:, 0]] + bend * y
+        xi_x = xi_x - at.offset_x_um - stage_um[0]
+        xi_y = xi_y - at.offset_y_um - stage_um[1]
+        turn = self._turns[0] / mask.cell_um
+        height, width = mask.cells.shape[1:3]
+        starts = [
+            turn[1, 0] * xi_x + turn[1, 1] * xi_y + height / 2 - self._reach,
+            turn[0, 0] * xi_x + turn[0, 1] * xi_y + width / 2 - self._reach,
+        ]
+        corners = np.stack([np.floor(start).astype(np.int64) for start in starts], axis=-1)
+        shares = []
+        for axis, start in enumerate(starts):
+            place = np.rint((start - corners[..., axis]) * TABLE_STEPS).astype(np.int64)
+            shares.append(self._tables[0][place])
+
+        def counted(v: Array, u: Array, y: Array, x: Array) -> Array:
+            leaning = (x * u + y * v) / (mask.corner_um * self._far_um)
+            far = (u**2 + v**2) / self._far_um**2
+            return 1 + at.vignetting * leaning + at.falloff * far
+
+        every = np.argwhere(np.ones(mask.views, dtype=bool))
+        totals = sum(
+            self._aperture[v, u] * counted(grid_v[v], grid_u[u], y[:, 0], x[:, 0]) for v, u in every
+        )
+        weights = np.stack(
+            [
+                self._aperture[v, u] * counted(grid_v[v], grid_u[u], y[:, 0], x[:, 0]) / totals
+                for v, u in chosen
+            ],
+            axis=1,
+        )
+        return corners, shares[0], shares[1], weights
+
     def _both(
         self,
         pixels: Pixels,
