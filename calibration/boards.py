@@ -65,7 +65,7 @@ class BoardSet:
         if last.exposure_s == first.exposure_s:
             return first
         share = (exposure_s - first.exposure_s) / (last.exposure_s - first.exposure_s)
-        mean = first.mean_dn + np.float32(share) * (last.mean_dn - first.mean_dn)
+        mean = (first.mean_dn + share * (last.mean_dn - first.mean_dn)).astype(np.float32)
         spread = first.variance_dn2 + share * (last.variance_dn2 - first.variance_dn2)
         return MeanFrame(mean, max(spread, 0.0), min(first.count, last.count), exposure_s)
 

@@ -93,9 +93,10 @@ def _entries(
     rows = starts[:, :1] + np.arange(spans[0])
     columns = starts[:, 1:] + np.arange(spans[1])
     height, width = cells.shape[:2]
-    index = np.clip(rows, 0, height - 1)[:, :, None] * width + np.clip(columns, 0, width - 1)[
-        :, None, :
-    ]
+    index = (
+        np.clip(rows, 0, height - 1)[:, :, None] * width
+        + np.clip(columns, 0, width - 1)[:, None, :]
+    )
     return index.reshape(len(pixels), -1), out.reshape(len(pixels), -1)
 
 
@@ -172,7 +173,7 @@ def _solved(
             matrix = matrix + slopes.T @ slopes
             right += slopes.T @ (residual[part] / spread)
     matrix = sparse.csc_array(matrix)
-    solution = np.atleast_1d(spsolve(matrix, right))
+    solution = np.ravel(np.asarray(spsolve(matrix, right)))
     lost, deviation = np.zeros(len(place)), np.zeros(len(place))
     lost[chosen] = np.clip(solution, -1, 1)
     deviation[chosen] = 1 / np.sqrt(matrix.diagonal())

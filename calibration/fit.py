@@ -266,8 +266,9 @@ def fit_placement(
         steps += taken
     assert normal is not None
     placement = with_aperture_mean_one(placement)
-    covariance = np.linalg.inv(normal.matrix + np.diag(prior))
-    bound = np.linalg.inv(normal.information * normal.spread**2 + np.diag(prior))
+    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior)), np.float64)
+    information = normal.information * normal.spread**2 + np.diag(prior)
+    bound = np.asarray(np.linalg.inv(information), np.float64)
     correlation = _correlation(mask, placement, samples)
     if correlation < LEAST_FIT_CORRELATION:
         raise CalibrationError(

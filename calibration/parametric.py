@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.placement import Placement
-from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
+from calibration.shadow import ANY_COLOUR, Shadow
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 

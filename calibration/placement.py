@@ -65,12 +65,12 @@ class Placement:
         """Return the parameters as one vector."""
         return np.array([*(getattr(self, name) for name in SCALARS), *np.ravel(self.aperture)])
 
-    def moved(self, step: NDArray[np.float64]) -> Placement:
+    def moved(self, step: NDArray[np.floating]) -> Placement:
         """Return the placement after a step, within what is possible."""
         return placement_of(self.vector() + step, np.shape(self.aperture))
 
 
-def placement_of(vector: NDArray[np.float64], views: tuple[int, ...]) -> Placement:
+def placement_of(vector: NDArray[np.floating], views: tuple[int, ...]) -> Placement:
     """Return the placement of a parameter vector for a grid of `views`, within what is possible."""
     scalars = dict(zip(SCALARS, map(float, vector), strict=False))
     scalars["blur_um"] = max(scalars["blur_um"], LEAST_BLUR_UM)

@@ -88,9 +88,10 @@ def information_of(
     reading, slopes = shadow.with_slopes(chosen, channels, views_open, kind.stage_um)
     variance = reading_variance(reading, kind, light)
     # The reference is divided by as well, and its noise does not average over the boards.
-    variance = variance + reading**2 * reading_variance(
-        np.ones_like(reading), Kind(None), light
-    ) / REFERENCE_FRAMES
+    variance = (
+        variance
+        + reading**2 * reading_variance(np.ones_like(reading), Kind(None), light) / REFERENCE_FRAMES
+    )
     return (slopes.T @ (slopes / variance[:, None])) * (light.pixels / SAMPLED)
 
 

@@ -1,4 +1,4 @@
-"""Where the mask's shadow lies on a whiteboard, to a fraction of a pixel, before anything is fitted.
+"""Where the mask's shadow lies on a whiteboard, to a fraction of a pixel, before any fit.
 
 The design's shadow, drawn in every colour, is correlated with the mosaic as it is, each pixel with
 the colour it sees: a phase correlation of demosaiced pictures would see the colour filters, which

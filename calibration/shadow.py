@@ -158,7 +158,7 @@ def share_tables(mask: ShadowMask, placement: Placement) -> tuple[NDArray[np.flo
             (at(places, ratio, blur_um + soft) - at(places, ratio, blur_um - soft)) / (2 * soft),
         ]
     )
-    return tables, reach
+    return tables.astype(np.float64), reach
 
 
 def _turns(placement: Placement) -> NDArray[np.float64]:
@@ -181,7 +181,18 @@ def _turns(placement: Placement) -> NDArray[np.float64]:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def _read(
-    pixels, channels, cells, tables, reach, turns, lengths, numbers, views_open, aperture, out, slope
+    pixels,
+    channels,
+    cells,
+    tables,
+    reach,
+    turns,
+    lengths,
+    numbers,
+    views_open,
+    aperture,
+    out,
+    slope,
 ):
     """Set out (n,) to the readings of pixels (n, 2), and slope (n, parameter) if it has rows.
 
@@ -275,19 +286,19 @@ def _read(
                     if not wanted:
                         continue
                     gain = share * (clear - leak)
-                    to_x = gain * (
-                        by_column * turns[0, 0, 0] + by_row * turns[0, 1, 0]
-                    ) / cell_um
-                    to_y = gain * (
-                        by_column * turns[0, 0, 1] + by_row * turns[0, 1, 1]
-                    ) / cell_um
+                    to_x = gain * (by_column * turns[0, 0, 0] + by_row * turns[0, 1, 0]) / cell_um
+                    to_y = gain * (by_column * turns[0, 0, 1] + by_row * turns[0, 1, 1]) / cell_um
                     here_gradient[0] -= to_x
                     here_gradient[1] -= to_y
                     for t in range(3):
-                        here_gradient[2 + t] += gain * (
-                            by_column * (turns[t + 1, 0, 0] * xi_x + turns[t + 1, 0, 1] * xi_y)
-                            + by_row * (turns[t + 1, 1, 0] * xi_x + turns[t + 1, 1, 1] * xi_y)
-                        ) / cell_um
+                        here_gradient[2 + t] += (
+                            gain
+                            * (
+                                by_column * (turns[t + 1, 0, 0] * xi_x + turns[t + 1, 0, 1] * xi_y)
+                                + by_row * (turns[t + 1, 1, 0] * xi_x + turns[t + 1, 1, 1] * xi_y)
+                            )
+                            / cell_um
+                        )
                     here_gradient[5] += designed * (
                         to_x * (u_um - x_um) + to_y * (v_um - y_um) + gain * by_ratio
                     )
@@ -297,9 +308,7 @@ def _read(
                     here_gradient[9] += share * (1 - passed)
                     here_gradient[10] += aperture[v, u] * lean / weight_sum * through
                     here_gradient[11] += aperture[v, u] * far / weight_sum * through
-                    here_gradient[scalars + v * views_u + u] += (
-                        share / aperture[v, u] * through
-                    )
+                    here_gradient[scalars + v * views_u + u] += share / aperture[v, u] * through
             reading += here / parts
             if wanted:
                 here_gradient[10] -= here * leaning_sum / weight_sum

@@ -53,7 +53,8 @@ class Calibration:
     """The measured Psi, how sure it is, and what turns frames into readings.
 
     deviation: standard deviation of every coefficient, shaped as `psi.weights`.
-    white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor.
+    white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor. good: (y, x),
+    pixels to use at all (None: every one).
     """
 
     psi: ImagingMatrix
@@ -61,6 +62,22 @@ class Calibration:
     dark_dn: NDArray[np.float32]
     white_dn_per_s: NDArray[np.float32]
     gain: SensorGain
+    good: NDArray[np.bool_] | None = None
+
+    def usable(self, frames_dn: Frames, white_level_dn: int) -> NDArray[np.bool_]:
+        """Return which readings to use, (shot, y, x): of good pixels, and not saturated."""
+        unsaturated = np.asarray(frames_dn) < white_level_dn
+        return unsaturated if self.good is None else unsaturated & self.good
+
+    def psi_variance(self, level: float) -> NDArray[np.float64]:
+        """Return the variance of a reading that Psi's own uncertainty makes, (shot, y, x).
+
+        level: of an even light field; coefficients are taken as independent.
+        """
+        k = self.psi.binning
+        shots, rows, columns = self.psi.frames_shape
+        summed = np.square(self.deviation, dtype=np.float64).sum(axis=(1, 2, 4))
+        return level**2 * summed.reshape(shots, rows, k, columns, k).sum(axis=(2, 4))
 
     def readings(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float32]:
         """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""

@@ -83,7 +83,8 @@ class WhiteboardBench:
 
     def __post_init__(self) -> None:
         rows, columns = self.size
-        self._at_um = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 0.0)
+        names = ("mask_x", "mask_y", "aperture_x", "aperture_y")
+        self._at_um: dict[str, float] = {name: 0.0 for name in names}
         self._window_um = 2 * max(self.camera.views) * self.camera.lens.aperture_cell_um
         shape = (*self.camera.views, rows, columns, 3)
         scene = np.ones(shape, np.float32) if self.scene is None else self.scene
@@ -103,7 +104,7 @@ class WhiteboardBench:
         self._readings: dict[tuple[Setting, bool], Array] = {}
 
     def reading(self, setting: Setting, masks_in: bool = True) -> Array:
-        """Return the noise-free reading of a setting, (pixel_y, pixel_x); the lens' falloff in it."""
+        """Return the noise-free reading of a setting, with the lens' falloff, (pixel_y, pixel_x)."""
         key = (Setting(**{**vars(setting), "repeats": 1}), masks_in)
         if key not in self._readings:
             self._stand(setting, masks_in)
@@ -161,8 +162,8 @@ class WhiteboardBench:
                 (
                     frame
                     for (other, named), frame in references.items()
-                    if named == lamp and self.camera.shots[other].filter
-                    == self.camera.shots[shot].filter
+                    if named == lamp
+                    and self.camera.shots[other].filter == self.camera.shots[shot].filter
                 ),
                 None,
             )

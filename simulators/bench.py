@@ -260,7 +260,9 @@ class Bench:
             shapes.append(frame.shape[:2])
             cells.append(frame.reshape(-1, 3))
             at_lens = plate.distance_mm >= lens.distance_mm
-            moved = (at_um["mask_x"], at_um["mask_y"]) if name in camera.moving_masks else (0.0, 0.0)
+            moved = (
+                (at_um["mask_x"], at_um["mask_y"]) if name in camera.moving_masks else (0.0, 0.0)
+            )
             errors = NO_ERRORS if at_lens else self._errors
             plates.append(self._standing(errors, plate.distance_mm, grain_um, moved))
         scene = np.ones((1, 1, 1, 1, 3), np.float32) if self.target == "whiteboard" else self._scene
