@@ -193,8 +193,11 @@ def _read(
     aperture,
     out,
     slope,
+    each,
 ):
     """Set out (n,) to the readings of pixels (n, 2), and slope (n, parameter) if it has rows.
+
+    each (n, view), if it has rows, is set to what every open view adds.
 
     numbers: size (rows, columns), binning. lengths: cell, rho, d / D, pitch, aperture cell, corner,
     aperture corner, offset x, y, bend, clear, leak, vignetting, falloff.
@@ -283,6 +286,8 @@ def _read(
                     share = aperture[v, u] * (1 + vignetting * lean + falloff * far) / weight_sum
                     through = leak + (clear - leak) * passed
                     here += share * through
+                    if each.shape[0] > 0:
+                        each[n, v * views_u + u] += share * through / parts
                     if not wanted:
                         continue
                     gain = share * (clear - leak)
@@ -353,7 +358,7 @@ class Shadow:
         channels: (n,), the colour each sees, or ANY_COLOUR. views_open: (v, u). stage_um: where
         the mask stands, x and y. frame: of the pattern.
         """
-        return self._both(pixels, channels, views_open, stage_um, frame, 0)[0]
+        return self._both(pixels, channels, views_open, stage_um, frame)[0]
 
     def with_slopes(
         self,
@@ -364,7 +369,19 @@ class Shadow:
         frame: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the readings (n,) and their derivatives (n, parameter), as `readings`."""
-        return self._both(pixels, channels, views_open, stage_um, frame, len(pixels))
+        return self._both(pixels, channels, views_open, stage_um, frame, len(pixels))[:2]
+
+    def coefficients(
+        self,
+        pixels: Pixels,
+        channels: NDArray[np.uint8],
+        stage_um: tuple[float, float] = (0.0, 0.0),
+        frame: int = 0,
+    ) -> NDArray[np.float64]:
+        """Return Psi's coefficients of pixels (n, 2) and the colours they see, (n, v, u)."""
+        every = np.ones(self.mask.views, dtype=bool)
+        each = self._both(pixels, channels, every, stage_um, frame, 0, len(pixels))[2]
+        return each.reshape(len(pixels), *self.mask.views)
 
     def footprints(
         self, pixels: Pixels, views_open: NDArray[np.bool_], stage_um: tuple[float, float]
@@ -429,11 +446,13 @@ class Shadow:
         views_open: NDArray[np.bool_],
         stage_um: tuple[float, float],
         frame: int,
-        slopes: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        slopes: int = 0,
+        views: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         mask, at = self.mask, self.placement
         out = np.empty(len(pixels))
         slope = np.empty((slopes, len(SCALARS) + self._aperture.size))
+        each = np.zeros((views, self._aperture.size))
         designed = mask.distance_um / mask.lens_um
         lengths = np.array(
             [
@@ -466,5 +485,6 @@ class Shadow:
             self._aperture,
             out,
             slope,
+            each,
         )
-        return out, slope
+        return out, slope, each
