@@ -9,7 +9,7 @@ far outside that, and large enough to matter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -214,9 +214,7 @@ def drifted(placement: Placement, drift: Array) -> Placement:
 def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> float:
     """Return the root mean square displacement of the shadow over picture and views, pixels."""
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
-    y, x = (
-        (np.linspace(0, 1, 9) - 0.5) * count * mask.pitch_um for count in mask.size
-    )
+    y, x = ((np.linspace(0, 1, 9) - 0.5) * count * mask.pitch_um for count in mask.size)
     v, u = ((np.arange(n) - (n - 1) / 2) * mask.aperture_cell_um for n in mask.views)
     yy, xx, vv, uu = np.meshgrid(y, x, v, u, indexing="ij")
     xi_x, xi_y = (1 - ratio) * xx + ratio * uu, (1 - ratio) * yy + ratio * vv
@@ -252,7 +250,9 @@ def find_drift(
     rng = np.random.default_rng(settings.seed)
     side = settings.block_px if shots < 3 else max(settings.block_px - 2, 4)
     blocks = _blocks(readings, variance, usable, colour, side, settings.blocks, rng)
-    disparities = np.linspace(-settings.disparity_px, settings.disparity_px, settings.disparity_steps)
+    disparities = np.linspace(
+        -settings.disparity_px, settings.disparity_px, settings.disparity_steps
+    )
     prior = plane_prior(mask.views, side, disparities)
     spreads = np.array([*SPREADS, *[0.1] * (shots - 1)])
     pixel_um = mask.pitch_um
@@ -269,14 +269,16 @@ def find_drift(
     here, slopes = search.scores(drift, steps)
     while taken < MOST_STEPS and not converged:
         taken += 1
-        matrix = slopes.T @ slopes + penalty
+        # Without their mean, which far from the peak is larger than what they scatter.
+        centred = slopes - slopes.mean(axis=0)
+        matrix = centred.T @ centred + penalty
         move = np.linalg.solve(matrix, slopes.sum(axis=0) - penalty @ drift)
         deviations = np.sqrt(np.diag(np.linalg.inv(matrix)))
-        value = here.sum() - 0.5 * drift @ penalty @ drift
+        value = float(here.sum() - 0.5 * drift @ penalty @ drift)
         share = 1.0
         while share > 0.05:
             trial = drift + share * move
-            found = averaged(search.evidence(trial)).sum() - 0.5 * trial @ penalty @ trial
+            found = _posterior(search, trial, penalty)
             if found > value:
                 break
             share /= 2
@@ -285,9 +287,15 @@ def find_drift(
             break
         drift = trial
         converged = bool(np.max(np.abs(share * move) / deviations) < settings.tolerance)
-        on_step(float(found))
+        on_step(found)
         here, slopes = search.scores(drift, steps)
-    covariance = _sandwich(search, drift, steps, slopes, penalty)
+    curvature = _curvature(search, drift, steps, penalty)
+    move = np.linalg.solve(curvature, slopes.sum(axis=0) - penalty @ drift)
+    if _posterior(search, drift + move, penalty) > _posterior(search, drift, penalty):
+        drift = drift + move
+    middle = slopes.T @ slopes + penalty
+    inverse = np.linalg.inv(curvature)
+    covariance = inverse @ middle @ inverse
     statistic = float(drift[:5] @ np.linalg.solve(covariance[:5, :5], drift[:5]))
     probability = float(chi2.sf(statistic, len(KINDS)))
     moved = displacement_px(mask, placement, drift)
@@ -339,10 +347,12 @@ def _coarse(
     return best
 
 
-def _sandwich(
-    search: _Search, drift: Array, steps: Array, slopes: Array, penalty: Array
-) -> NDArray[np.float64]:
-    """Return the covariance of the drift: curvature^-1 scores^2 curvature^-1."""
+def _posterior(search: _Search, drift: Array, penalty: Array) -> float:
+    return float(averaged(search.evidence(drift)).sum() - 0.5 * drift @ penalty @ drift)
+
+
+def _curvature(search: _Search, drift: Array, steps: Array, penalty: Array) -> NDArray[np.float64]:
+    """Return minus the second derivatives of the log posterior, at least the prior's."""
     size = len(drift)
     curvature = np.empty((size, size))
     for k, step in enumerate(steps):
@@ -352,15 +362,8 @@ def _sandwich(
         behind = search.scores(drift - move, steps)[1].sum(axis=0)
         curvature[k] = -(ahead - behind) / (4 * step)
     curvature = (curvature + curvature.T) / 2 + penalty
-    values, vectors = np.linalg.eigh(curvature / np.sqrt(np.outer(np.diag(penalty), np.diag(penalty))))
-    # A direction that the captures do not tell is held by the prior alone.
-    values = np.maximum(values, 1.0)
     scale = np.sqrt(np.diag(penalty))
-    inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    middle = slopes.T @ slopes + penalty
-    return np.asarray(inverse @ middle @ inverse, dtype=np.float64)
-
-
-def stages_of(stages: Sequence[tuple[float, float]]) -> Stages:
-    """Return stage positions as plain pairs."""
-    return [(float(x), float(y)) for x, y in stages]
+    values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
+    # A direction that the captures do not tell is held by the prior alone.
+    held = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    return np.asarray(held * np.outer(scale, scale), dtype=np.float64)

@@ -125,8 +125,13 @@ def _evidences(coefficients, colours, readings, noise, down, across, grids, chos
             at = 0
             for grid in range(3):
                 _add_grid(
-                    coefficients[block], down[d], across[d], grids[grid, 0], grids[grid, 1],
-                    matrix, at,
+                    coefficients[block],
+                    down[d],
+                    across[d],
+                    grids[grid, 0],
+                    grids[grid, 1],
+                    matrix,
+                    at,
                 )
                 at += grids[grid, 1] ** 2
             coloured = matrix[:, fine:] * CHROMA_SPREAD

@@ -221,8 +221,7 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     watcher.begin("the true Psi, for comparison", None)
     exact = bench.exact_psi(design)
     errors = {
-        name: psi_error(one.psi, exact, outcome.good)
-        for name, one in outcome.calibrations.items()
+        name: psi_error(one.psi, exact, outcome.good) for name, one in outcome.calibrations.items()
     }
     metrics = {
         "camera": settings.camera_name,

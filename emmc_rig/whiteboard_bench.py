@@ -84,7 +84,7 @@ class WhiteboardBench:
     def __post_init__(self) -> None:
         rows, columns = self.size
         names = ("mask_x", "mask_y", "aperture_x", "aperture_y")
-        self._at_um: dict[str, float] = {name: 0.0 for name in names}
+        self._at_um: dict[str, float] = dict.fromkeys(names, 0.0)
         self._window_um = 2 * max(self.camera.views) * self.camera.lens.aperture_cell_um
         shape = (*self.camera.views, rows, columns, 3)
         scene = np.ones(shape, np.float32) if self.scene is None else self.scene
@@ -223,3 +223,16 @@ class WhiteboardBench:
         }
         dark = frame(np.zeros(design.frames_shape[1:]))
         return Whiteboards(dark, references, {k: frame(r) for k, r in readings.items()})
+
+    def capture_scene(self) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
+        """Return the shots of the scene, (shot, pixel_y, pixel_x) in DN, and their exposures."""
+        exposures_s = self.camera.exposures_s()
+        frames = []
+        self.bench.target = "scene"
+        try:
+            for shot, exposure_s in enumerate(exposures_s):
+                self._stand(Setting(shot), True)
+                frames.append(self.bench.expose(float(exposure_s)))
+        finally:
+            self.bench.target = "whiteboard"
+        return np.stack(frames), exposures_s
