@@ -111,7 +111,7 @@ def _blocks(
     rng: np.random.Generator,
 ) -> _Blocks:
     """Return blocks on a jittered grid whose pixels are all usable and not dark."""
-    shots, rows, columns = readings.shape
+    _, rows, columns = readings.shape
     across = max(int(np.sqrt(count * columns / rows)), 1)
     down = max(count // across, 1)
     found = []

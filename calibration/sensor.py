@@ -26,6 +26,7 @@ FIT_SHARE = 0.7
 LINEAR_RANGE = (0.05, 0.95)
 CLIPPED_SHARE = 0.01
 QUANTISATION_DN2 = 1 / 12
+BRIGHTER_DEVIATIONS = 10.0
 HOT_DEVIATIONS = 8.0
 DEAD_SHARE = 0.5
 
@@ -152,25 +153,25 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     hot = _hot(darks)
     good = ~hot
     dark_levels = [_level(pair, good, white_level_dn) for pair in darks]
-    levels, spatial, dead = [], None, np.zeros_like(hot)
-    lit: list[tuple[float, Pair]] = []
+    levels = []
+    lit, loudest = None, 0.0
     for pair in sorted(flats, key=lambda one: one.exposure_s):
         level = _level(pair, good, white_level_dn)
         levels.append(level)
-        # The pair nearest to half of saturation shows the pixels' own response.
-        if level.clipped.max() < CLIPPED_SHARE:
-            lit = [(level.exposure_s, pair)]
-    if len(levels) < 4 or not lit:
+        # A phase that saturates loses its variance: the brightest pair before that shows the
+        # pixels' own response best.
+        quietest = float(level.variance.mean(axis=0).min())
+        if level.clipped.max() < CLIPPED_SHARE and quietest > loudest:
+            lit, loudest = pair, quietest
+    if len(levels) < 4 or lit is None:
         raise CalibrationError(
             f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
             "some below saturation"
         )
-    dead = _dead(lit[0][1], darks[0])
+    dead = _dead(lit, darks[0])
     good &= ~dead
-    spatial = _spatial(lit[0][1], darks[0], good)
+    spatial = _spatial(lit, darks[0], good)
     everything = _figures(dark_levels, levels, np.arange(BLOCKS), spatial)
-    if everything["gain_dn_per_electron"] <= 0:
-        raise CalibrationError("the flats are no brighter than the dark: is the lamp on?")
     without = [
         _figures(dark_levels, levels, np.delete(np.arange(BLOCKS), block), spatial)
         for block in range(BLOCKS)
@@ -230,6 +231,8 @@ def _figures(
 ) -> dict[str, float]:
     signal, spread, times, clipped, slope, black, dark = _points(darks, flats, blocks)
     saturation = _saturation(signal, spread, clipped)
+    if saturation < BRIGHTER_DEVIATIONS * np.sqrt(dark):
+        raise CalibrationError("the flats are no brighter than the dark: is the lamp on?")
     below = (signal <= FIT_SHARE * saturation) & (signal > 0)
     if below.sum() < 3:
         raise CalibrationError(

@@ -59,6 +59,7 @@ DRIFTS = {
 }
 FITS = 24
 ALARM_RUNS = 20
+FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
 LARGE = (4000, 6000)
 
 
@@ -145,7 +146,7 @@ def _check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 def _noise_boards(
     mask: ShadowMask, settings: CalibrateSettings, wanted: list[Setting], seed: int
 ) -> tuple[list[Board], WhiteboardBench]:
-    """Return whiteboards of the soft design itself with the noise of one capture: for statistics."""
+    """Return whiteboards of the soft design with the noise of one capture: for statistics."""
     rng = np.random.default_rng(seed)
     camera = settings.camera
     bench = WhiteboardBench(camera, settings.size, settings.truth, seed)

@@ -104,7 +104,7 @@ class WhiteboardBench:
         self._readings: dict[tuple[Setting, bool], Array] = {}
 
     def reading(self, setting: Setting, masks_in: bool = True) -> Array:
-        """Return the noise-free reading of a setting, with the lens' falloff, (pixel_y, pixel_x)."""
+        """Return the noise-free reading of a setting, (pixel_y, pixel_x), the falloff in it."""
         key = (Setting(**{**vars(setting), "repeats": 1}), masks_in)
         if key not in self._readings:
             self._stand(setting, masks_in)

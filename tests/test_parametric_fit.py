@@ -144,7 +144,7 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
         designed_placement(CAMERA), offset_x_um=4.0, rotation_rad=0.001, blur_um=3.0, leak=0.02
     )
     fits = []
-    for seed in range(12):
+    for seed in range(8):
         boards = synthetic(design, truth, 0.02, seed)
         settings = FitSettings(seed=seed, first_pixels=1500)
         fits.append(fit_placement(boards, CAMERA, mask, settings, start=truth))
@@ -154,8 +154,8 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
     names = labels(VIEWS)
     told = [i for i, name in enumerate(names) if name not in fits[0].undecided][:11]
     ratio = np.mean(errors[:, told] ** 2 / bound[told])
-    # 12 x 11 nearly independent squares: their mean is known to 0.13.
-    assert ratio == pytest.approx(1.05, abs=0.45)
+    # 8 x 11 nearly independent squares: their mean is known to 0.16.
+    assert ratio == pytest.approx(1.05, abs=0.5)
     assert np.all(stated[told] < 1.25 * bound[told])
 
 
@@ -232,7 +232,7 @@ def test_the_expected_error_of_psi_is_the_error_of_psi(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
     exact = psi_at(Shadow(mask, truth), design, shot_stages(CAMERA))
     squares, expected = [], []
-    for seed in range(6):
+    for seed in range(4):
         fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, mask, start=truth)
         psi = psi_at(Shadow(mask, fit.placement), design, shot_stages(CAMERA))
         squares.append(psi.relative_difference(exact) ** 2)
