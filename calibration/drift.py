@@ -130,11 +130,19 @@ def _blocks(
             f"only {len(found)} blocks of {side} x {side} pixels are lit, unsaturated and without "
             "bad pixels: a drift cannot be told from these captures"
         )
-    inside = np.stack(np.mgrid[:side, :side], axis=-1).reshape(-1, 2)
+    inside = np.moveaxis(np.mgrid[:side, :side], 0, -1).reshape(-1, 2)
     pixels = np.array(found)[:, None, :] + inside
     y, x = pixels[..., 0], pixels[..., 1]
-    take = [array[:, y, x].transpose(1, 0, 2) for array in (colour, readings, variance)]
-    return _Blocks(pixels, take[0], take[1].astype(np.float64), take[2].astype(np.float64))
+
+    def taken(array: NDArray) -> NDArray:
+        return array[:, y, x].transpose(1, 0, 2)
+
+    return _Blocks(
+        pixels,
+        taken(colour),
+        taken(readings).astype(np.float64),
+        taken(variance).astype(np.float64),
+    )
 
 
 class _Search:

@@ -85,7 +85,7 @@ def psi_deviation(
     mask = replace(shadow.mask, binning=1)
     samples_shadow = Shadow(mask, shadow.placement)
     deviation = np.empty(design.weights.shape, dtype=np.float32)
-    shots, views_v, views_u, _, stored_colours, _ = deviation.shape
+    shots, views_v, views_u, _, stored_colours, _ = design.weights.shape
     scale = stored_colours * design.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         chosen = _one_view((views_v, views_u), v, u)

@@ -83,6 +83,7 @@ def found_for(before, shots=1, settings=QUICK, gains=(), **more):
     for shot, gain in enumerate(gains):
         readings[shot] *= gain
     colour = build_imaging_matrix(camera, SIZE).colour
+    assert colour is not None
     stages = [shot.offset_um.get("code", (0.0, 0.0)) for shot in camera.shots]
     mask = shadow_mask(camera, SIZE)
     placement = drifted(placed(), -np.array(before))
@@ -219,6 +220,7 @@ def test_a_displacement_is_counted_in_pixels_of_the_shadow():
 def test_captures_without_light_or_usable_pixels_are_refused():
     readings, variance, usable, camera = captured()
     colour = build_imaging_matrix(camera, SIZE).colour
+    assert colour is not None
     usable = usable.copy()
     usable[:, ::3, ::3] = False
     with pytest.raises(CalibrationError, match="blocks of 6 x 6 pixels are lit"):

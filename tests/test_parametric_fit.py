@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.boards import BoardFrame, BoardSet, as_readings, sensor_blemishes
-from calibration.choice import choose, judge, predicted_by_shadow
+from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
+from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
 from calibration.defects import find_defects
 from calibration.errors import CalibrationError
 from calibration.fit import FitSettings, fit_placement
 from calibration.parametric import expected_psi_error, psi_at, shot_stages
 from calibration.placement import designed_placement, labels
 from calibration.registration import register
-from calibration.routes import calibrate
+from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.whiteboard_bench import (
@@ -113,8 +113,6 @@ def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
     mask = shadow_mask(CAMERA, SIZE)
     shadow = Shadow(mask, placement)
     boards = []
-    from calibration.boards import Board
-
     pixels = np.argwhere(np.ones(SIZE, dtype=bool))
     for setting in settings:
         views_open = np.full(VIEWS, setting.pinhole is None)
@@ -205,8 +203,6 @@ def test_flicker_and_a_moved_stage_are_told_by_the_board_that_has_them(design):
     moved = replace(
         synthetic(design, replace(truth, offset_x_um=3.0), settings=FEW[2:3])[0], name="third"
     )
-    from calibration.routes import fit_advice
-
     seen = [boards[0], replace(flickered, name="second"), moved, *boards[3:]]
     fit = fit_placement(seen, CAMERA, shadow_mask(CAMERA, SIZE))
     advice = " ".join(fit_advice(fit))
@@ -264,15 +260,16 @@ def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
 
 
 def test_the_simplest_route_at_the_noise_is_chosen():
-    class Judged:
-        def __init__(self, route, chi2):
-            self.route, self.chi2 = route, chi2
+    def judged(route, chi2):
+        return HeldOut(route, chi2, chi2, 0.0, 0.0, np.zeros((2, 2), np.float32))
 
-    pick = lambda *pairs: choose([Judged(*pair) for pair in pairs])[0].route  # noqa: E731
+    def pick(*pairs):
+        return choose([judged(*pair) for pair in pairs])[0].route
+
     assert pick(("free", 1.0), ("mixed", 1.1), ("parametric", 1.2)) == "parametric"
     assert pick(("parametric", 3.0), ("mixed", 1.2), ("free", 1.0)) == "mixed"
     assert pick(("parametric", 9.0), ("mixed", 5.0), ("free", 2.5)) == "free"
-    assert "none reaches the noise" in choose([Judged("mixed", 8.0)])[1]
+    assert "none reaches the noise" in choose([judged("mixed", 8.0)])[1]
 
 
 def test_dark_current_is_drawn_as_a_line_between_two_dark_exposures(few):

@@ -45,7 +45,7 @@ def sharp(camera):
 
 
 def everywhere(size=SIZE):
-    return np.stack(np.mgrid[: size[0], : size[1]], axis=-1).reshape(-1, 2)
+    return np.moveaxis(np.mgrid[: size[0], : size[1]], 0, -1).reshape(-1, 2)
 
 
 @pytest.mark.parametrize(("cfa", "binning"), [("rggb", 1), ("mono", 1), ("rggb", 2), ("mono", 2)])
@@ -63,6 +63,7 @@ def test_an_open_whiteboard_is_the_sum_of_the_coefficients():
     design = build_imaging_matrix(camera, SIZE)
     shadow = Shadow(shadow_mask(camera, SIZE), sharp(camera))
     every = np.ones(VIEWS, dtype=bool)
+    assert design.colour is not None
     read = shadow.readings(everywhere(), design.colour[0].ravel(), every)
     white = design.forward(np.ones(design.light_field_shape, np.float32))[0]
     np.testing.assert_allclose(read.reshape(SIZE), white, atol=2e-4)
