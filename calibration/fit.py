@@ -81,7 +81,8 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`; bound: likewise, the
     inverse of the Fisher information of the readings used (with the prior), which it does not
     fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
-    parameters that the prior decides more than the whiteboards.
+    parameters that the prior decides more than the whiteboards. history: robust deviation of the
+    residuals over the noise after every step, at least 1.
     """
 
     placement: Placement
@@ -337,10 +338,10 @@ def _descend(
         size = float(np.max(np.abs(trial.vector() - placement.vector()) / deviations))
         if found <= value:
             placement = trial
-        history.append(min(found, value))
-        if on_step is not None:
-            on_step(history[-1])
         normal = _normal(mask, placement, samples)
+        history.append(normal.spread)
+        if on_step is not None:
+            on_step(normal.spread)
         if size < settings.tolerance or found > value:
             return placement, step + 1, True, normal
     return placement, settings.max_steps, False, normal

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calibration.boards import BoardSet
+from calibration.boards import BoardSet, as_readings
 from calibration.fit import FitSettings
 from calibration.placement import SCALARS, Placement, designed_placement, labels
 from calibration.planning import (
@@ -26,8 +26,10 @@ from calibration.planning import (
     plan_free,
     plan_parametric,
 )
-from calibration.routes import Outcome, calibrate
+from calibration.routes import Outcome, Parametric, calibrate
+from calibration.sensor import SensorSheet, characterise
 from calibration.shadow import ShadowMask, shadow_mask
+from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
 from emmc_rig.calibration_report import write_calibration_report
 from emmc_rig.demo import Silent, Watcher
@@ -49,6 +51,7 @@ FREE_REPEATS = 2
 TARGET = 0.005
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
+STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class CalibrateSettings:
     seed: int = 0
     truth: BenchTruth = field(default_factory=BenchTruth)
     fit: FitSettings = field(default_factory=FitSettings)
+    map_stage: bool = False
 
 
 def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
@@ -177,6 +181,8 @@ class Run:
     held_out: BoardSet
     planned: PlannedFrames | None
     metrics: dict
+    sensor: SensorSheet
+    stage: StageMap | None
 
 
 def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None) -> Run:
@@ -218,6 +224,14 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         on_stage=lambda name: watcher.begin(name, None),
     )
     calibrated_s = time.perf_counter() - started
+    watcher.begin("sensor", None)
+    sensor = characterise(*bench.sensor_pairs(), camera.sensor.noise.white_level_dn)
+    stage = None
+    best = outcome.mixed or outcome.parametric
+    if settings.map_stage:
+        if best is None:
+            raise AppError("--stage needs a parametric route: leave --route at auto")
+        stage = measured_stage(bench, design, best, watcher)
     watcher.begin("the true Psi, for comparison", None)
     exact = bench.exact_psi(design)
     errors = {
@@ -247,13 +261,39 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         "defects": None if outcome.mixed is None else _defect_count(outcome),
         "parameters": _parameters(outcome),
         "fit": _fit_figures(outcome),
+        "sensor": {name: value for name, value, _, _ in sensor.rows()},
+        "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
         "capture_seconds": captured_s,
         "calibration_seconds": calibrated_s,
         "seed": settings.seed,
         "command": command_line(),
         "versions": versions(),
     }
-    return Run(settings, bench, outcome, few, held_out, planned, metrics)
+    return Run(settings, bench, outcome, few, held_out, planned, metrics, sensor, stage)
+
+
+def measured_stage(
+    bench: WhiteboardBench, design: ImagingMatrix, known: Parametric, watcher: Watcher
+) -> StageMap:
+    """Send the mask stage about, from both sides, and return what one whiteboard each tells."""
+    if not bench.camera.moving_masks:
+        raise AppError("--stage: no mask of this camera moves")
+    rng = np.random.default_rng(bench.seed)
+    reach = STAGE_REACH_UM
+    places_um = rng.uniform(-reach, reach, (STAGE_PLACES, 2))
+    # Every pair of sides equally often.
+    wanted = [
+        Setting(
+            stage_um=(float(x), float(y)),
+            repeats=1,
+            came_from=(1 - 2 * (k % 2), 1 - 2 * (k // 2 % 2)),
+        )
+        for k, (x, y) in enumerate(places_um)
+    ]
+    watcher.begin("whiteboards for the stage map", len(wanted))
+    boards = as_readings(bench.capture(wanted, watcher.step), design)
+    places = [locate(board, known.shadow.mask, known.fit.placement) for board in boards]
+    return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
 
 
 def psi_error(psi: ImagingMatrix, exact: ImagingMatrix, good: NDArray[np.bool_]) -> float:
@@ -348,7 +388,14 @@ def run_calibrate(
     outcome.calibration.psi.save(folder / PSI)
     placement = None if best is None else best.fit.placement
     save_calibration(folder / CALIBRATION, outcome.calibration, placement)
-    write_calibration_report(folder / REPORT, outcome, run.metrics, true_parameters(settings.truth))
+    write_calibration_report(
+        folder / REPORT,
+        outcome,
+        run.metrics,
+        true_parameters(settings.truth),
+        run.sensor,
+        run.stage,
+    )
     write_metrics(folder, run.metrics)
     return run.metrics
 

@@ -24,7 +24,7 @@ from calibration.parametric import coefficient_planes, expected_psi_error, psi_a
 from calibration.routes import calibrate
 from calibration.sensor import Pair, characterise
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
-from calibration.stage_map import locate, stage_map
+from calibration.stage_map import locate
 from calibration.whiteboard import Calibration, measure_psi
 from emmc_rig.calibrate import (
     CalibrateSettings,
@@ -32,19 +32,27 @@ from emmc_rig.calibrate import (
     free_route_error,
     free_settings,
     held_out_settings,
+    measured_stage,
     parametric_plan,
     plan_light,
     run_calibration,
     soft_design,
     true_parameters,
 )
+from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.scene import fine_scene
-from emmc_rig.whiteboard_bench import HARSH_SENSOR, BenchTruth, Setting, WhiteboardBench
+from emmc_rig.whiteboard_bench import (
+    HARSH_SENSOR,
+    BenchTruth,
+    Setting,
+    StageFaults,
+    WhiteboardBench,
+)
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -322,44 +330,33 @@ def _check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
 def _check_stage(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     """A stage of known faults, mapped from one whiteboard per position on the harsh bench."""
-    camera = settings.camera
-    size = (min(settings.size[0], 96), min(settings.size[1], 128))
-    bench = WhiteboardBench(camera, size, settings.truth, settings.seed)
-    design = build_imaging_matrix(camera, size)
-    mask = shadow_mask(camera, size)
-    few = bench.capture([*few_settings(parametric_plan(
-        camera, mask, plan_light(bench, mask), 0.01))])  # fmt: skip
-    fit = fit_placement(as_readings(few, design), camera, mask)
-    rng = np.random.default_rng(settings.seed)
-    turn, backlash, spread = np.deg2rad(0.3), np.array([2.0, 1.2]), 0.1
-    matrix = 1.0015 * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    sent = rng.uniform(-200, 200, (16, 2))
-    sides = rng.choice([-1, 1], (16, 2))
-    real = sent @ matrix.T + sides * backlash / 2 + rng.normal(0, spread, (16, 2))
-    places = []
-    errors = []
-    for commanded, stood in zip(sent, real, strict=True):
-        boards = as_readings(
-            bench.capture([Setting(stage_um=(float(stood[0]), float(stood[1])), repeats=1)]), design
-        )
-        told = replace(boards[0], stage_um=(float(commanded[0]), float(commanded[1])))
-        place = locate(told, mask, fit.placement)
-        places.append(place)
-        errors.append(np.hypot(place.x_um - stood[0], place.y_um - stood[1]))
-    found = stage_map(
-        [(float(x), float(y)) for x, y in sent], [(int(a), int(b)) for a, b in sides], places
-    )
+    camera, faults = settings.camera, StageFaults(1.0015, 0.3, (2.0, 1.2), 0.1)
+    truth = replace(settings.truth, stage=faults)
+    still = run_calibration(replace(settings, route="parametric"))
+    assert still.outcome.parametric is not None
+    bench = WhiteboardBench(camera, settings.size, truth, settings.seed)
+    design = build_imaging_matrix(camera, settings.size)
+    found = measured_stage(bench, design, still.outcome.parametric, Silent())
+    setting = Setting(stage_um=(151.0, -83.0), repeats=1, came_from=(-1, 1))
+    (board,) = as_readings(bench.capture([setting]), design)
+    parametric = still.outcome.parametric
+    place = locate(board, parametric.mask, parametric.fit.placement)
+    real = faults.real_um(setting.stage_um, setting.came_from)
+    off_um = float(np.hypot(place.x_um - real[0], place.y_um - real[1]))
     pitch_um = camera.sensor.sample_pitch_um
     rows = [
-        _row("mask located, px (root mean square)", float(np.sqrt(np.mean(np.square(errors))))
-             / pitch_um, 0.02, ".5f"),
-        Row("scale of the stage", f"{found.scale[0]:.5f}", "1.00150"),
-        Row("rotation of the stage, degrees", f"{found.rotation_deg:.4f}", "0.3000"),
+        _row("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
+        Row("scale of the stage", f"{found.scale[0]:.5f}", f"{faults.scale:.5f}"),
+        Row(
+            "rotation of the stage, degrees",
+            f"{found.rotation_deg:.4f}",
+            f"{faults.rotation_deg:.4f}",
+        ),
         Row("orthogonality, degrees", f"{found.orthogonality_deg:+.4f}", "0.0000"),
         Row("backlash x, y, um", "{:.2f}, {:.2f}".format(*found.backlash_um), "2.00, 1.20"),
         Row("repeatability x, y, um", "{:.2f}, {:.2f}".format(*found.repeatability_um), "0.10"),
-    ]  # fmt: skip
-    return rows, {"errors_um": [float(error) for error in errors]}
+    ]
+    return rows, {name: [value, deviation] for name, value, deviation, _ in found.rows()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,9 @@ def calibrate(
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="rays per view of the simulated bench")
     ] = 512,
+    stage: Annotated[
+        bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
 ) -> None:
@@ -61,6 +64,7 @@ def calibrate(
         target,
         seed,
         BenchTruth(rays_per_view=rays),
+        map_stage=stage,
     )
     if check is not None:
         from emmc_rig.calibration_check import run_checks

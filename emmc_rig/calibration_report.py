@@ -180,10 +180,10 @@ def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float])
         ],
     )  # fmt: skip
     figure, (axes,) = sheet(1, 5.2)
-    low = min(history)
-    axes.semilogy(np.arange(1, len(history) + 1), np.maximum(history, low), color=ACCENT)
+    axes.plot(np.arange(1, len(history) + 1), history, "o-", color=ACCENT, markersize=3)
+    axes.set_ylim(bottom=0)
     axes.set_xlabel("step, over widening windows", color=FAINT, fontsize=9)
-    axes.set_ylabel("robust loss", color=FAINT, fontsize=9)
+    axes.set_ylabel("typical residual / noise", color=FAINT, fontsize=9)
     title_of(axes, "Convergence")
     fit = metrics["fit"]
     told = (

@@ -7,13 +7,14 @@ session makes the same `BoardSet`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards import BoardFrame, BoardSet
 from calibration.frames import average
+from calibration.sensor import Pair
 from calibration.whiteboard import Whiteboards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
@@ -25,6 +26,9 @@ Array = NDArray[np.floating]
 DARK_REPEATS = 2
 REFERENCE_REPEATS = 4
 BOARD_LEVEL = 0.7
+DARK_EXPOSURES_S = (0.01, 1.0, 4.0)
+FLAT_SHARES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.3)
+"""Of the exposure that fills the well."""
 RAYS_PER_VIEW = 512
 HARSH_MOUNTING = MountingErrors(
     offset_um=(23.7, -14.2),
@@ -51,7 +55,8 @@ HARSH_SENSOR = SensorFlaws(
 class Setting:
     """One whiteboard to take: how the bench stands, and how many frames.
 
-    stage_um: beyond the shot's own offset of the mask.
+    stage_um: beyond the shot's own offset of the mask. came_from: the side, +1 where an axis moved
+    up to its place.
     """
 
     shot: int = 0
@@ -59,6 +64,33 @@ class Setting:
     lamp: str = "white"
     stage_um: tuple[float, float] = (0.0, 0.0)
     repeats: int = 2
+    came_from: tuple[int, int] = (1, 1)
+
+
+@dataclass(frozen=True)
+class StageFaults:
+    """How a mask stage strays: scale and turn of its axes, backlash, repeatability, in um."""
+
+    scale: float = 1.0
+    rotation_deg: float = 0.0
+    backlash_um: tuple[float, float] = (0.0, 0.0)
+    repeatability_um: float = 0.0
+
+    def real_um(
+        self, sent_um: tuple[float, float], came_from: tuple[int, int]
+    ) -> tuple[float, float]:
+        """Return where the stage stands when sent to a place from a side; the same each time."""
+        turn = np.deg2rad(self.rotation_deg)
+        x, y = sent_um
+        key = [round(value * 1e3) & 0xFFFFFFFF for value in (x, y)]
+        strays = np.random.default_rng([*key, *(side + 1 for side in came_from)])
+        off = strays.normal(0, 1, 2) * self.repeatability_um
+        # Places approached from below are where the stage says.
+        off += np.array(self.backlash_um) * (np.array(came_from) - 1) / 2
+        return (
+            float(self.scale * (np.cos(turn) * x - np.sin(turn) * y) + off[0]),
+            float(self.scale * (np.sin(turn) * x + np.cos(turn) * y) + off[1]),
+        )
 
 
 @dataclass(frozen=True)
@@ -69,6 +101,7 @@ class BenchTruth:
     optics: OpticsFlaws = HARSH_OPTICS
     sensor: SensorFlaws = HARSH_SENSOR
     rays_per_view: int = RAYS_PER_VIEW
+    stage: StageFaults = StageFaults()
 
 
 @dataclass
@@ -105,20 +138,15 @@ class WhiteboardBench:
 
     def reading(self, setting: Setting, masks_in: bool = True) -> Array:
         """Return the noise-free reading of a setting, (pixel_y, pixel_x), the falloff in it."""
-        key = (Setting(**{**vars(setting), "repeats": 1}), masks_in)
+        key = (replace(setting, repeats=1), masks_in)
         if key not in self._readings:
             self._stand(setting, masks_in)
             self._readings[key] = self.bench.readings()
         return self._readings[key]
 
     def _stand(self, setting: Setting, masks_in: bool) -> None:
-        moving = [
-            self.camera.shots[setting.shot].offset_um.get(name, (0.0, 0.0))
-            for name in self.camera.moving_masks
-        ]
-        shot_x, shot_y = moving[0] if moving else (0.0, 0.0)
-        self._at_um["mask_x"] = shot_x + setting.stage_um[0]
-        self._at_um["mask_y"] = shot_y + setting.stage_um[1]
+        real = self.truth.stage.real_um(self.sent_um(setting), setting.came_from)
+        self._at_um["mask_x"], self._at_um["mask_y"] = real
         if setting.pinhole is None:
             self._at_um["aperture_x"], self._at_um["aperture_y"] = self._window_um, 0.0
         else:
@@ -178,17 +206,37 @@ class WhiteboardBench:
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
             frame = self._frames(setting, exposure_s, True, setting.repeats, label)
             on_frame(label)
-            moved = self._stage_of(setting)
-            frames.append(BoardFrame(frame, moved, setting.shot, setting.pinhole, setting.lamp))
+            sent = self.sent_um(setting)
+            frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
         return BoardSet(darks, references, tuple(frames))
 
-    def _stage_of(self, setting: Setting) -> tuple[float, float]:
+    def sent_um(self, setting: Setting) -> tuple[float, float]:
+        """Return where a setting sends the mask stage: the shot's offset and what is beyond."""
         moving = [
             self.camera.shots[setting.shot].offset_um.get(name, (0.0, 0.0))
             for name in self.camera.moving_masks
         ]
         x, y = moving[0] if moving else (0.0, 0.0)
         return (x + setting.stage_um[0], y + setting.stage_um[1])
+
+    def sensor_pairs(self) -> tuple[list[Pair], list[Pair]]:
+        """Return pairs of dark frames, and of whiteboards without masks from dim to saturated."""
+        noise, sensor = self.camera.sensor.noise, self.truth.sensor
+        white = self.reading(Setting(), False)
+        light = self.bench.light(0)
+        full_s = self.exposures_s()[0] / BOARD_LEVEL
+
+        def pairs(reading: Array, times: Sequence[float]) -> list[Pair]:
+            return [
+                Pair(
+                    float(t),
+                    *(sensor.expose_dn(noise, reading, t, light, self.bench.rng) for _ in range(2)),
+                )
+                for t in times
+            ]
+
+        flats = pairs(white, [share * full_s for share in FLAT_SHARES])
+        return pairs(0 * white, DARK_EXPOSURES_S), flats
 
     def _dark(self, exposure_s: float):
         noise = self.camera.sensor.noise
