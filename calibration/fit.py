@@ -21,6 +21,7 @@ from pydantic import Field
 from calibration.boards import Board
 from calibration.errors import CalibrationError
 from calibration.placement import (
+    SCALARS,
     Placement,
     Tolerances,
     designed_placement,
@@ -37,6 +38,9 @@ TUKEY = 4.685
 """Times the deviation: 95 % as sure as least squares where the noise is normal."""
 CHUNK = 4096
 FIRST_WINDOW_PX = 64
+DECIDED = 0.7
+"""Of the prior's deviation: a parameter told no better stays at the design."""
+MOST_MORE = 200
 LEAST_FIT_CORRELATION = 0.7
 OFFSETS = slice(0, 2)
 
@@ -81,7 +85,8 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`; bound: likewise, the
     inverse of the Fisher information of the readings used (with the prior), which it does not
     fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
-    parameters that the prior decides more than the whiteboards. history: robust deviation of the
+    parameters that the prior decides more than the whiteboards; more_boards: how many more of the
+    same kinds would decide them (MOST_MORE: no number of them). history: robust deviation of the
     residuals over the noise after every step, at least 1.
     """
 
@@ -95,6 +100,7 @@ class Fit:
     status: str
     advice: str
     undecided: tuple[str, ...]
+    more_boards: int
     boards: tuple[BoardCheck, ...]
     history: tuple[float, ...] = field(default=())
 
@@ -277,10 +283,14 @@ def fit_placement(
             f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use the free route"
         )
-    told = np.sqrt(np.diag(covariance)) / deviations
+    told = _told(placement, covariance, tolerances)
     undecided = tuple(
-        name for name, share in zip(labels(camera.views), told, strict=True) if share > 0.7
+        name for name, share in zip(labels(camera.views), told, strict=True) if share > DECIDED
     )
+    # Precision beyond the prior's grows with the number of whiteboards.
+    have = np.maximum(1 / told**2 - 1, 1e-9)
+    lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
+    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
     kept = max(normal.kept, 1)
     return Fit(
         placement,
@@ -293,9 +303,36 @@ def fit_placement(
         "converged" if converged else "step limit reached",
         "" if converged else "raise max_steps, or capture another whiteboard",
         undecided,
+        more,
         tuple(_check(mask, placement, sample) for sample in samples),
         tuple(history),
     )
+
+
+def _told(
+    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
+) -> NDArray[np.float64]:
+    """Return every parameter's deviation over that of the prior, by their labels.
+
+    Of the aperture's weights what counts is their share of the light: neither their common level
+    nor what a falloff in their place would say is to be decided.
+    """
+    weights = np.array(placement.aperture)
+    views = weights.shape
+    prior = tolerances.deviations((views[0], views[1]))
+    share = np.sqrt(np.diag(covariance)) / prior
+    v, u = ((np.arange(count) - (count - 1) / 2) for count in views)
+    far = (v[:, None] ** 2 + u**2).ravel()
+    far = far / max(far.max(), 1e-12)
+    count, first = weights.size, len(SCALARS)
+    slopes = np.zeros((count, len(covariance)))
+    slopes[:, first:] = np.diag(1 / weights.ravel())
+    slopes[:, SCALARS.index("falloff")] = far / (1 + placement.falloff * far)
+    slopes -= slopes.mean(axis=0)
+    spread = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
+    share[first:] = np.minimum(spread / tolerances.aperture, 1.0)
+    share[SCALARS.index("falloff")] = 0.0
+    return share
 
 
 def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]:

@@ -19,7 +19,7 @@ from calibration.choice import (
 )
 from calibration.defects import Defects, find_defects
 from calibration.errors import CalibrationError
-from calibration.fit import Fit, FitSettings, fit_placement
+from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
 from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
 from calibration.placement import Tolerances
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -216,8 +216,13 @@ def fit_advice(fit: Fit) -> list[str]:
             )
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
+        more = (
+            "capture some through the pinhole"
+            if fit.more_boards >= MOST_MORE
+            else f"{fit.more_boards} more of the same kinds, or fewer through the pinhole"
+        )
         found.append(
-            f"too few whiteboards for {len(fit.undecided)} parameter(s) ({shown}): they stay at "
-            "the design; `emmc-rig calibrate --plan` says how many more"
+            f"too few whiteboards for {len(fit.undecided)} parameter(s) ({shown}), which stay at "
+            f"the design: {more}; `emmc-rig calibrate --plan` says which"
         )
     return found

@@ -13,7 +13,7 @@ Source: whiteboard calibration as in Marwah et al. (ACM TOG 2013), supplement, t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,7 @@ Frames = NDArray[np.floating] | NDArray[np.integer]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 IDEAL_DN = 1e6
+Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
 
 def lamps_needed(design: ImagingMatrix) -> tuple[str, ...]:
@@ -97,39 +98,62 @@ def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
     coefficient is shared among its samples. Raises CalibrationError for missing frames, frames
     of another size, and a whiteboard too dark to divide by.
     """
-    lamps = lamps_needed(design)
-    views_v, views_u = design.weights.shape[1:3]
-    first = boards.references.get((0, lamps[0]))
-    if first is None:
-        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
-    gain = photon_transfer(boards.dark, first)
+    gain = _gain(boards, design)
     weights = np.empty_like(design.weights)
     deviation = np.empty_like(design.weights)
+    for (shot, v, u, stored), values, spread in measured_planes(boards, design):
+        weights[shot, v, u, :, stored] = values
+        deviation[shot, v, u, :, stored] = spread
     white = np.empty(design.frames_shape, dtype=np.float32)
     for shot in range(design.shots):
-        references = [
-            _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
-            for lamp in lamps
-        ]
-        white[shot] = sum(reference for reference, _ in references)
-        for v in range(views_v):
-            for u in range(views_u):
-                for stored, lamp in enumerate(lamps):
-                    reference, reference_variance = references[stored]
-                    name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
-                    pinhole = boards.pinholes.get((shot, v, u, lamp))
-                    signal, variance = _signal(boards, gain, pinhole, name)
-                    ratio = signal / reference
-                    relative = reference_variance / reference**2
-                    spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
-                    place = (shot, v, u, slice(None), stored)
-                    share = _shares(design.weights[place], design.binning)
-                    weights[place] = share * _samples(np.maximum(ratio, 0), design.binning)
-                    deviation[place] = share * _samples(spread, design.binning)
-        weights[shot] /= len(lamps)
-        deviation[shot] /= len(lamps)
+        white[shot] = sum(reference for reference, _ in _references(boards, gain, design, shot))
     psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
+
+
+def measured_planes(boards: Whiteboards, design: ImagingMatrix) -> Iterator[Plane]:
+    """Yield ((shot, v, u, stored colour), coefficients, their deviation), both (y, x).
+
+    One plane is held at a time, and one whiteboard is asked for: `boards.pinholes` may read its
+    frames as it is asked. Raises as `measure_psi`.
+    """
+    lamps = lamps_needed(design)
+    gain = _gain(boards, design)
+    views_v, views_u = design.weights.shape[1:3]
+    for shot in range(design.shots):
+        references = _references(boards, gain, design, shot)
+        for v, u in np.ndindex(views_v, views_u):
+            for stored, lamp in enumerate(lamps):
+                reference, reference_variance = references[stored]
+                name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
+                pinhole = boards.pinholes.get((shot, v, u, lamp))
+                signal, variance = _signal(boards, gain, pinhole, name)
+                ratio = signal / reference
+                relative = reference_variance / reference**2
+                spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
+                share = _shares(design.weights[shot, v, u, :, stored], design.binning) / len(lamps)
+                yield (
+                    (shot, v, u, stored),
+                    (share * _samples(np.maximum(ratio, 0), design.binning)).astype(np.float32),
+                    (share * _samples(spread, design.binning)).astype(np.float32),
+                )
+
+
+def _gain(boards: Whiteboards, design: ImagingMatrix) -> SensorGain:
+    first = boards.references.get((0, lamps_needed(design)[0]))
+    if first is None:
+        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
+    return photon_transfer(boards.dark, first)
+
+
+def _references(
+    boards: Whiteboards, gain: SensorGain, design: ImagingMatrix, shot: int
+) -> list[tuple[Array, Array]]:
+    """Return DN per second of the references of a shot, lamp by lamp, and their variances."""
+    return [
+        _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
+        for lamp in lamps_needed(design)
+    ]
 
 
 def ideal_boards(

@@ -57,8 +57,9 @@ def write_calibration_report(
     sections = [("choice", "Chosen", _choice(outcome, metrics))]
     sections.append(("redo", "What to measure again", _advice(outcome.advice)))
     best = outcome.mixed or outcome.parametric
-    if best is not None:
-        sections.append(("fit", "Fit", _fit(metrics, truth or {}, best.fit.history)))
+    first = outcome.parametric
+    if best is not None and first is not None:
+        sections.append(("fit", "Fit", _fit(metrics, truth or {}, first.fit.history)))
     sections.append(("residuals", "Residual maps", _residuals(list(outcome.judged.values()))))
     sections.append(("psi", "Psi", _psi(outcome)))
     if sensor is not None:
@@ -244,7 +245,7 @@ def _sensor(sheet_: SensorSheet) -> str:
     transfer.set_xlabel("signal above the dark, DN", color=FAINT, fontsize=9)
     transfer.set_ylabel("temporal variance, DN²", color=FAINT, fontsize=9)
     title_of(transfer, "Photon transfer")
-    linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o-", color=ACCENT, markersize=4)
+    linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
     linearity.axhline(0, color=INK, linewidth=0.8)
     linearity.set_xlabel("exposure, s", color=FAINT, fontsize=9)
     linearity.set_ylabel("deviation from the line, %", color=FAINT, fontsize=9)

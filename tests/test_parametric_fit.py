@@ -215,6 +215,13 @@ def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
     boards = synthetic(design, designed_placement(CAMERA), 0.05, settings=FEW[:1])
     fit = fit_placement(boards, CAMERA, shadow_mask(CAMERA, SIZE))
     assert any(name.startswith("aperture") for name in fit.undecided)
+    assert fit.more_boards > 0
+    assert "too few whiteboards" in fit_advice(fit)[-1]
+    enough = fit_placement(
+        synthetic(design, designed_placement(CAMERA), 0.005), CAMERA, shadow_mask(CAMERA, SIZE)
+    )
+    assert enough.undecided == ()
+    assert enough.more_boards == 0
 
 
 def test_no_defects_are_found_on_a_clean_mask(design):

@@ -481,3 +481,15 @@ def test_psi_is_the_average_over_dense_rays(masks, offsets, rays, tolerance):
     modelled = psi.weights[0].transpose(0, 1, 2, 4, 3) * 3 * 4
     error = np.abs(modelled - passed)
     assert error.max() < tolerance, error.max()
+
+
+def test_a_psi_written_plane_by_plane_is_the_same_file(coded_psi, tmp_path):
+    psi = coded_psi(shots=2, binning=2)
+    psi.save(tmp_path / "whole.h5")
+    planes = (psi.weights[place][:, 0] for place in np.ndindex(psi.weights.shape[:3]))
+    psi.save_planes(tmp_path / "planes.h5", planes)
+    again = ImagingMatrix.load(tmp_path / "planes.h5")
+    np.testing.assert_array_equal(again.weights, psi.weights)
+    assert again.checksum() == ImagingMatrix.load(tmp_path / "whole.h5").checksum()
+    with pytest.raises(SensingError, match="one stored colour"):
+        coded_psi(cfa="mono").save_planes(tmp_path / "mono.h5", [])

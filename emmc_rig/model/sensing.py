@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -238,6 +239,40 @@ class ImagingMatrix:
                 file["weights"] = self.weights
                 if self.colour is not None:
                     file["colour"] = self.colour
+            os.replace(partial, path)
+        except OSError as fault:
+            raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+        finally:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+
+    def save_planes(self, path: Path, planes: Iterable[NDArray[np.floating]]) -> None:
+        """Write the Psi of these sizes and colours whose weights come plane by plane, (y, x).
+
+        The planes of (shot, v, u) follow one another as in `weights`, one colour stored; those of
+        `self` are not read. For sensors whose Psi does not fit into memory.
+        """
+        if self.weights.shape[4] != 1:
+            raise SensingError("planes are written of a Psi with one stored colour")
+        digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{self.camera_json}".encode())
+        partial = path.with_name(path.name + ".part")
+        try:
+            with h5py.File(partial, "w") as file:
+                weights = file.create_dataset("weights", self.weights.shape, np.float32)
+                places = np.ndindex(self.weights.shape[:3])
+                for place, plane in zip(places, planes, strict=True):
+                    values = np.ascontiguousarray(plane, dtype=np.float32)
+                    weights[(*place, slice(None), 0)] = values
+                    digest.update(values.view(np.uint8).data)
+                if self.colour is not None:
+                    file["colour"] = self.colour
+                digest.update(np.ascontiguousarray(self.colour_map).view(np.uint8).data)
+                file.attrs.update(
+                    format=FORMAT,
+                    binning=self.binning,
+                    camera=self.camera_json,
+                    sha256=digest.hexdigest(),
+                )
             os.replace(partial, path)
         except OSError as fault:
             raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
