@@ -288,7 +288,7 @@ def fit_placement(
         name for name, share in zip(labels(camera.views), told, strict=True) if share > DECIDED
     )
     # Precision beyond the prior's grows with the number of whiteboards.
-    have = np.maximum(1 / told**2 - 1, 1e-9)
+    have = np.maximum(1 / np.maximum(told, 1e-6) ** 2 - 1, 1e-9)
     lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
     kept = max(normal.kept, 1)
