@@ -136,6 +136,11 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
     )
 
 
+def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:
+    """Return a mask whose grains (row, column) have lost so much, as `find_defects` gives it."""
+    return _with_losses(_grained(mask), placement, lost)
+
+
 def _residual(shadow: Shadow, board: Board) -> Array:
     pixels = np.argwhere(board.usable)
     predicted = shadow.readings(

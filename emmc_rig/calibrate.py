@@ -33,13 +33,14 @@ from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
 from emmc_rig.calibration_report import write_calibration_report
 from emmc_rig.demo import Silent, Watcher
+from emmc_rig.drift import CALIBRATION, PSI
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
-PSI, CALIBRATION, PLAN, REPORT = "psi.h5", "calibration.h5", "plan.yaml", "report.html"
+PLAN, REPORT = "plan.yaml", "report.html"
 ROUTES = {
     "auto": ("parametric", "mixed"),
     "parametric": ("parametric",),
@@ -359,7 +360,7 @@ def true_parameters(truth: BenchTruth) -> dict[str, float]:
     }
 
 
-def save_calibration(path: Path, calibration: Calibration, placement: Placement | None) -> None:
+def save_calibration(path: Path, calibration: Calibration, known: Parametric | None) -> None:
     """Write what turns frames into readings, how sure Psi is, and the placement, as HDF5."""
     with h5py.File(path, "w") as file:
         file.attrs["gain_dn_per_electron"] = calibration.gain.gain_dn_per_electron
@@ -369,10 +370,12 @@ def save_calibration(path: Path, calibration: Calibration, placement: Placement 
         file["white_dn_per_s"] = calibration.white_dn_per_s
         if calibration.good is not None:
             file["good"] = calibration.good
-        if placement is not None:
+        if known is not None:
             for name in SCALARS:
-                file.attrs[name] = getattr(placement, name)
-            file["aperture"] = np.array(placement.aperture)
+                file.attrs[name] = getattr(known.fit.placement, name)
+            file["aperture"] = np.array(known.fit.placement.aperture)
+            if known.defects is not None:
+                file["lost"] = known.defects.lost
 
 
 def run_calibrate(
@@ -384,10 +387,9 @@ def run_calibrate(
     """
     run = run_calibration(settings, watcher)
     outcome = run.outcome
-    best = outcome.mixed if outcome.chosen == "mixed" else outcome.parametric
+    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
     outcome.calibration.psi.save(folder / PSI)
-    placement = None if best is None else best.fit.placement
-    save_calibration(folder / CALIBRATION, outcome.calibration, placement)
+    save_calibration(folder / CALIBRATION, outcome.calibration, known)
     write_calibration_report(
         folder / REPORT,
         outcome,

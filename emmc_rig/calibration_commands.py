@@ -33,6 +33,16 @@ def calibrate(
             "sensor, stage, drift, alarms, cost, frames, large; commas between, or all",
         ),
     ] = None,
+    drift: Annotated[
+        Path | None,
+        typer.Option(
+            "--drift",
+            help="a folder of frames.h5: does the Psi of --known still fit? Writes one that does",
+        ),
+    ] = None,
+    known: Annotated[
+        Path, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
+    ] = Path("emmc-calibration"),
     target: Annotated[
         float, typer.Option("--target", help="relative error of Psi to plan for")
     ] = 0.005,
@@ -51,6 +61,9 @@ def calibrate(
     from emmc_rig.output import result_folder
     from emmc_rig.whiteboard_bench import BenchTruth
 
+    if drift is not None:
+        _judge_drift(known, drift, out)
+        return
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
     rows, cross, columns = size.lower().partition("x")
@@ -103,3 +116,15 @@ def calibrate(
     for line in metrics["advice"]:
         typer.echo(f"measure again: {line}")
     typer.echo(f"open {out / 'report.html'}")
+
+
+def _judge_drift(known: Path, frames: Path, out: Path) -> None:
+    from emmc_rig.drift import run_drift
+    from emmc_rig.output import result_folder
+
+    with result_folder(out) as folder:
+        metrics = run_drift(known, frames, folder)
+    typer.echo(metrics["words"])
+    for kind, value in metrics["values"].items():
+        typer.echo(f"    {kind} {value:+.4g} +- {metrics['deviations'][kind]:.2g}")
+    typer.echo(f"use {out / 'psi.h5'}")

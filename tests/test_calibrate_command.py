@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 import yaml
 
+from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig import cli
-from emmc_rig.calibrate import CalibrateSettings, psi_error, run_calibration
-from emmc_rig.calibration_check import run_checks
+from emmc_rig.calibrate import CalibrateSettings, psi_error, run_calibrate, run_calibration
+from emmc_rig.calibration_check import moved_truth, run_checks
 from emmc_rig.calibration_report import write_calibration_report
 from emmc_rig.camera_sheet import find_camera
+from emmc_rig.drift import run_drift
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.whiteboard_bench import BenchTruth, StageFaults
+from emmc_rig.output import save_frames
+from emmc_rig.scene import fine_scene
+from emmc_rig.whiteboard_bench import BenchTruth, StageFaults, WhiteboardBench
 
 SIZE = ["--size", "32x40", "--rays", "64"]
 
@@ -156,3 +160,66 @@ def test_the_error_of_psi_leaves_bad_pixels_out(coded_psi):
     assert psi_error(other, psi, good) > 0.1
     good[0, 0] = False
     assert psi_error(other, psi, good) == 0
+
+
+@pytest.fixture(scope="module")
+def calibrated(camera_file, tmp_path_factory):
+    """A calibration on disk, and the camera."""
+    camera = find_camera(str(camera_file))
+    folder = tmp_path_factory.mktemp("known")
+    truth = BenchTruth(rays_per_view=256)
+    run_calibrate(CalibrateSettings("small", camera, (48, 64), "mixed", truth=truth), folder)
+    return folder, camera, truth
+
+
+def frames_of(folder, camera, truth):
+    fine = fine_scene("deep-occlusions", 2, 2, size=(48, 64), views=camera.views, seed=3)
+    bench = WhiteboardBench(camera, (48, 64), truth, 7, fine.samples)
+    frames, exposures_s = bench.capture_scene()
+    noise, times = camera.sensor.noise, exposures_s[:, None, None]
+    readings = noise.normalise(frames, times, 1.0)
+    deviation = np.sqrt(noise.variance(readings, times, 1.0))
+    hot, dead = truth.sensor.bad((48, 64))
+    usable = ~noise.saturated(frames) & ~(hot | dead)
+    folder.mkdir()
+    save_frames(
+        folder / "frames.h5", frames, readings, exposures_s, deviation=deviation, usable=usable
+    )
+    return folder
+
+
+def test_a_capture_after_the_mask_has_moved_is_told_and_psi_mended(calibrated, tmp_path):
+    known, camera, truth = calibrated
+    moved = moved_truth(truth, (9.0, -8.0, 0.0, 0.0, 0.0))
+    frames = frames_of(tmp_path / "frames", camera, moved)
+    out = tmp_path / "mended"
+    out.mkdir()
+    quick = DriftSettings(
+        blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6
+    )
+    told = run_drift(known, frames, out, quick)
+    assert told["drifted"]
+    assert "Psi no longer fits" in told["words"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["values"]["shift_x_um"] == pytest.approx(9.0, abs=1.0)
+    assert metrics["values"]["shift_y_um"] == pytest.approx(-8.0, abs=1.0)
+    before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
+    exact = WhiteboardBench(camera, (48, 64), moved).exact_psi(before)
+    good = np.ones((48, 64), dtype=bool)
+    assert psi_error(after, exact, good) < 0.3 * psi_error(before, exact, good)
+
+
+def test_drift_refuses_frames_of_another_size_and_a_free_psi(run, calibrated, tmp_path):
+    known, camera, truth = calibrated
+    frames = frames_of(tmp_path / "frames", camera, truth)
+    with h5py.File(frames / "frames.h5", "a") as file:
+        for name in ("readings", "deviation", "usable"):
+            cut = np.asarray(file[name])[:, :-2]
+            del file[name]
+            file[name] = cut
+    code, _, error = run("calibrate", "--drift", frames, "--known", known)
+    assert code == 1
+    assert "this calibration is for (1, 48, 64)" in " ".join(error.split())
+    code, _, error = run("calibrate", "--drift", frames, "--known", tmp_path)
+    assert code == 1
+    assert "name a folder that `emmc-rig calibrate` wrote" in " ".join(error.split())
