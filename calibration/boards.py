@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, photon_transfer
 from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]
 
@@ -130,7 +130,7 @@ def gain_of(boards: BoardSet) -> SensorGain:
 
 
 def as_readings(
-    boards: BoardSet, design: ImagingMatrix, usable: NDArray[np.bool_] | None = None
+    boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
 ) -> list[Board]:
     """Return the whiteboards as readings.
 
@@ -139,7 +139,7 @@ def as_readings(
     a reference that is missing, and whiteboards too dark to use.
     """
     gain = gain_of(boards)
-    expected = design.frames_shape[1:]
+    expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
     found = []
     for one in boards.frames:
@@ -155,7 +155,7 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        found.append(_board(one, reference, boards, gain, design, good))
+        found.append(_board(one, reference, boards, gain, layout, good))
     return found
 
 
@@ -164,7 +164,7 @@ def _board(
     reference: MeanFrame,
     boards: BoardSet,
     gain: SensorGain,
-    design: ImagingMatrix,
+    layout: PsiLayout,
     good: NDArray[np.bool_],
 ) -> Board:
     signal, signal_variance = _signal(one.frame, boards, gain)
@@ -183,14 +183,14 @@ def _board(
     reading = signal / safe
     variance = signal_variance / safe**2 + reading**2 * white_variance / safe**2
     variance = np.where(bright & good, variance, np.inf)
-    k = design.binning
-    if design.colour is not None:
-        channels = design.colour[one.shot, ::k, ::k]
+    k = layout.binning
+    if layout.colour is not None:
+        channels = layout.colour[one.shot, ::k, ::k]
     elif one.lamp in LAMP_COLOURS:
         channels = np.full(reading.shape, LAMP_COLOURS.index(one.lamp), dtype=np.uint8)
     else:
         channels = np.full(reading.shape, 3, dtype=np.uint8)
-    views_open = np.ones(design.weights.shape[1:3], dtype=bool)
+    views_open = np.ones(layout.views, dtype=bool)
     if one.pinhole is not None:
         views_open[:] = False
         views_open[one.pinhole] = True

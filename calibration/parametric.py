@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.placement import Placement
 from calibration.shadow import ANY_COLOUR, Shadow
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 ROWS = 256
 Stages = Sequence[tuple[float, float]]
@@ -31,51 +31,51 @@ def _one_view(views: tuple[int, int], v: int, u: int) -> NDArray[np.bool_]:
 
 
 def _bands(
-    design: ImagingMatrix, shot: int, stored: int
+    layout: PsiLayout, shot: int, stored: int
 ) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.uint8]]]:
     """Yield rows of samples with their indices (n, 2) and colours (n,)."""
-    rows, columns = design.size
+    rows, columns = layout.size
     for first in range(0, rows, ROWS):
         band = slice(first, min(first + ROWS, rows))
         y, x = np.mgrid[band, :columns]
         samples = np.stack([y.ravel(), x.ravel()], axis=1)
-        if design.colour is None:
+        if layout.colour is None:
             channels = np.full(len(samples), stored, dtype=np.uint8)
         else:
-            channels = design.colour[shot, band].ravel()
+            channels = layout.colour[shot, band].ravel()
         yield band, samples, channels
 
 
 def coefficient_planes(
-    shadow: Shadow, design: ImagingMatrix, stages: Stages
+    shadow: Shadow, layout: PsiLayout, stages: Stages
 ) -> Iterator[tuple[tuple[int, int, int, int], NDArray[np.float32]]]:
     """Yield ((shot, v, u, stored colour), coefficients (y, x)) of Psi, one plane in memory.
 
-    design: gives sizes and colours alone, its weights are not read. stages: per shot.
+    stages: per shot.
     """
-    shots, views_v, views_u, _, stored_colours, _ = design.weights.shape
+    shots, views_v, views_u, _, stored_colours, _ = layout.shape
     mask = replace(shadow.mask, binning=1)
     samples_shadow = Shadow(mask, shadow.placement)
-    scale = stored_colours * design.binning**2
+    scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
-        plane = np.empty(design.size, dtype=np.float32)
+        plane = np.empty(layout.size, dtype=np.float32)
         chosen = _one_view((views_v, views_u), v, u)
-        for band, samples, channels in _bands(design, shot, stored):
+        for band, samples, channels in _bands(layout, shot, stored):
             read = samples_shadow.readings(samples, channels, chosen, stages[shot], shot)
             plane[band] = read.reshape(plane[band].shape) / scale
         yield (shot, v, u, stored), plane
 
 
-def psi_at(shadow: Shadow, design: ImagingMatrix, stages: Stages) -> ImagingMatrix:
+def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
     """Return Psi with the mask stage at `stages`, one (x, y) in um per shot."""
-    weights = np.empty_like(design.weights)
-    for (shot, v, u, stored), plane in coefficient_planes(shadow, design, stages):
+    weights = np.empty(layout.shape, dtype=np.float32)
+    for (shot, v, u, stored), plane in coefficient_planes(shadow, layout, stages):
         weights[shot, v, u, :, stored] = plane
-    return ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
+    return ImagingMatrix(weights, layout.colour, layout.binning, layout.camera_json)
 
 
 def psi_deviation(
-    shadow: Shadow, design: ImagingMatrix, stages: Stages, covariance: NDArray[np.float64]
+    shadow: Shadow, layout: PsiLayout, stages: Stages, covariance: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Return the standard deviation of every coefficient, shaped as Psi's weights.
 
@@ -84,12 +84,12 @@ def psi_deviation(
     root = np.linalg.cholesky(covariance + 1e-15 * np.diag(np.diag(covariance)))
     mask = replace(shadow.mask, binning=1)
     samples_shadow = Shadow(mask, shadow.placement)
-    deviation = np.empty(design.weights.shape, dtype=np.float32)
-    shots, views_v, views_u, _, stored_colours, _ = design.weights.shape
-    scale = stored_colours * design.binning**2
+    deviation = np.empty(layout.shape, dtype=np.float32)
+    shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         chosen = _one_view((views_v, views_u), v, u)
-        for band, samples, channels in _bands(design, shot, stored):
+        for band, samples, channels in _bands(layout, shot, stored):
             slopes = samples_shadow.with_slopes(samples, channels, chosen, stages[shot], shot)[1]
             spread = np.sqrt(np.square(slopes @ root).sum(axis=1)) / scale
             target = deviation[shot, v, u, band, stored]

@@ -47,7 +47,7 @@ class Parametric:
 
     def psi(self, design: ImagingMatrix, stages: Stages) -> ImagingMatrix:
         """Return Psi with the mask stage at `stages`, (x, y) in um per shot."""
-        return psi_at(self.shadow, design, stages)
+        return psi_at(self.shadow, design.layout, stages)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def calibrate(
     for boards in (few, pinholes):
         if boards is not None:
             good &= sensor_blemishes(boards)
-    judges = as_readings(held_out, design, good)
+    judges = as_readings(held_out, design.layout, good)
     if not judges:
         raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
     parametric = mixed = None
@@ -107,7 +107,7 @@ def calibrate(
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
         on_stage("parametric fit")
-        seen = as_readings(few, design, good)
+        seen = as_readings(few, design.layout, good)
         mask = shadow_mask(camera, design.size)
         fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
         advice += fit_advice(fit)
@@ -177,7 +177,7 @@ def _calibration(
     stages = shot_stages(camera)
     psi = one.psi(design, stages)
     if np.prod(design.size) <= MOST_PIXELS_WITH_DEVIATION:
-        deviation = psi_deviation(one.shadow, design, stages, one.fit.covariance)
+        deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
     else:
         deviation = np.broadcast_to(np.float32(np.nan), psi.weights.shape)
     white = np.stack([_white(boards, design, shot) for shot in range(design.shots)])

@@ -292,7 +292,7 @@ def measured_stage(
         for k, (x, y) in enumerate(places_um)
     ]
     watcher.begin("whiteboards for the stage map", len(wanted))
-    boards = as_readings(bench.capture(wanted, watcher.step), design)
+    boards = as_readings(bench.capture(wanted, watcher.step), design.layout)
     places = [locate(board, known.shadow.mask, known.fit.placement) for board in boards]
     return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
 

@@ -41,7 +41,7 @@ from emmc_rig.calibrate import (
 )
 from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
-from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
@@ -217,10 +217,10 @@ def _check_bound(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     bound = np.mean([np.diag(fit.bound) for fit in fits], axis=0)
     ratios = np.sqrt(np.mean(errors**2, axis=0) / bound)
     design = build_imaging_matrix(settings.camera, settings.size)
-    exact = psi_at(Shadow(mask, truth), design, shot_stages(settings.camera))
+    exact = psi_at(Shadow(mask, truth), design.layout, shot_stages(settings.camera))
     reached = [
         psi_at(
-            Shadow(mask, fit.placement), design, shot_stages(settings.camera)
+            Shadow(mask, fit.placement), design.layout, shot_stages(settings.camera)
         ).relative_difference(exact)
         for fit in fits[:6]
     ]
@@ -246,7 +246,7 @@ def _check_plan(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     rows, detail = [], {}
     design = build_imaging_matrix(camera, settings.size)
     truth = soft_design(camera, mask)
-    exact = psi_at(Shadow(mask, truth), design, shot_stages(camera))
+    exact = psi_at(Shadow(mask, truth), design.layout, shot_stages(camera))
     for target in (0.02, 0.01, 0.005):
         bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
         planned = parametric_plan(camera, mask, plan_light(bench, mask), target)
@@ -254,7 +254,7 @@ def _check_plan(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         for seed in range(3):
             boards, _ = _noise_boards(mask, settings, few_settings(planned), 50 + seed)
             fit = fit_placement(boards, camera, mask, start=truth)
-            psi = psi_at(Shadow(mask, fit.placement), design, shot_stages(camera))
+            psi = psi_at(Shadow(mask, fit.placement), design.layout, shot_stages(camera))
             found.append(psi.relative_difference(exact))
         reached = float(np.sqrt(np.mean(np.square(found))))
         detail[f"{target}"] = [planned.expected_error, reached, planned.exposures]
@@ -339,7 +339,7 @@ def _check_stage(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     design = build_imaging_matrix(camera, settings.size)
     found = measured_stage(bench, design, still.outcome.parametric, Silent())
     setting = Setting(stage_um=(151.0, -83.0), repeats=1, came_from=(-1, 1))
-    (board,) = as_readings(bench.capture([setting]), design)
+    (board,) = as_readings(bench.capture([setting]), design.layout)
     parametric = still.outcome.parametric
     place = locate(board, parametric.mask, parametric.fit.placement)
     real = faults.real_um(setting.stage_um, setting.came_from)
@@ -536,10 +536,12 @@ def _check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
                 "ideal": _psnr(exact, calibration, captured),
                 "mismatched": _psnr(calibration.psi, calibration, captured),
                 "oracle": _psnr(
-                    psi_at(Shadow(shadow.mask, oracle), design, stages), calibration, captured
+                    psi_at(Shadow(shadow.mask, oracle), design.layout, stages),
+                    calibration,
+                    captured,
                 ),
                 "blind": _psnr(
-                    psi_at(Shadow(shadow.mask, found.placement), design, stages),
+                    psi_at(Shadow(shadow.mask, found.placement), design.layout, stages),
                     calibration,
                     captured,
                 ),
@@ -602,10 +604,10 @@ def _check_large(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         distance_share=0.03,
     )  # fmt: skip
     rng = np.random.default_rng(settings.seed)
-    tile = build_imaging_matrix(camera, (16, 16)).colour
-    if tile is None:
+    layout = psi_layout(camera, LARGE)
+    if layout.colour is None:
         raise AppError("the large check is for sensors with a colour filter")
-    colours = np.tile(tile[0][:2, :2], (LARGE[0] // 2, LARGE[1] // 2))
+    colours = np.ascontiguousarray(layout.colour[0])
     shadow = Shadow(mask, truth)
     boards = []
     for pinhole in (None, (2, 2), (0, 0), (4, 0), (2, 4)):
@@ -625,9 +627,8 @@ def _check_large(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     started = time.perf_counter()
     fit = fit_placement(boards, camera, mask)
     fit_s = time.perf_counter() - started
-    design = _sizes_only(camera, LARGE, colours)
     started = time.perf_counter()
-    planes = coefficient_planes(Shadow(mask, fit.placement), design, [(0.0, 0.0)])
+    planes = coefficient_planes(Shadow(mask, fit.placement), layout, [(0.0, 0.0)])
     next(planes)
     plane_s = time.perf_counter() - started
     memory_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -641,18 +642,6 @@ def _check_large(settings: CalibrateSettings) -> tuple[list[Row], dict]:
              ".6f"),
     ]  # fmt: skip
     return rows, {"fit_seconds": fit_s, "plane_seconds": plane_s, "peak_gib": memory_gib}
-
-
-def _sizes_only(camera: Camera, size: tuple[int, int], colours: NDArray[np.uint8]) -> ImagingMatrix:
-    """Return a design whose weights take no memory: one zero seen everywhere."""
-    shape = (1, *camera.views, size[0], 1, size[1])
-    weights = np.broadcast_to(np.zeros(1, np.float32), shape)
-    design = object.__new__(ImagingMatrix)
-    for name, value in (
-        ("weights", weights), ("colour", colours[None]), ("binning", 1), ("camera_json", ""),
-    ):  # fmt: skip
-        object.__setattr__(design, name, value)
-    return design
 
 
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {

@@ -98,7 +98,7 @@ def run_drift(
     )
     mended = known.psi
     if drift.drifted:
-        mended = psi_at(Shadow(known.mask, drift.placement), known.psi, stages)
+        mended = psi_at(Shadow(known.mask, drift.placement), known.psi.layout, stages)
     mended.save(out / PSI)
     metrics = {**_figures(drift), "command": command_line(), "versions": versions()}
     write_metrics(out, metrics)
