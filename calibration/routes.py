@@ -128,11 +128,9 @@ def calibrate(
         free = measure_psi(pinholes.pinholes(), design)
         calibrations["free"] = replace(free, good=good)
         first = judges[0]
-        lamp_alone = len(lamps_needed(design)) == 1
-        if lamp_alone:
-            predicted = predicted_by_psi(free.psi, first)
-            variance = prediction_variance(free.deviation, first, design.binning)
-            judged["free"] = judge("free", first, predicted, variance)
+        predicted = predicted_by_psi(free.psi, first)
+        variance = prediction_variance(free.deviation, first, design.binning)
+        judged["free"] = judge("free", first, predicted, variance)
         frames["free"] = pinholes.exposures
     chosen, why = choose([judged[name] for name in routes if name in judged])
     if chosen.chi2 > 4:

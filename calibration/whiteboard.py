@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, photon_transfer
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
 Frames = NDArray[np.floating] | NDArray[np.integer]
@@ -31,7 +31,7 @@ IDEAL_DN = 1e6
 Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
 
-def lamps_needed(design: ImagingMatrix) -> tuple[str, ...]:
+def lamps_needed(design: ImagingMatrix | PsiLayout) -> tuple[str, ...]:
     """Return the lamp colours to measure under: white alone where a pixel sees one colour only."""
     return LAMP_COLOURS if design.colour is None else ("white",)
 
@@ -98,30 +98,37 @@ def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
     coefficient is shared among its samples. Raises CalibrationError for missing frames, frames
     of another size, and a whiteboard too dark to divide by.
     """
-    gain = _gain(boards, design)
+    gain = _gain(boards, design.layout)
     weights = np.empty_like(design.weights)
     deviation = np.empty_like(design.weights)
-    for (shot, v, u, stored), values, spread in measured_planes(boards, design):
+    planes = measured_planes(boards, design.layout, design.weights)
+    for (shot, v, u, stored), values, spread in planes:
         weights[shot, v, u, :, stored] = values
         deviation[shot, v, u, :, stored] = spread
     white = np.empty(design.frames_shape, dtype=np.float32)
     for shot in range(design.shots):
-        white[shot] = sum(reference for reference, _ in _references(boards, gain, design, shot))
+        white[shot] = sum(
+            reference for reference, _ in _references(boards, gain, design.layout, shot)
+        )
     psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
 
 
-def measured_planes(boards: Whiteboards, design: ImagingMatrix) -> Iterator[Plane]:
+def measured_planes(
+    boards: Whiteboards, layout: PsiLayout, designed: Array | None = None
+) -> Iterator[Plane]:
     """Yield ((shot, v, u, stored colour), coefficients, their deviation), both (y, x).
 
     One plane is held at a time, and one whiteboard is asked for: `boards.pinholes` may read its
-    frames as it is asked. Raises as `measure_psi`.
+    frames as it is asked. designed: Psi's weights as designed, which say how a pixel's coefficient
+    is shared among its samples (default: evenly). Raises as `measure_psi`.
     """
-    lamps = lamps_needed(design)
-    gain = _gain(boards, design)
-    views_v, views_u = design.weights.shape[1:3]
-    for shot in range(design.shots):
-        references = _references(boards, gain, design, shot)
+    lamps = lamps_needed(layout)
+    gain = _gain(boards, layout)
+    views_v, views_u = layout.views
+    k = layout.binning
+    for shot in range(layout.shape[0]):
+        references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):
                 reference, reference_variance = references[stored]
@@ -131,28 +138,30 @@ def measured_planes(boards: Whiteboards, design: ImagingMatrix) -> Iterator[Plan
                 ratio = signal / reference
                 relative = reference_variance / reference**2
                 spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
-                share = _shares(design.weights[shot, v, u, :, stored], design.binning) / len(lamps)
+                share = 1 / (k**2 * len(lamps))
+                if designed is not None:
+                    share = _shares(designed[shot, v, u, :, stored], k) / len(lamps)
                 yield (
                     (shot, v, u, stored),
-                    (share * _samples(np.maximum(ratio, 0), design.binning)).astype(np.float32),
-                    (share * _samples(spread, design.binning)).astype(np.float32),
+                    (share * _samples(np.maximum(ratio, 0), k)).astype(np.float32),
+                    (share * _samples(spread, k)).astype(np.float32),
                 )
 
 
-def _gain(boards: Whiteboards, design: ImagingMatrix) -> SensorGain:
-    first = boards.references.get((0, lamps_needed(design)[0]))
+def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
+    first = boards.references.get((0, lamps_needed(layout)[0]))
     if first is None:
         raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
     return photon_transfer(boards.dark, first)
 
 
 def _references(
-    boards: Whiteboards, gain: SensorGain, design: ImagingMatrix, shot: int
+    boards: Whiteboards, gain: SensorGain, layout: PsiLayout, shot: int
 ) -> list[tuple[Array, Array]]:
     """Return DN per second of the references of a shot, lamp by lamp, and their variances."""
     return [
         _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
-        for lamp in lamps_needed(design)
+        for lamp in lamps_needed(layout)
     ]
 
 

@@ -13,6 +13,7 @@ from emmc_rig.model.camera import (
     draw_plates,
     load_camera,
     pixel_light,
+    psi_layout,
     sensor_response,
 )
 from emmc_rig.model.errors import CameraError
@@ -364,8 +365,6 @@ def test_a_mask_whose_shadow_diffraction_blurs_is_warned_about():
 @pytest.mark.parametrize("cfa", ["rggb", "mono", "x-trans", "rgbw"])
 @pytest.mark.parametrize("binning", [1, 2])
 def test_the_layout_of_psi_is_that_of_the_psi_built(cfa, binning):
-    from emmc_rig.model.camera import psi_layout
-
     camera = Camera.model_validate({"title": "x", "sensor": {"cfa": cfa, "binning": binning}})
     layout, built = psi_layout(camera, (24, 36)), build_imaging_matrix(camera, (24, 36))
     assert layout.shape == built.weights.shape

@@ -418,7 +418,7 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     period = sensor_response(camera, (tile.shape[0] * k, tile.shape[1] * k))
     single = bool((period.sum(axis=-1) <= 1).all())
     if size[0] % k or size[1] % k:
-        sensor_response(camera, size)
+        sensor_response(camera, size)  # raises, and says what to do
     colour = None
     if single:
         sides = tile.shape[0] * k, tile.shape[1] * k
