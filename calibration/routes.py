@@ -184,7 +184,8 @@ def _calibration(
 
 def _white(boards: BoardSet, design: ImagingMatrix, shot: int) -> NDArray[np.float32]:
     """Return what a reading of 1 gives in DN per second: all lamp colours together."""
-    lamps = lamps_needed(design) if (shot, "white") not in boards.references else ("white",)
+    white = {(shot, "white"), (0, "white")} & set(boards.references)
+    lamps = ("white",) if white else lamps_needed(design)
     total = np.zeros(design.frames_shape[1:], dtype=np.float64)
     for lamp in lamps:
         reference = boards.references.get((shot, lamp)) or boards.references.get((0, lamp))

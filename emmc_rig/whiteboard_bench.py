@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,7 +186,9 @@ class WhiteboardBench:
         exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
         darks = tuple(self._dark(exposure_s) for exposure_s in sorted({board_s, *exposures}))
         references, frames = {}, []
-        for shot, lamp in sorted({(one.shot, one.lamp) for one in settings}):
+        # Every shot has its reference; shots behind the same filter share one.
+        lamps = sorted({one.lamp for one in settings})
+        for shot, lamp in product(range(len(self.camera.shots)), lamps):
             alike = next(
                 (
                     frame
