@@ -22,6 +22,7 @@ from calibration.drift import Drift, displacement_px, drifted, find_drift
 from calibration.fit import Fit, FitSettings, fit_placement
 from calibration.frames import MeanFrame
 from calibration.parametric import coefficient_planes, expected_psi_error, psi_at, shot_stages
+from calibration.residuals import ResidualCheck, check_residuals
 from calibration.routes import calibrate
 from calibration.sensor import Pair, characterise
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -381,13 +382,21 @@ def _captured(
 
 
 def _psnr(psi: ImagingMatrix, calibration: Calibration, captured: _Captured) -> float:
+    return _reconstructed(psi, calibration, captured)[0]
+
+
+def _reconstructed(
+    psi: ImagingMatrix, calibration: Calibration, captured: _Captured
+) -> tuple[float, ResidualCheck]:
+    """Return the PSNR of a TV reconstruction, and what its residuals look like."""
     readings = calibration.readings(captured.frames_dn, captured.exposures_s)
     white = captured.bench.camera.sensor.noise.white_level_dn
     usable = calibration.usable(captured.frames_dn, white)
     variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
     sigma = float(np.sqrt(variance[usable].mean()))
     result = reconstruct_tv(psi, readings, sigma, TVSettings(), usable)
-    return psnr_db(result.light_field, captured.truth)
+    residual = readings - psi.forward(result.light_field)
+    return psnr_db(result.light_field, captured.truth), check_residuals(residual, variance, usable)
 
 
 def _calibrated(settings: CalibrateSettings, target: float):
@@ -533,25 +542,22 @@ def _check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
             captured = _captured(spec, camera, truth, settings.seed + 2)
             found = _drift_of(calibration, shadow, captured, design)
             oracle = drifted(shadow.placement, np.array(drift))
-            db = {
-                "ideal": _psnr(exact, calibration, captured),
-                "mismatched": _psnr(calibration.psi, calibration, captured),
-                "oracle": _psnr(
-                    psi_at(Shadow(shadow.mask, oracle), design.layout, stages),
-                    calibration,
-                    captured,
-                ),
-                "blind": _psnr(
-                    psi_at(Shadow(shadow.mask, found.placement), design.layout, stages),
-                    calibration,
-                    captured,
-                ),
+            matrices = {
+                "ideal": exact,
+                "mismatched": calibration.psi,
+                "oracle": psi_at(Shadow(shadow.mask, oracle), design.layout, stages),
+                "blind": psi_at(Shadow(shadow.mask, found.placement), design.layout, stages),
             }
+            done = {
+                kind: _reconstructed(psi, calibration, captured) for kind, psi in matrices.items()
+            }
+            db = {kind: one[0] for kind, one in done.items()}
             left = np.array(list(found.values.values()))[:5] - np.array(drift)
             left_px = displacement_px(shadow.mask, shadow.placement, left)
             name = Path(spec).name
             detail[f"{what}, {name}"] = {
                 **db,
+                "residuals": {kind: asdict(one[1]) for kind, one in done.items()},
                 "found": found.values,
                 "drifted": found.drifted,
                 "left_px": left_px,
