@@ -205,10 +205,6 @@ class _Search:
         best = np.argsort(-evidence, axis=1)[:, :count]
         self.chosen = np.take_along_axis(self.chosen, best, axis=1)
 
-    def every_disparity(self) -> None:
-        """Consider all disparities again."""
-        self.chosen = np.tile(np.arange(len(self.prior.disparities_px)), (len(self.chosen), 1))
-
 
 def drifted(placement: Placement, drift: Array) -> Placement:
     """Return the placement after a drift (in the order of KINDS; what follows is ignored)."""
@@ -273,53 +269,22 @@ def find_drift(
     search = _Search(mask, placement, stages, blocks, prior)
     search.keep_best(drift, settings.candidates)
     penalty = np.diag(1 / spreads**2)
-    taken, converged = 0, False
-    here, slopes = search.scores(drift, steps, central=False)
-    while taken < MOST_STEPS and not converged:
-        taken += 1
-        # Without their mean, which far from the peak is larger than what they scatter.
-        centred = slopes - slopes.mean(axis=0)
-        matrix = centred.T @ centred + penalty
-        move = np.linalg.solve(matrix, slopes.sum(axis=0) - penalty @ drift)
-        deviations = np.sqrt(np.diag(np.linalg.inv(matrix)))
-        value = float(here.sum() - 0.5 * drift @ penalty @ drift)
-        share = 1.0
-        while share > 0.05:
-            trial = drift + share * move
-            found = _posterior(search, trial, penalty)
-            if found > value:
-                break
-            share /= 2
-        else:
-            converged = True
-            break
-        drift = trial
-        converged = bool(np.max(np.abs(share * move) / deviations) < settings.tolerance)
-        on_step(found)
-        here, slopes = search.scores(drift, steps, central=False)
-    # The last step is Newton's own, from derivatives without the bias of one-sided differences.
-    _, slopes = search.scores(drift, steps, central=True)
-    curvature = _curvature(search, drift, steps, penalty)
-    move = np.linalg.solve(curvature, slopes.sum(axis=0) - penalty @ drift)
-    if _posterior(search, drift + move, penalty) > _posterior(search, drift, penalty):
-        drift = drift + move
-    middle = slopes.T @ slopes + penalty
-    inverse = np.linalg.inv(curvature)
-    covariance = inverse @ middle @ inverse
-    statistic = float(drift[:5] @ np.linalg.solve(covariance[:5, :5], drift[:5]))
-    probability = float(chi2.sf(statistic, len(KINDS)))
+    drift, taken, converged = _climb(search, drift, steps, penalty, settings.tolerance, on_step)
+    drift, covariance = _polish(search, drift, steps, penalty)
+    count = len(KINDS)
+    mask_alone = drift[:count]
+    statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
+    probability = float(chi2.sf(statistic, count))
     moved = displacement_px(mask, placement, drift)
     names = [*KINDS, *(f"brightness_{shot + 1}" for shot in range(1, shots))]
-    deviations = np.sqrt(np.diag(covariance))
-    by_kind = {
-        kind: displacement_px(mask, placement, np.where(np.arange(5) == k, drift[:5], 0))
-        for k, kind in enumerate(KINDS)
-    }
     return Drift(
         dict(zip(names, map(float, drift), strict=True)),
-        dict(zip(names, map(float, deviations), strict=True)),
+        dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True)),
         moved,
-        by_kind,
+        {
+            kind: displacement_px(mask, placement, np.where(np.arange(count) == k, mask_alone, 0))
+            for k, kind in enumerate(KINDS)
+        },
         statistic,
         probability,
         probability < settings.false_alarms and moved > settings.harmless_px,
@@ -327,6 +292,52 @@ def find_drift(
         taken,
         "converged" if converged else "step limit reached",
     )
+
+
+def _climb(
+    search: _Search,
+    drift: Array,
+    steps: Array,
+    penalty: Array,
+    tolerance: float,
+    on_step: Callable[[float], None],
+) -> tuple[Array, int, bool]:
+    """Return the drift after Gauss-Newton steps on the blocks' scores, their count, converged."""
+    for taken in range(1, MOST_STEPS + 1):
+        here, slopes = search.scores(drift, steps, central=False)
+        value = float(here.sum() - 0.5 * drift @ penalty @ drift)
+        # Without their mean, which far from the peak is larger than what they scatter.
+        centred = slopes - slopes.mean(axis=0)
+        matrix = centred.T @ centred + penalty
+        move = np.linalg.solve(matrix, slopes.sum(axis=0) - penalty @ drift)
+        deviations = np.sqrt(np.diag(np.linalg.inv(matrix)))
+        found = _posterior(search, drift + move, penalty)
+        while found <= value:
+            move = move / 2
+            if np.max(np.abs(move) / deviations) < tolerance / 4:
+                return drift, taken, True
+            found = _posterior(search, drift + move, penalty)
+        drift = drift + move
+        on_step(found)
+        if np.max(np.abs(move) / deviations) < tolerance:
+            return drift, taken, True
+    return drift, MOST_STEPS, False
+
+
+def _polish(
+    search: _Search, drift: Array, steps: Array, penalty: Array
+) -> tuple[Array, NDArray[np.float64]]:
+    """Return the drift after a last step, Newton's own, and its sandwich covariance.
+
+    Its derivatives are without the bias of the one-sided differences before.
+    """
+    _, slopes = search.scores(drift, steps, central=True)
+    curvature = _curvature(search, drift, steps, penalty)
+    move = np.linalg.solve(curvature, slopes.sum(axis=0) - penalty @ drift)
+    if _posterior(search, drift + move, penalty) > _posterior(search, drift, penalty):
+        drift = drift + move
+    inverse = np.linalg.inv(curvature)
+    return drift, np.asarray(inverse @ (slopes.T @ slopes + penalty) @ inverse, np.float64)
 
 
 def _coarse(

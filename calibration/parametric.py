@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.placement import Placement
 from calibration.shadow import ANY_COLOUR, Shadow
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
@@ -123,12 +122,3 @@ def expected_psi_error(shadow: Shadow, covariance: NDArray[np.float64]) -> float
     """Return the expected relative Frobenius error of Psi from the placement's covariance."""
     matrix, squares = psi_information(shadow)
     return float(np.sqrt(max(np.trace(matrix @ covariance), 0) / squares))
-
-
-def with_stage_map(placement: Placement, stage_um: tuple[float, float]) -> Placement:
-    """Return the placement with the stage's position made part of the offset."""
-    return replace(
-        placement,
-        offset_x_um=placement.offset_x_um + stage_um[0],
-        offset_y_um=placement.offset_y_um + stage_um[1],
-    )

@@ -8,7 +8,7 @@ direction from which each axis came.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,12 +188,3 @@ def _deviations(
         "repeatability_x_um": spread[0] / freedom,
         "repeatability_y_um": spread[1] / freedom,
     }
-
-
-def moved_by(placement: Placement, place: Place) -> Placement:
-    """Return the placement with the mask where a whiteboard found it."""
-    return replace(
-        placement,
-        offset_x_um=placement.offset_x_um + place.x_um,
-        offset_y_um=placement.offset_y_um + place.y_um,
-    )

@@ -70,16 +70,6 @@ class Calibration:
         unsaturated = np.asarray(frames_dn) < white_level_dn
         return unsaturated if self.good is None else unsaturated & self.good
 
-    def psi_variance(self, level: float) -> NDArray[np.float64]:
-        """Return the variance of a reading that Psi's own uncertainty makes, (shot, y, x).
-
-        level: of an even light field; coefficients are taken as independent.
-        """
-        k = self.psi.binning
-        shots, rows, columns = self.psi.frames_shape
-        summed = np.square(self.deviation, dtype=np.float64).sum(axis=(1, 2, 4))
-        return level**2 * summed.reshape(shots, rows, k, columns, k).sum(axis=(2, 4))
-
     def readings(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float32]:
         """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""
         scale = self.white_dn_per_s * np.asarray(exposures_s)[:, None, None]

@@ -78,7 +78,7 @@ def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
     light = (1 if single else 3) * bench.camera.sensor.binning**2
     return Light(
         bench.camera.sensor.noise,
-        bench.exposures_s()[1],
+        bench.board_exposure_s(),
         views[0] * views[1],
         light,
         rows * columns,

@@ -6,7 +6,7 @@ session makes the same `BoardSet`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import average
+from calibration.frames import MeanFrame, average
 from calibration.sensor import Pair
-from calibration.whiteboard import Whiteboards, lamps_needed, measure_psi
+from calibration.whiteboard import IDEAL_DN, Whiteboards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.sensing import ImagingMatrix
@@ -158,16 +158,17 @@ class WhiteboardBench:
         self.bench.shot, self.bench.lamp = setting.shot, setting.lamp
         self.bench.masks_in = masks_in
 
-    def exposures_s(self) -> tuple[float, float]:
-        """Return the exposure of a reference, and of a whiteboard through the open aperture."""
+    def board_exposure_s(self) -> float:
+        """Return the exposure that fills BOARD_LEVEL of the range without masks."""
         noise = self.camera.sensor.noise
         range_electrons = (noise.white_level_dn - noise.black_level_dn) / noise.gain_dn_per_electron
         well = self.truth.sensor.full_well_electrons or range_electrons
         light = 3 * self.camera.sensor.binning**2 if self.camera.sensor.cfa_name == "mono" else 1
-        white_s = BOARD_LEVEL * min(well, range_electrons) / (noise.electrons_per_s * light)
-        return white_s, white_s
+        return BOARD_LEVEL * min(well, range_electrons) / (noise.electrons_per_s * light)
 
-    def _frames(self, setting: Setting, exposure_s: float, masks_in: bool, count: int, what: str):
+    def _frames(
+        self, setting: Setting, exposure_s: float, masks_in: bool, count: int, what: str
+    ) -> MeanFrame:
         sensor, noise = self.truth.sensor, self.camera.sensor.noise
         reading = self.reading(setting, masks_in)
         light = self.bench.light(setting.shot)
@@ -181,7 +182,7 @@ class WhiteboardBench:
         self, settings: Sequence[Setting], on_frame: Callable[[str], None] = lambda label: None
     ) -> BoardSet:
         """Return the dark frames, the references and the whiteboards asked for."""
-        reference_s, board_s = self.exposures_s()
+        board_s = self.board_exposure_s()
         views = self.camera.views[0] * self.camera.views[1]
         exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
         darks = tuple(self._dark(exposure_s) for exposure_s in sorted({board_s, *exposures}))
@@ -201,7 +202,7 @@ class WhiteboardBench:
             if alike is None:
                 label = f"reference, shot {shot + 1}, {lamp} lamp"
                 setting = Setting(shot, lamp=lamp)
-                alike = self._frames(setting, reference_s, False, REFERENCE_REPEATS, label)
+                alike = self._frames(setting, board_s, False, REFERENCE_REPEATS, label)
                 on_frame(label)
             references[shot, lamp] = alike
         for setting in settings:
@@ -227,7 +228,7 @@ class WhiteboardBench:
         noise, sensor = self.camera.sensor.noise, self.truth.sensor
         white = self.reading(Setting(), False)
         light = self.bench.light(0)
-        full_s = self.exposures_s()[0] / BOARD_LEVEL
+        full_s = self.board_exposure_s() / BOARD_LEVEL
 
         def pairs(reading: Array, times: Sequence[float]) -> list[Pair]:
             return [
@@ -241,7 +242,7 @@ class WhiteboardBench:
         flats = pairs(white, [share * full_s for share in FLAT_SHARES])
         return pairs(0 * white, DARK_EXPOSURES_S), flats
 
-    def _dark(self, exposure_s: float):
+    def _dark(self, exposure_s: float) -> MeanFrame:
         noise = self.camera.sensor.noise
         nothing = np.zeros_like(self.reading(Setting(), False))
         frames = (
@@ -253,27 +254,21 @@ class WhiteboardBench:
     def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
         """Return the true Psi: what a noise-free sensor measures through the pinhole."""
         lamps = lamps_needed(design)
-        ideal: Mapping = {
-            (shot, v, u, lamp): self.reading(Setting(shot, (v, u), lamp))
-            for shot, v, u in np.ndindex(design.weights.shape[:3])
-            for lamp in lamps
-        }
-        return measure_psi(self._ideal(ideal, lamps, design), design).psi
-
-    def _ideal(self, readings: Mapping, lamps: tuple[str, ...], design: ImagingMatrix):
-        from calibration.frames import MeanFrame
-        from calibration.whiteboard import IDEAL_DN
 
         def frame(reading: Array) -> MeanFrame:
             return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
 
         references = {
             (shot, lamp): frame(self.reading(Setting(shot, lamp=lamp), False))
-            for shot in range(design.shots)
+            for shot, lamp in product(range(design.shots), lamps)
+        }
+        pinholes = {
+            (shot, v, u, lamp): frame(self.reading(Setting(shot, (v, u), lamp)))
+            for shot, v, u in np.ndindex(design.weights.shape[:3])
             for lamp in lamps
         }
         dark = frame(np.zeros(design.frames_shape[1:]))
-        return Whiteboards(dark, references, {k: frame(r) for k, r in readings.items()})
+        return measure_psi(Whiteboards(dark, references, pinholes), design).psi
 
     def capture_scene(self) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
         """Return the shots of the scene, (shot, pixel_y, pixel_x) in DN, and their exposures."""
