@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 
 LARGEST_CLIPPED_SHARE = 1e-3
+LARGEST_FLICKER = 0.02
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,13 @@ def average(
 ) -> MeanFrame:
     """Return the mean of repeated frames (y, x), uint16.
 
-    Raises CalibrationError when there are none, when they differ in size, or when more than
-    LARGEST_CLIPPED_SHARE of the pixels of one are saturated.
+    Raises CalibrationError when there are none, when they differ in size, when more than
+    LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
+    more than LARGEST_FLICKER of the brightest.
     """
     total = squares = None
     count = 0
+    levels: list[float] = []
     for frame in frames:
         clipped = float(np.mean(frame >= white_level_dn))
         if clipped > LARGEST_CLIPPED_SHARE:
@@ -52,6 +55,13 @@ def average(
         total += values
         squares += values**2
         count += 1
+        levels.append(float(values.mean()))
+        if max(levels) - min(levels) > LARGEST_FLICKER * max(levels):
+            raise CalibrationError(
+                f"{what}: repeats differ by {(max(levels) - min(levels)) / max(levels):.1%} in "
+                "brightness; the lamp flickers: let it warm up, run it on direct current, or "
+                "expose for whole periods of the mains"
+            )
     if total is None or squares is None:
         raise CalibrationError(f"{what}: no frame was taken")
     spread = np.nan

@@ -13,7 +13,7 @@ Source: whiteboard calibration as in Marwah et al. (ACM TOG 2013), supplement, t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,16 +21,17 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, photon_transfer
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
 Frames = NDArray[np.floating] | NDArray[np.integer]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 IDEAL_DN = 1e6
+Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
 
-def lamps_needed(design: ImagingMatrix) -> tuple[str, ...]:
+def lamps_needed(design: ImagingMatrix | PsiLayout) -> tuple[str, ...]:
     """Return the lamp colours to measure under: white alone where a pixel sees one colour only."""
     return LAMP_COLOURS if design.colour is None else ("white",)
 
@@ -53,7 +54,8 @@ class Calibration:
     """The measured Psi, how sure it is, and what turns frames into readings.
 
     deviation: standard deviation of every coefficient, shaped as `psi.weights`.
-    white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor.
+    white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor. good: (y, x),
+    pixels to use at all (None: every one).
     """
 
     psi: ImagingMatrix
@@ -61,6 +63,12 @@ class Calibration:
     dark_dn: NDArray[np.float32]
     white_dn_per_s: NDArray[np.float32]
     gain: SensorGain
+    good: NDArray[np.bool_] | None = None
+
+    def usable(self, frames_dn: Frames, white_level_dn: int) -> NDArray[np.bool_]:
+        """Return which readings to use, (shot, y, x): of good pixels, and not saturated."""
+        unsaturated = np.asarray(frames_dn) < white_level_dn
+        return unsaturated if self.good is None else unsaturated & self.good
 
     def readings(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float32]:
         """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""
@@ -80,39 +88,71 @@ def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
     coefficient is shared among its samples. Raises CalibrationError for missing frames, frames
     of another size, and a whiteboard too dark to divide by.
     """
-    lamps = lamps_needed(design)
-    views_v, views_u = design.weights.shape[1:3]
-    first = boards.references.get((0, lamps[0]))
-    if first is None:
-        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
-    gain = photon_transfer(boards.dark, first)
+    gain = _gain(boards, design.layout)
     weights = np.empty_like(design.weights)
     deviation = np.empty_like(design.weights)
+    planes = measured_planes(boards, design.layout, design.weights)
+    for (shot, v, u, stored), values, spread in planes:
+        weights[shot, v, u, :, stored] = values
+        deviation[shot, v, u, :, stored] = spread
     white = np.empty(design.frames_shape, dtype=np.float32)
     for shot in range(design.shots):
-        references = [
-            _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
-            for lamp in lamps
-        ]
-        white[shot] = sum(reference for reference, _ in references)
-        for v in range(views_v):
-            for u in range(views_u):
-                for stored, lamp in enumerate(lamps):
-                    reference, reference_variance = references[stored]
-                    name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
-                    pinhole = boards.pinholes.get((shot, v, u, lamp))
-                    signal, variance = _signal(boards, gain, pinhole, name)
-                    ratio = signal / reference
-                    relative = reference_variance / reference**2
-                    spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
-                    place = (shot, v, u, slice(None), stored)
-                    share = _shares(design.weights[place], design.binning)
-                    weights[place] = share * _samples(np.maximum(ratio, 0), design.binning)
-                    deviation[place] = share * _samples(spread, design.binning)
-        weights[shot] /= len(lamps)
-        deviation[shot] /= len(lamps)
+        white[shot] = sum(
+            reference for reference, _ in _references(boards, gain, design.layout, shot)
+        )
     psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
+
+
+def measured_planes(
+    boards: Whiteboards, layout: PsiLayout, designed: Array | None = None
+) -> Iterator[Plane]:
+    """Yield ((shot, v, u, stored colour), coefficients, their deviation), both (y, x).
+
+    One plane is held at a time, and one whiteboard is asked for: `boards.pinholes` may read its
+    frames as it is asked. designed: Psi's weights as designed, which say how a pixel's coefficient
+    is shared among its samples (default: evenly). Raises as `measure_psi`.
+    """
+    lamps = lamps_needed(layout)
+    gain = _gain(boards, layout)
+    views_v, views_u = layout.views
+    k = layout.binning
+    for shot in range(layout.shape[0]):
+        references = _references(boards, gain, layout, shot)
+        for v, u in np.ndindex(views_v, views_u):
+            for stored, lamp in enumerate(lamps):
+                reference, reference_variance = references[stored]
+                name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
+                pinhole = boards.pinholes.get((shot, v, u, lamp))
+                signal, variance = _signal(boards, gain, pinhole, name)
+                ratio = signal / reference
+                relative = reference_variance / reference**2
+                spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
+                share = 1 / (k**2 * len(lamps))
+                if designed is not None:
+                    share = _shares(designed[shot, v, u, :, stored], k) / len(lamps)
+                yield (
+                    (shot, v, u, stored),
+                    (share * _samples(np.maximum(ratio, 0), k)).astype(np.float32),
+                    (share * _samples(spread, k)).astype(np.float32),
+                )
+
+
+def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
+    first = boards.references.get((0, lamps_needed(layout)[0]))
+    if first is None:
+        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
+    return photon_transfer(boards.dark, first)
+
+
+def _references(
+    boards: Whiteboards, gain: SensorGain, layout: PsiLayout, shot: int
+) -> list[tuple[Array, Array]]:
+    """Return DN per second of the references of a shot, lamp by lamp, and their variances."""
+    return [
+        _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
+        for lamp in lamps_needed(layout)
+    ]
 
 
 def ideal_boards(

@@ -23,6 +23,7 @@ from rich.table import Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
+from emmc_rig.calibration_commands import calibrate
 from emmc_rig.capture.cli import CaptureStoppedError, capture
 from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
@@ -51,6 +52,7 @@ app.add_typer(devices, name="devices")
 app.add_typer(session, name="session")
 app.command()(capture)
 app.command()(live)
+app.command()(calibrate)
 console = Console(stderr=True)
 
 SceneOption = Annotated[
@@ -110,7 +112,8 @@ class Bars:
             self._progress.update(self._task, total=done, completed=done, detail="")
 
 
-def _progress() -> Progress:
+def shown_progress() -> Progress:
+    """Return bars for a `Bars` to draw on."""
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -191,7 +194,7 @@ def demo(
     )
     for warning in described.warnings():
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
-    with result_folder(out) as folder, _progress() as progress:
+    with result_folder(out) as folder, shown_progress() as progress:
         bars = Bars(progress)
         metrics = run_demo(settings, folder, bars)
         bars.finish()
@@ -323,7 +326,7 @@ def reconstruct(
             raise typer.BadParameter(
                 "--truth needs the whole light field in memory, without --tile"
             )
-        with result_folder(out) as folder, _progress() as progress:
+        with result_folder(out) as folder, shown_progress() as progress:
             bars = Bars(progress)
             bars.begin(f"{method} in tiles", None)
             metrics = run_in_tiles(
@@ -332,7 +335,7 @@ def reconstruct(
         typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
         typer.echo(f"read {out / 'light_field.h5'}")
         return
-    with result_folder(out) as folder, _progress() as progress:
+    with result_folder(out) as folder, shown_progress() as progress:
         bars = Bars(progress)
         bars.begin(method, None)
         metrics = run_reconstruct(
@@ -453,7 +456,7 @@ def train(
     }
     settings = train_settings(out, scenes or (), leave_out or (), grid, kind, chosen, resume)
     try:
-        with _progress() as progress:
+        with shown_progress() as progress:
             bars = Bars(progress)
             dictionary, told = run(settings, bars)
             bars.finish()
@@ -496,7 +499,7 @@ def tables(
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     try:
-        with _progress() as progress:
+        with shown_progress() as progress:
             bars = Bars(progress)
             outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
             bars.finish()

@@ -105,12 +105,12 @@ def render(content: ReportContent) -> str:
     curve = DisplayCurve.fitted_to(content.estimate if content.truth is None else content.truth)
     errors = None if content.truth is None else Errors.between(content.estimate, content.truth)
     parts = {
-        "title": _text(content.title),
-        "generator": _text(f"emmc-rig {__version__}"),
-        "scene": _text(content.scene),
-        "camera": _text(content.camera),
-        "camera_line": _text(content.camera_line),
-        "camera_reference": _text(content.camera_reference),
+        "title": text_of(content.title),
+        "generator": text_of(f"emmc-rig {__version__}"),
+        "scene": text_of(content.scene),
+        "camera": text_of(content.camera),
+        "camera_line": text_of(content.camera_line),
+        "camera_reference": text_of(content.camera_reference),
         "warnings": _warnings(content),
         "cards": _cards(content),
         "capture_note": _capture_note(content),
@@ -177,7 +177,8 @@ def _finite(values: Array) -> NDArray[np.float32]:
     return np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0)
 
 
-def _text(value: object) -> str:
+def text_of(value: object) -> str:
+    """Text for the page, escaped."""
     return html.escape(str(value), quote=True)
 
 
@@ -192,7 +193,8 @@ def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
     return f"data:{kind};base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
-def _png(image: NDArray[np.uint8]) -> str:
+def png_of(image: NDArray[np.uint8]) -> str:
+    """A lossless picture as an address that holds it."""
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
@@ -285,7 +287,7 @@ def _error_data(errors: "Errors") -> dict[str, object]:
     return {
         "scale": scale,
         "views": _sprite(encode(views), ERROR_JPEG_QUALITY),
-        "mean": _png(encode(views[..., 0].mean(axis=(0, 1)))),
+        "mean": png_of(encode(views[..., 0].mean(axis=(0, 1)))),
     }
 
 
@@ -295,7 +297,7 @@ def _frame(label: str, frame: Array, curve: DisplayCurve) -> dict[str, object]:
         "label": label,
         "white": 1 / curve.gain,
         "gamma": curve.gamma,
-        "picture": _png(curve.encode(frame)),
+        "picture": png_of(curve.encode(frame)),
     }
 
 
@@ -400,11 +402,12 @@ def _written(value: object, spec: str = "", unit: str = "") -> str:
     return f"{text or value} {unit}".rstrip()
 
 
-def _card(label: str, value: str, note: str, tone: str = "") -> str:
+def card(label: str, value: str, note: str, tone: str = "") -> str:
+    """A figure in a frame: good, watch, bad or plain."""
     words = "" if any(letter.isdigit() for letter in value) else "words"
     return (
-        f'<div class="card {words} {tone}"><h3>{_text(label)}</h3>'
-        f'<p class="value">{_text(value)}</p><p class="note">{_text(note)}</p></div>'
+        f'<div class="card {words} {tone}"><h3>{text_of(label)}</h3>'
+        f'<p class="value">{text_of(value)}</p><p class="note">{text_of(note)}</p></div>'
     )
 
 
@@ -416,14 +419,14 @@ def _cards(content: ReportContent) -> str:
     exact, cost = metrics.get("exact_psi_psnr_db"), metrics.get("calibration_cost_db")
     if psnr is not None and replicate is not None:
         gain = psnr - replicate
-        versus = _card(
+        versus = card(
             "Over centre view",
             f"{gain:+.2f} dB",
             f"copying the true centre view gives {replicate:.2f} dB",
             "good" if gain > 0 else "bad",
         )
     else:
-        versus = _card("Over centre view", "not measured", no_truth)
+        versus = card("Over centre view", "not measured", no_truth)
     psi_error = _number(metrics.get("psi_relative_error"))
     known_psi = "not measured" if psi_error is None else f"{100 * psi_error:.2f} %"
     status = str(metrics.get("status") or "not measured")
@@ -432,27 +435,27 @@ def _cards(content: ReportContent) -> str:
     longest = max(stages, key=lambda name: stages[name], default=None)
     return "".join(
         (
-            _card(
+            card(
                 "PSNR",
                 _written(metrics.get("psnr_db"), ".2f", "dB"),
                 "peak 1, all views, pixels and colours" if compared else no_truth,
             ),
             versus,
-            _card("SSIM", _written(metrics.get("ssim"), ".4f"), "1 is identical"),
-            _card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
-            _card(
+            card("SSIM", _written(metrics.get("ssim"), ".4f"), "1 is identical"),
+            card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
+            card(
                 "Calibration costs",
                 _written(cost, "z.2f", "dB"),
                 f"with the exact Psi: {_written(exact, '.2f', 'dB')}"
                 if _number(exact) is not None
                 else "needs a run with the exact Psi",
             ),
-            _card(
+            card(
                 "Time",
                 f"{total_s:.1f} s" if stages else "not measured",
                 "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
             ),
-            _card(
+            card(
                 "Solver",
                 status,
                 str(metrics.get("advice") or metrics.get("method") or ""),
@@ -469,7 +472,7 @@ def _warnings(content: ReportContent) -> str:
         warnings.append(f"The estimate holds {broken} values that are not finite; drawn black.")
     if not warnings:
         return ""
-    items = "".join(f"<li>{_text(warning)}</li>" for warning in warnings)
+    items = "".join(f"<li>{text_of(warning)}</li>" for warning in warnings)
     return (
         f'<aside class="warnings" aria-label="Warnings"><h2>Warnings</h2><ul>{items}</ul></aside>'
     )
@@ -480,7 +483,7 @@ def _capture_note(content: ReportContent) -> str:
     values = _finite(content.frames)
     plural = "shot" if shots == 1 else "shots"
     return (
-        f"{shots} {plural} of {width} × {height} pixels, colour filter {_text(content.cfa)}. "
+        f"{shots} {plural} of {width} × {height} pixels, colour filter {text_of(content.cfa)}. "
         f"Normalised values: least {values.min():.3f}, mean {values.mean():.3f}, "
         f"greatest {values.max():.3f} (1 is an open camera before a white scene)."
     )
@@ -580,8 +583,8 @@ def _thumbnails(slices: Array) -> Array:
 
 def _psi_panel(name: str, note: str, picture: str, scale: float, ramp: str) -> str:
     return (
-        f"<figure><figcaption><strong>{_text(name)}</strong> {_text(note)}</figcaption>"
-        f'<img class="pixels" src="{picture}" alt="{_text(name)}: {_text(note)}">'
+        f"<figure><figcaption><strong>{text_of(name)}</strong> {text_of(note)}</figcaption>"
+        f'<img class="pixels" src="{picture}" alt="{text_of(name)}: {text_of(note)}">'
         f'<div class="bar"><span>0</span><i class="{ramp}"></i><span>{scale:.3g}</span></div>'
         "</figure>"
     )
@@ -590,38 +593,43 @@ def _psi_panel(name: str, note: str, picture: str, scale: float, ramp: str) -> s
 def _psi(content: ReportContent) -> str:
     if content.psi is None:
         return '<p class="quiet">No imaging matrix was handed to this report.</p>'
-    rows, columns = content.psi.shape[:2]
+    return psi_panels(content.psi, content.psi_std)
+
+
+def psi_panels(psi: Array, psi_std: Array | None) -> str:
+    """Slices of Psi, and of its standard deviation, both (v, u, y, x), as figures of a page."""
+    rows, columns = psi.shape[:2]
     layout = f"rows are v 0 to {rows - 1} downwards, columns u 0 to {columns - 1}"
-    whole = _thumbnails(content.psi)
+    whole = _thumbnails(psi)
     whole_scale = _round_up(float(np.percentile(whole, 99.9)))
-    piece = _finite(_centre(content.psi))
+    piece = _finite(_centre(psi))
     piece_scale = _round_up(float(np.percentile(piece, 99.9)))
     side = f"{piece.shape[3]} × {piece.shape[2]}"
     panels = [
         _psi_panel(
             "Whole field",
             f"one tile per view, averaged down; {layout}",
-            _png(_montage(DisplayCurve(1 / whole_scale, 1.0).encode(whole), 3)),
+            png_of(_montage(DisplayCurve(1 / whole_scale, 1.0).encode(whole), 3)),
             whole_scale,
             "grey",
         ),
         _psi_panel(
             "Centre, pixel for pixel",
             f"the middle {side} pixels of each view's weights",
-            _png(_montage(DisplayCurve(1 / piece_scale, 1.0).encode(piece), 2)),
+            png_of(_montage(DisplayCurve(1 / piece_scale, 1.0).encode(piece), 2)),
             piece_scale,
             "grey",
         ),
     ]
-    if content.psi_std is not None:
-        std = _finite(_centre(content.psi_std))
+    if psi_std is not None:
+        std = _finite(_centre(psi_std))
         std_scale = _round_up(float(np.percentile(std, 99.9)))
-        typical = float(np.median(_finite(content.psi_std)))
+        typical = float(np.median(_finite(psi_std)))
         panels.append(
             _psi_panel(
                 "Its standard deviation",
                 f"same pixels; median over all coefficients {typical:.2g}",
-                _png(_montage(_heat(DisplayCurve(1 / std_scale, 1.0).encode(std)), 2)),
+                png_of(_montage(_heat(DisplayCurve(1 / std_scale, 1.0).encode(std)), 2)),
                 std_scale,
                 "heat",
             )
@@ -690,9 +698,9 @@ def _curve_chart(name: str, first_step: int, values: Sequence[float], logarithmi
     path = " ".join(f"{across(step):.1f},{up(level):.1f}" for step, level in points)
     ends = f"{values[0]:.4g} to {values[-1]:.4g} over {len(values)} values"
     return (
-        f"<figure><figcaption><strong>{_text(name)}</strong> {_text(ends)}</figcaption>"
+        f"<figure><figcaption><strong>{text_of(name)}</strong> {text_of(ends)}</figcaption>"
         f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" '
-        f'aria-label="{_text(name)}, {_text(ends)}">{"".join(grid)}'
+        f'aria-label="{text_of(name)}, {text_of(ends)}">{"".join(grid)}'
         f'<line class="axis" x1="{left}" x2="{width - right}" y1="{height - bottom}" '
         f'y2="{height - bottom}"/><polyline class="curve" points="{path}"/>'
         f'<text x="{(left + width - right) / 2}" y="{height - 6}" '
@@ -733,14 +741,14 @@ def _timings(stage_s: Mapping[str, float]) -> str:
         share = f" ({100 * s / total_s:.0f} %)" if math.isfinite(s) and total_s > 0 else ""
         figure = f"{s:.2f} s{share}" if math.isfinite(s) else "not a number"
         bars.append(
-            f'<text x="{left - 12}" y="{middle + 4}" text-anchor="end">{_text(name)}</text>'
+            f'<text x="{left - 12}" y="{middle + 4}" text-anchor="end">{text_of(name)}</text>'
             f'<rect x="{left}" y="{middle - 9}" width="{max(length, 1.5):.1f}" height="18" rx="3"/>'
             f'<text x="{left + max(length, 1.5) + 8:.1f}" y="{middle + 4}">{figure}</text>'
         )
     spoken = ", ".join(f"{name} {_written(s, '.2f', 's')}" for name, s in stages)
     return (
         f'<svg class="chart timings" viewBox="0 0 {left + room + 120} {row * len(stages)}" '
-        f'role="img" aria-label="Seconds per stage: {_text(spoken)}">{"".join(bars)}</svg>'
+        f'role="img" aria-label="Seconds per stage: {text_of(spoken)}">{"".join(bars)}</svg>'
         f'<p class="quiet">{total_s:.2f} s in all.</p>'
     )
 
@@ -764,10 +772,10 @@ def _metrics_table(metrics: Mapping[str, object]) -> str:
     rows = []
     for key, value in _flat(metrics):
         figure = FIGURES.get(key, Figure(key, "", "", ""))
-        written = _text(_written(value, figure.format, figure.unit))
+        written = text_of(_written(value, figure.format, figure.unit))
         rows.append(
-            f'<tr><th scope="row">{_text(figure.label)}</th><td class="figure">{written}</td>'
-            f"<td>{_text(figure.meaning)}</td><td><code>{_text(key)}</code></td></tr>"
+            f'<tr><th scope="row">{text_of(figure.label)}</th><td class="figure">{written}</td>'
+            f"<td>{text_of(figure.meaning)}</td><td><code>{text_of(key)}</code></td></tr>"
         )
     return (
         '<table><thead><tr><th scope="col">Figure</th><th scope="col">Value</th>'
@@ -789,7 +797,7 @@ def _provenance(content: ReportContent) -> str:
     if isinstance(versions, Mapping):
         rows += [(f"Version of {name}", version) for name, version in versions.items()]
     body = "".join(
-        f'<tr><th scope="row">{_text(name)}</th><td><code>{_text(value)}</code></td></tr>'
+        f'<tr><th scope="row">{text_of(name)}</th><td><code>{text_of(value)}</code></td></tr>'
         for name, value in rows
     )
     return f'<table class="narrow"><tbody>{body}</tbody></table>'

@@ -17,9 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
+from scipy.stats import norm
 from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
+from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, OpticsFlaws, SensorFlaws
 
 Array = NDArray[np.floating]
 LAMPS = {
@@ -35,24 +37,34 @@ WINDOW_MARGIN = 0.05
 
 @dataclass(frozen=True)
 class MountingErrors:
-    """How the masks really sit, which the program is not told."""
+    """How the masks really sit and look, which the program is not told.
+
+    skew: tangent of the angle by which a mask's columns lean. distance_share: relative error of
+    their distance. distortion_um: third-order radial displacement of the rays at the corner of
+    the picture. edge_blur_um: standard deviation of the mask's edges.
+    """
 
     offset_um: tuple[float, float] = (6.5, -4.0)
     rotation_deg: float = 0.03
     stretch: float = 1.0004
+    skew: float = 0.0
+    distance_share: float = 0.0
+    distortion_um: float = 0.0
+    edge_blur_um: float = 0.0
 
 
 NO_ERRORS = MountingErrors((0.0, 0.0), 0.0, 1.0)
 
 
-def ray_points(views: tuple[int, int], count: int) -> NDArray[np.float64]:
+def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.float64]:
     """Return where the rays of every view start in a pixel and an aperture cell, in [0, 1).
 
-    Sobol points, scrambled differently for every view: (v, u, count, 4), the last axis x, y, u, v.
+    Sobol points, scrambled differently for every view: (v, u, count, axes), the last axis x, y,
+    u, v, and with six axes where in the blur of an edge.
     """
-    shape = (views[0] * views[1], count, 4)
-    points = [Sobol(4, rng=np.random.default_rng(view)).random(count) for view in range(shape[0])]
-    return np.reshape(points, (*views, count, 4))
+    rngs = [np.random.default_rng(view) for view in range(views[0] * views[1])]
+    points = [Sobol(axes, rng=rng).random(count) for rng in rngs]
+    return np.reshape(points, (*views, count, axes))
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -68,6 +80,7 @@ def trace(
     starts,
     shapes,
     plates,
+    falloff,
     readings,
 ):
     """Set readings (y, x), per sample, to the mean over rays of lamp x masks x scene x response.
@@ -76,21 +89,26 @@ def trace(
     points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
     open width of a cell. openings_um: (opening, 3), x, y and half side of the squares at the lens
     that the aperture plate leaves open. cells: (all cells, colour); starts, shapes: where each
-    mask lies in it, (rows, columns). plates: per mask distance_um, cell_um, x_um, y_um, and the
-    cosine and sine of its turn.
+    mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um, what turns um on
+    the mask into cells (column from x and y, row from x and y), the displacement of its rays per
+    cubed um off the axis, and the width of its edges in um. falloff: (v, u, y, x), or all 1.
+    points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
     views_v, views_u, count = points.shape[0], points.shape[1], points.shape[2]
     lens_um, pitch_um, width_um, cell_um, open_um = lengths_um
     board = scene.shape[2] == 1
     f, g = finer
+    even = falloff.shape[3] == 1
     for y in prange(rows):
         passed = np.empty((3, columns), np.float32)
         total = np.zeros(columns)
+        seen = np.zeros(columns)
         for v in range(views_v):
             for u in range(views_u):
+                total[:] = 0
                 for ray in range(count):
-                    in_x, in_y, in_u, in_v = points[v, u, ray]
+                    in_x, in_y, in_u, in_v = points[v, u, ray, :4]
                     ray_u = (u - (views_u - 1) / 2) * cell_um + (in_u - 0.5) * open_um
                     ray_v = (v - (views_v - 1) / 2) * cell_um + (in_v - 0.5) * open_um
                     blocked = True
@@ -108,19 +126,28 @@ def trace(
                         passed[c, :] = lamp[c]
                     for mask in range(plates.shape[0]):
                         ratio = plates[mask, 0] / lens_um
-                        size = plates[mask, 1]
-                        cosine, sine = plates[mask, 4], plates[mask, 5]
-                        at_x = (1 - ratio) * first_x + ratio * ray_u - plates[mask, 2]
-                        at_y = (1 - ratio) * ray_y + ratio * ray_v - plates[mask, 3]
+                        at_x = (1 - ratio) * first_x + ratio * ray_u - plates[mask, 1]
+                        at_y = (1 - ratio) * ray_y + ratio * ray_v - plates[mask, 2]
+                        if points.shape[3] == 6:
+                            at_x += plates[mask, 8] * points[v, u, ray, 4]
+                            at_y += plates[mask, 8] * points[v, u, ray, 5]
                         height, width = shapes[mask, 0], shapes[mask, 1]
-                        column = (cosine * at_x + sine * at_y) / size + width / 2
-                        row = (cosine * at_y - sine * at_x) / size + height / 2
-                        along = (1 - ratio) * pitch_um * cosine / size
-                        across = -(1 - ratio) * pitch_um * sine / size
+                        column_x, column_y, row_x, row_y = plates[mask, 3:7]
+                        bend = plates[mask, 7]
+                        column = column_x * at_x + column_y * at_y + width / 2
+                        row = row_x * at_x + row_y * at_y + height / 2
+                        along = (1 - ratio) * pitch_um * column_x
+                        across = (1 - ratio) * pitch_um * row_x
                         start = starts[mask]
                         for x in range(columns):
-                            j = int(np.floor(column + along * x))
-                            i = int(np.floor(row + across * x))
+                            to_column, to_row = column + along * x, row + across * x
+                            if bend != 0:
+                                ray_x = first_x + x * pitch_um
+                                cubed = bend * (ray_x * ray_x + ray_y * ray_y)
+                                to_column += cubed * (column_x * ray_x + column_y * ray_y)
+                                to_row += cubed * (row_x * ray_x + row_y * ray_y)
+                            j = int(np.floor(to_column))
+                            i = int(np.floor(to_row))
                             if i < 0 or j < 0 or i >= height or j >= width:
                                 for c in range(3):
                                     passed[c, x] = 0
@@ -139,8 +166,11 @@ def trace(
                                 total[x] += (
                                     passed[c, x] * response[y, x, c] * line[fine_x + x * g, c]
                                 )
+                for x in range(columns):
+                    share = falloff[0, 0, 0, 0] if even else falloff[v, u, y, x]
+                    seen[x] += share * total[x]
         for x in range(columns):
-            readings[y, x] = total[x] / (count * views_v * views_u)
+            readings[y, x] = seen[x] / (count * views_v * views_u)
 
 
 class Bench:
@@ -163,6 +193,8 @@ class Bench:
         rng: np.random.Generator,
         errors: MountingErrors | None = None,
         rays_per_view: int = RAYS_PER_VIEW,
+        optics: OpticsFlaws = PERFECT_OPTICS,
+        sensor: SensorFlaws = PERFECT_SENSOR,
     ) -> None:
         views = camera.views
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
@@ -179,10 +211,19 @@ class Bench:
         self.shot = 0
         self.masks_in = True
         self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
-        self._positions_um, self._window_um, self._rng = positions_um, window_um, rng
+        self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
-        self._points = ray_points(views, rays_per_view)
-        self._plates = draw_plates(camera, size)
+        self._sensor = sensor
+        axes = 4 if self._errors.edge_blur_um == 0 else 6
+        self._points = ray_points(views, rays_per_view, axes)
+        self._points[..., 4:] = norm.ppf(self._points[..., 4:])
+        lens = camera.lens
+        lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
+        self._falloff = optics.falloff(size, views, lengths_um)
+        self._plates = {
+            name: [(plate, *optics.soiled(frame, plate.cell_um)) for frame in plate.cells]
+            for name, plate in draw_plates(camera, size).items()
+        }
         self._response = sensor_response(camera, size)
         self._light = pixel_light(camera, size)
         self._seen: tuple[tuple, Array] | None = None
@@ -198,7 +239,13 @@ class Bench:
     def expose(self, exposure_s: float) -> NDArray[np.uint16]:
         """Return one noisy frame (pixel_y, pixel_x) in DN."""
         noise, light = self._camera.sensor.noise, self._light[self.shot]
-        return noise.expose_dn(self.readings(), exposure_s, light, self._rng)
+        if self._sensor is PERFECT_SENSOR:
+            return noise.expose_dn(self.readings(), exposure_s, light, self.rng)
+        return self._sensor.expose_dn(noise, self.readings(), exposure_s, light, self.rng)
+
+    def light(self, shot: int) -> NDArray[np.float32]:
+        """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
+        return self._light[shot]
 
     def reseed(self, rng: np.random.Generator) -> None:
         """Draw the noise of the frames that follow from another source."""
@@ -210,27 +257,18 @@ class Bench:
         cell_um = lens.aperture_cell_um
         names = camera.shot_masks(self.shot) if self.masks_in else ()
         cells, starts, shapes, plates = [np.zeros((0, 3), np.float32)], [], [], []
-        turn = np.deg2rad(self._errors.rotation_deg)
         for name in names:
-            plate = self._plates[name]
-            frame = plate.cells[self.shot % len(plate.cells)]
+            frames = self._plates[name]
+            plate, frame, grain_um = frames[self.shot % len(frames)]
             starts.append(sum(len(part) for part in cells))
             shapes.append(frame.shape[:2])
             cells.append(frame.reshape(-1, 3))
-            moves = name in camera.moving_masks
             at_lens = plate.distance_mm >= lens.distance_mm
-            off_x, off_y = (0.0, 0.0) if at_lens else self._errors.offset_um
-            stretch = 1.0 if at_lens else self._errors.stretch
-            plates.append(
-                (
-                    plate.distance_mm * 1e3,
-                    plate.cell_um * stretch,
-                    off_x + (at_um["mask_x"] if moves else 0.0),
-                    off_y + (at_um["mask_y"] if moves else 0.0),
-                    1.0 if at_lens else np.cos(turn),
-                    0.0 if at_lens else np.sin(turn),
-                )
+            moved = (
+                (at_um["mask_x"], at_um["mask_y"]) if name in camera.moving_masks else (0.0, 0.0)
             )
+            errors = NO_ERRORS if at_lens else self._errors
+            plates.append(self._standing(errors, plate.distance_mm, grain_um, moved))
         scene = np.ones((1, 1, 1, 1, 3), np.float32) if self.target == "whiteboard" else self._scene
         response = self._response[self.shot]
         seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
@@ -252,12 +290,38 @@ class Bench:
             np.concatenate(cells),
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),
-            np.array(plates, dtype=np.float64).reshape(-1, 6),
+            np.array(plates, dtype=np.float64).reshape(-1, 9),
+            self._falloff,
             samples,
         )
         k = sensor.binning
         rows, columns = self._size[0] // k, self._size[1] // k
         return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
+
+    def _standing(
+        self,
+        errors: MountingErrors,
+        distance_mm: float,
+        cell_um: float,
+        moved_um: tuple[float, float],
+    ) -> tuple[float, ...]:
+        """Return a mask's row of `trace`'s plates."""
+        turn = np.deg2rad(errors.rotation_deg)
+        cosine, sine = np.cos(turn), np.sin(turn)
+        per_um = 1 / (cell_um * errors.stretch)
+        pitch_um = self._camera.sensor.sample_pitch_um
+        corner_um = np.hypot(*self._size) / 2 * pitch_um
+        return (
+            distance_mm * 1e3 * (1 + errors.distance_share),
+            errors.offset_um[0] + moved_um[0],
+            errors.offset_um[1] + moved_um[1],
+            (cosine - errors.skew * sine) * per_um,
+            (sine + errors.skew * cosine) * per_um,
+            -sine * per_um,
+            cosine * per_um,
+            errors.distortion_um / corner_um**3,
+            errors.edge_blur_um,
+        )
 
     def _openings(self, x_um: float, y_um: float) -> Array:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""

@@ -13,6 +13,7 @@ from emmc_rig.model.camera import (
     draw_plates,
     load_camera,
     pixel_light,
+    psi_layout,
     sensor_response,
 )
 from emmc_rig.model.errors import CameraError
@@ -359,3 +360,15 @@ def test_a_mask_whose_shadow_diffraction_blurs_is_warned_about():
     assert Camera.model_validate(VALID).warnings() == []
     (warning,) = Camera.model_validate(changed("masks", "near", "distance_mm", 5)).warnings()
     assert "mask 'near': Fresnel number 0.052 < 1" in warning
+
+
+@pytest.mark.parametrize("cfa", ["rggb", "mono", "x-trans", "rgbw"])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_the_layout_of_psi_is_that_of_the_psi_built(cfa, binning):
+    camera = Camera.model_validate({"title": "x", "sensor": {"cfa": cfa, "binning": binning}})
+    layout, built = psi_layout(camera, (24, 36)), build_imaging_matrix(camera, (24, 36))
+    assert layout.shape == built.weights.shape
+    assert layout.frames_shape == built.frames_shape
+    assert (layout.colour is None) == (built.colour is None)
+    if built.colour is not None:
+        np.testing.assert_array_equal(layout.colour, built.colour)

@@ -11,7 +11,7 @@ from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix, draw_plates, sensor_response
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.masks import CFA
-from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
+from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours, save_planes
 
 EPS = float(np.finfo(np.float32).eps)
 VIEWS = (2, 3)
@@ -481,3 +481,15 @@ def test_psi_is_the_average_over_dense_rays(masks, offsets, rays, tolerance):
     modelled = psi.weights[0].transpose(0, 1, 2, 4, 3) * 3 * 4
     error = np.abs(modelled - passed)
     assert error.max() < tolerance, error.max()
+
+
+def test_a_psi_written_plane_by_plane_is_the_same_file(coded_psi, tmp_path):
+    psi = coded_psi(shots=2, binning=2)
+    psi.save(tmp_path / "whole.h5")
+    planes = (psi.weights[place][:, 0] for place in np.ndindex(psi.weights.shape[:3]))
+    save_planes(tmp_path / "planes.h5", psi.layout, planes)
+    again = ImagingMatrix.load(tmp_path / "planes.h5")
+    np.testing.assert_array_equal(again.weights, psi.weights)
+    assert again.checksum() == ImagingMatrix.load(tmp_path / "whole.h5").checksum()
+    with pytest.raises(SensingError, match="one stored colour"):
+        save_planes(tmp_path / "mono.h5", coded_psi(cfa="mono").layout, [])

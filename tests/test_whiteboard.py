@@ -136,6 +136,13 @@ def test_a_saturated_whiteboard_is_refused():
         average([frame], 0.1, WHITE_DN, "reference")
 
 
+def test_a_lamp_that_flickers_between_repeats_is_refused():
+    steady = np.full((20, 20), 10_000, np.uint16)
+    assert average([steady, steady + 50], 0.1, WHITE_DN, "reference").count == 2
+    with pytest.raises(CalibrationError, match=r"differ by 4\.8% in brightness; the lamp flickers"):
+        average([steady, steady + 500], 0.1, WHITE_DN, "reference")
+
+
 def test_a_missing_whiteboard_is_named():
     _, design = design_of()
     boards = ideal_boards(pinhole_readings(design), ("white",), design)

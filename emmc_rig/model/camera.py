@@ -27,7 +27,7 @@ from emmc_rig.model.geometry import (
 )
 from emmc_rig.model.masks import AnyPattern, cfa_tile
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import Settings, read_yaml, validated
 
 FILTER_COLOURS = {"none": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
@@ -410,6 +410,27 @@ def _transmittances(
                     total += product
             total /= len(parts) ** 2
             yield v, u, total
+
+
+def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
+    """Return what the Psi of a camera looks like for `size` samples, without building it.
+
+    Raises CameraError when the pixels do not divide the light field.
+    """
+    k = camera.sensor.binning
+    tile = cfa_tile(camera.sensor.cfa)
+    # One period of the filters tells whether pixels see one colour, and which.
+    period = sensor_response(camera, (tile.shape[0] * k, tile.shape[1] * k))
+    single = bool((period.sum(axis=-1) <= 1).all())
+    if size[0] % k or size[1] % k:
+        sensor_response(camera, size)  # raises, and says what to do
+    colour = None
+    if single:
+        sides = tile.shape[0] * k, tile.shape[1] * k
+        rows, columns = np.arange(size[0]) % sides[0], np.arange(size[1]) % sides[1]
+        colour = period.argmax(axis=-1).astype(np.uint8)[:, rows[:, None], columns]
+    shape = (len(camera.shots), *camera.views, size[0], 1 if single else 3, size[1])
+    return PsiLayout(shape, colour, k, camera.model_dump_json())
 
 
 def build_imaging_matrix(camera: Camera, size: tuple[int, int]) -> ImagingMatrix:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +46,34 @@ class PixelSolve:
 
 
 @dataclass(frozen=True, eq=False)
+class PsiLayout:
+    """What a Psi is for, without its coefficients: for sensors whose Psi does not fit into memory.
+
+    shape, colour, binning, camera_json: as `ImagingMatrix.weights`' and its other fields.
+    """
+
+    shape: tuple[int, int, int, int, int, int]
+    colour: NDArray[np.uint8] | None
+    binning: int = 1
+    camera_json: str = ""
+
+    @property
+    def views(self) -> tuple[int, int]:
+        """Rows and columns of views."""
+        return self.shape[1], self.shape[2]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the light field."""
+        return self.shape[3], self.shape[5]
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]:
+        """(shot, pixel_y, pixel_x)."""
+        return self.shape[0], self.size[0] // self.binning, self.size[1] // self.binning
+
+
+@dataclass(frozen=True, eq=False)
 class ImagingMatrix:
     """Psi.
 
@@ -71,6 +100,13 @@ class ImagingMatrix:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
         if not np.isfinite(self.weights).all():
             raise SensingError("the imaging matrix has entries that are not finite")
+
+    @property
+    def layout(self) -> PsiLayout:
+        """What this Psi is for, without its coefficients."""
+        shots, v, u, rows, stored, columns = self.weights.shape
+        shape = (shots, v, u, rows, stored, columns)
+        return PsiLayout(shape, self.colour, self.binning, self.camera_json)
 
     @property
     def shots(self) -> int:
@@ -266,6 +302,40 @@ class ImagingMatrix:
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix
+
+
+def save_planes(path: Path, layout: PsiLayout, planes: Iterable[NDArray[np.floating]]) -> None:
+    """Write a Psi whose weights come plane by plane, (y, x), as `ImagingMatrix.save` would.
+
+    The planes of (shot, v, u) follow one another as in `ImagingMatrix.weights`; one colour stored.
+    """
+    if layout.shape[4] != 1:
+        raise SensingError("planes are written of a Psi with one stored colour")
+    digest = hashlib.sha256(f"{FORMAT}|{layout.binning}|{layout.camera_json}".encode())
+    colour = NO_COLOUR_MAP if layout.colour is None else layout.colour
+    partial = path.with_name(path.name + ".part")
+    try:
+        with h5py.File(partial, "w") as file:
+            weights = file.create_dataset("weights", layout.shape, np.float32)
+            for place, plane in zip(np.ndindex(layout.shape[:3]), planes, strict=True):
+                values = np.ascontiguousarray(plane, dtype=np.float32)
+                weights[(*place, slice(None), 0)] = values
+                digest.update(values.view(np.uint8).data)
+            if layout.colour is not None:
+                file["colour"] = layout.colour
+            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
+            file.attrs.update(
+                format=FORMAT,
+                binning=layout.binning,
+                camera=layout.camera_json,
+                sha256=digest.hexdigest(),
+            )
+        os.replace(partial, path)
+    except OSError as fault:
+        raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 class _FlatPsi(LinearOperator):

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from emmc_rig.chart_style import FAINT, INK, sheet, title_of
 from emmc_rig.tables import paper
 from emmc_rig.tables.findings import CHROMA, Measured, SceneFigures, printed_figures
 from emmc_rig.tables.plan import (
@@ -24,7 +25,6 @@ from emmc_rig.tables.plan import (
 
 COLOURS = {"i": "#1d5a9e", "ii": "#18794e", "iii": "#b45309"}
 METHOD_COLOURS = {"dict-admm": "#7a869a", "tv-dict": "#1d5a9e", "tv": "#18794e"}
-INK, FAINT, LINE = "#17202c", "#5b6776", "#dde2e9"
 SALT = "emmc-rig"
 
 
@@ -63,20 +63,9 @@ def draw_charts(folder: Path, measured: Measured, scenes: Sequence[str]) -> dict
 
 
 def _sheet(panels: int, wide: float = 4.6) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(wide * panels, 3.5), layout="constrained")
-    axes = [figure.add_subplot(1, panels, i + 1) for i in range(panels)]
-    for one in axes:
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(LINE)
-        one.tick_params(colors=FAINT, labelsize=9)
-        one.grid(axis="y", color=LINE, linewidth=0.7)
-        one.set_axisbelow(True)
+    figure, axes = sheet(panels, wide)
     axes[0].set_ylabel("PSNR, dB", color=FAINT, fontsize=9)
     return figure, axes
-
-
-def _title(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", fontsize=10.5, color=INK, weight="bold")
 
 
 def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
@@ -116,7 +105,7 @@ def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
                     )
         axes.set_xticks(range(1, 5 if name == "table4" else 4))
         axes.set_xlabel("images: shots, or full-colour images of (i)", color=FAINT, fontsize=9)
-        _title(axes, f"TV-Dict, {title}, noise-free")
+        title_of(axes, f"TV-Dict, {title}, noise-free")
     panels[-1].plot([], [], "--", color=FAINT, alpha=0.6, label="the paper's 7 scenes")
     panels[-1].legend(fontsize=8.5, frameon=False, labelcolor=INK)
     return figure
@@ -151,7 +140,7 @@ def _noise(measured: Measured, scenes: Sequence[str]) -> Figure | None:
             range(3), [f"({scenario}) {sensor}" for scenario, sensor in SCENARIOS.items()]
         )
         axes.set_ylim(np.floor(min(low)) - 2, np.ceil(max(low)) + 1)
-        _title(axes, title)
+        title_of(axes, title)
     panels[0].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
     panels[1].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
     return figure
@@ -179,7 +168,7 @@ def _colour(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     axes.set_xticks(at, [f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures])
     axes.set_ylim(np.floor(min(map(min, levels))) - 2, np.ceil(max(map(max, levels))) + 3)
     axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc="upper left", ncols=2)
-    _title(axes, "TV-Dict, Table III's scenes, noise-free")
+    title_of(axes, "TV-Dict, Table III's scenes, noise-free")
     return figure
 
 
@@ -205,5 +194,5 @@ def _masks(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     levels = [value for values in found.values() for value in values]
     axes.set_ylim(np.floor(min(levels)) - 2, np.ceil(max(levels)) + 2)
     axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, ncols=3, loc="upper left")
-    _title(axes, "One noisy CFA shot, Table II's scenes")
+    title_of(axes, "One noisy CFA shot, Table II's scenes")
     return figure

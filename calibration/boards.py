@@ -1,0 +1,242 @@
+"""Whiteboard frames as readings with variances, each with where mask, pinhole and lamp stood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.frames import MeanFrame, SensorGain, photon_transfer
+from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
+from emmc_rig.model.sensing import PsiLayout
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardFrame:
+    """One whiteboard setting as captured: its mean frame, and how the bench stood.
+
+    stage_um: where the mask stage stood, x and y, from where the design centres the mask; with
+    the shot's own offset in it. pinhole: the one view (v, u) open, or None: the whole aperture.
+    """
+
+    frame: MeanFrame
+    stage_um: tuple[float, float]
+    shot: int = 0
+    pinhole: tuple[int, int] | None = None
+    lamp: str = "white"
+
+    @property
+    def name(self) -> str:
+        """What the messages call it."""
+        through = "open aperture" if self.pinhole is None else f"view {self.pinhole}"
+        x, y = self.stage_um
+        return f"shot {self.shot}, {through}, {self.lamp} lamp, mask at ({x:g}, {y:g}) um"
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSet:
+    """All that was captured at the whiteboard, whatever wrote it: a rig, a session, a simulation.
+
+    darks: lamp off, at one exposure or more; between two the dark current is drawn as a line.
+    references[shot, lamp]: aperture open, masks out.
+    """
+
+    darks: tuple[MeanFrame, ...]
+    references: Mapping[tuple[int, str], MeanFrame]
+    frames: tuple[BoardFrame, ...]
+
+    def __post_init__(self) -> None:
+        if not self.darks:
+            raise CalibrationError("no dark frame: switch the lamp off and capture at least two")
+
+    @property
+    def dark(self) -> MeanFrame:
+        """The dark frame of the shortest exposure."""
+        return min(self.darks, key=lambda frame: frame.exposure_s)
+
+    def dark_at(self, exposure_s: float) -> MeanFrame:
+        """Return the dark frame of an exposure: black level and dark current of every pixel."""
+        first, last = self.dark, max(self.darks, key=lambda frame: frame.exposure_s)
+        if last.exposure_s == first.exposure_s:
+            return first
+        share = (exposure_s - first.exposure_s) / (last.exposure_s - first.exposure_s)
+        mean = (first.mean_dn + share * (last.mean_dn - first.mean_dn)).astype(np.float32)
+        spread = first.variance_dn2 + share * (last.variance_dn2 - first.variance_dn2)
+        return MeanFrame(mean, max(spread, 0.0), min(first.count, last.count), exposure_s)
+
+    @property
+    def exposures(self) -> int:
+        """How many frames were taken for it."""
+        # One reference may serve several shots.
+        references = {id(frame): frame for frame in self.references.values()}.values()
+        taken = [*self.darks, *references, *(one.frame for one in self.frames)]
+        return sum(frame.count for frame in taken)
+
+    def pinholes(self) -> Whiteboards:
+        """Return what the free route takes: the frames through the pinhole."""
+        dark = self.dark
+
+        def as_if_dark(frame: MeanFrame) -> MeanFrame:
+            more = self.dark_at(frame.exposure_s).mean_dn - dark.mean_dn
+            return replace(frame, mean_dn=frame.mean_dn - more)
+
+        return Whiteboards(
+            dark,
+            {key: as_if_dark(frame) for key, frame in self.references.items()},
+            {
+                (one.shot, *one.pinhole, one.lamp): as_if_dark(one.frame)
+                for one in self.frames
+                if one.pinhole is not None
+            },
+        )
+
+    def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:
+        """Return the same dark and reference frames with other whiteboards."""
+        return BoardSet(self.darks, self.references, tuple(frames))
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """One whiteboard as readings: 1 is the same pixel with the aperture open and the masks out.
+
+    reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
+    infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all).
+    """
+
+    name: str
+    reading: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    channels: NDArray[np.uint8]
+    views_open: NDArray[np.bool_]
+    stage_um: tuple[float, float]
+    shot: int
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which pixels count, (pixel_y, pixel_x)."""
+        return np.isfinite(self.variance)
+
+
+def gain_of(boards: BoardSet) -> SensorGain:
+    """Return the sensor's gain from the dark and the first reference frames."""
+    if not boards.references:
+        raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
+    return photon_transfer(boards.dark, next(iter(boards.references.values())))
+
+
+def as_readings(
+    boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
+) -> list[Board]:
+    """Return the whiteboards as readings.
+
+    usable: (pixel_y, pixel_x), pixels known to be good; a pixel whose reference is not bright
+    enough to divide by is left out as well. Raises CalibrationError for frames of another size,
+    a reference that is missing, and whiteboards too dark to use.
+    """
+    gain = gain_of(boards)
+    expected = layout.frames_shape[1:]
+    good = np.ones(expected, dtype=bool) if usable is None else usable
+    found = []
+    for one in boards.frames:
+        reference = boards.references.get((one.shot, one.lamp)) or boards.references.get(
+            (0, one.lamp)
+        )
+        if reference is None:
+            raise CalibrationError(f"{one.name}: no reference whiteboard under that lamp")
+        for frame, what in ((one.frame, one.name), (reference, "reference"), (boards.dark, "dark")):
+            if frame.mean_dn.shape != expected:
+                raise CalibrationError(
+                    f"{what}: a frame of {frame.mean_dn.shape[0]} x {frame.mean_dn.shape[1]} "
+                    f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
+                    "another camera?"
+                )
+        found.append(_board(one, reference, boards, gain, layout, good))
+    return found
+
+
+def _board(
+    one: BoardFrame,
+    reference: MeanFrame,
+    boards: BoardSet,
+    gain: SensorGain,
+    layout: PsiLayout,
+    good: NDArray[np.bool_],
+) -> Board:
+    signal, signal_variance = _signal(one.frame, boards, gain)
+    white, white_variance = _signal(reference, boards, gain)
+    bright = white * reference.exposure_s > DARKEST_REFERENCE_DN
+    if bright.mean() < 0.5:
+        raise CalibrationError(
+            f"the reference whiteboard under the {one.lamp} lamp is less than "
+            f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
+        )
+    if float(np.median(signal)) * one.frame.exposure_s < DARKEST_REFERENCE_DN / 10:
+        raise CalibrationError(
+            f"{one.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
+        )
+    safe = np.where(bright, white, 1)
+    reading = signal / safe
+    variance = signal_variance / safe**2 + reading**2 * white_variance / safe**2
+    variance = np.where(bright & good, variance, np.inf)
+    k = layout.binning
+    if layout.colour is not None:
+        channels = layout.colour[one.shot, ::k, ::k]
+    elif one.lamp in LAMP_COLOURS:
+        channels = np.full(reading.shape, LAMP_COLOURS.index(one.lamp), dtype=np.uint8)
+    else:
+        channels = np.full(reading.shape, 3, dtype=np.uint8)
+    views_open = np.ones(layout.views, dtype=bool)
+    if one.pinhole is not None:
+        views_open[:] = False
+        views_open[one.pinhole] = True
+    return Board(
+        one.name,
+        reading.astype(np.float32),
+        variance.astype(np.float32),
+        np.ascontiguousarray(channels),
+        views_open,
+        one.stage_um,
+        one.shot,
+    )
+
+
+def _signal(frame: MeanFrame, boards: BoardSet, gain: SensorGain) -> tuple[Array, Array]:
+    """Return DN per second above the dark, and its variance."""
+    dark = boards.dark_at(frame.exposure_s)
+    signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
+    variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
+    return signal / frame.exposure_s, variance / frame.exposure_s**2
+
+
+def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
+    """Return which pixels to use, (pixel_y, pixel_x): neither hot nor dead.
+
+    A pixel is hot whose dark frame, and dead whose reference, lies apart from its neighbours of
+    the same colour by far more than pixels differ: ten robust deviations, and for the reference
+    at least a fifth of its level.
+    """
+    dark = boards.dark.mean_dn.astype(np.float64)
+    good = np.ones(dark.shape, dtype=bool)
+    for one in boards.darks:
+        level = one.mean_dn.astype(np.float64)
+        good &= np.abs(level - np.median(level)) <= 10 * max(_spread(level), 0.5)
+    for reference in boards.references.values():
+        signal = reference.mean_dn - dark
+        for y in range(2):
+            for x in range(2):
+                part = signal[y::2, x::2]
+                level = float(np.median(part))
+                off = np.abs(part - level)
+                limit = max(10 * _spread(part), 0.2 * level)
+                good[y::2, x::2] &= off <= limit
+    return good
+
+
+def _spread(values: Array) -> float:
+    """Return a robust standard deviation."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))

@@ -1,0 +1,193 @@
+"""The mixed route: dust and defects on the mask, found in what the placement leaves unexplained.
+
+A defect takes the share delta off whatever passes a grain of the mask (half a cell), for every
+view and wherever the stage moves it: a property of the mask, not of pixels. Residuals are linear
+in the deltas. Grains are taken up only where the whiteboards support it (their own evidence beats
+SUPPORT deviations), then solved for together with the prior N(0, SIZE^2), and looked for again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from calibration.boards import Board
+from calibration.placement import Placement
+from calibration.shadow import Shadow, ShadowMask
+
+Array = NDArray[np.floating]
+SPLITS = 2
+SUPPORT = 6.0
+SIZE = 0.4
+ROUNDS = 3
+CHUNK = 16_384
+LARGEST_SHARE = 0.02
+"""Of the mask's grains; more are no defects but a wrong placement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Defects:
+    """The mask with its defects: grains (row, column), the share each takes off, and the mask."""
+
+    lost: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+    mask: ShadowMask
+
+    @property
+    def count(self) -> int:
+        """How many grains were taken up."""
+        return int(np.count_nonzero(self.lost))
+
+
+def _grained(mask: ShadowMask) -> ShadowMask:
+    cells = mask.cells.repeat(SPLITS, axis=1).repeat(SPLITS, axis=2)
+    return replace(mask, cells=np.ascontiguousarray(cells), cell_um=mask.cell_um / SPLITS)
+
+
+@njit(cache=True, parallel=True)
+def _influence(corners, shares_y, shares_x, weights, starts, through, channels, out):
+    """Set out (n, rows, columns) to how much each grain of a pixel's window adds to its reading.
+
+    corners: (n, view, 2), first grain of each view; shares: (n, view, k); weights: (n, view);
+    starts: (n, 2), of the window; through: (row, column, 4), what a grain passes.
+    """
+    for n in prange(out.shape[0]):
+        out[n] = 0
+        for view in range(corners.shape[1]):
+            top, left = corners[n, view]
+            for a in range(shares_y.shape[2]):
+                for b in range(shares_x.shape[2]):
+                    i, j = top + a - starts[n, 0], left + b - starts[n, 1]
+                    row, column = top + a, left + b
+                    if 0 <= row < through.shape[0] and 0 <= column < through.shape[1]:
+                        out[n, i, j] += (
+                            weights[n, view]
+                            * shares_y[n, view, a]
+                            * shares_x[n, view, b]
+                            * through[row, column, channels[n]]
+                        )
+
+
+def _entries(
+    shadow: Shadow, board: Board, pixels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return (pixel, grain) indices into the flat mask and their influences."""
+    channels = board.channels[pixels[:, 0], pixels[:, 1]]
+    corners, shares_y, shares_x, weights = shadow.footprints(
+        pixels, board.views_open, board.stage_um
+    )
+    count = shares_x.shape[2]
+    starts = corners.min(axis=1)
+    spans = (corners.max(axis=1) - starts).max(axis=0) + count
+    placement = shadow.placement
+    cells = shadow.mask.cells[board.shot % len(shadow.mask.cells)]
+    through = placement.leak + (placement.clear - placement.leak) * cells.astype(np.float64)
+    out = np.empty((len(pixels), *spans))
+    _influence(corners, shares_y, shares_x, weights, starts, through, channels, out)
+    rows = starts[:, :1] + np.arange(spans[0])
+    columns = starts[:, 1:] + np.arange(spans[1])
+    height, width = cells.shape[:2]
+    index = (
+        np.clip(rows, 0, height - 1)[:, :, None] * width
+        + np.clip(columns, 0, width - 1)[:, None, :]
+    )
+    return index.reshape(len(pixels), -1), out.reshape(len(pixels), -1)
+
+
+def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement) -> Defects:
+    """Return the defects that these whiteboards support, under the placement fitted to them."""
+    fine = _grained(mask)
+    height, width = fine.cells.shape[1:3]
+    lost = np.zeros(height * width)
+    deviation = np.zeros(height * width)
+    for _ in range(ROUNDS):
+        shadow = Shadow(fine, placement)
+        gradient, curvature = np.zeros(height * width), np.zeros(height * width)
+        current = Shadow(_with_losses(fine, placement, lost.reshape(height, width)), placement)
+        residuals = [_residual(current, board) for board in boards]
+        spread = max(1.0, 1.4826 * float(np.median(np.abs(np.concatenate(residuals)))))
+        for board, residual in zip(boards, residuals, strict=True):
+            pixels = np.argwhere(board.usable)
+            deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
+            for first in range(0, len(pixels), CHUNK):
+                part = slice(first, first + CHUNK)
+                index, influence = _entries(shadow, board, pixels[part])
+                scaled = influence / deviations[part, None]
+                pull = -scaled * (residual[part, None] / spread)
+                gradient += np.bincount(index.ravel(), pull.ravel(), height * width)
+                curvature += np.bincount(index.ravel(), (scaled**2).ravel(), height * width)
+        evidence = gradient / np.sqrt(np.maximum(curvature, 1e-12))
+        chosen = (np.abs(evidence) > SUPPORT) & (curvature > 1 / SIZE**2)
+        chosen |= lost != 0
+        if not chosen.any() or chosen.mean() > LARGEST_SHARE:
+            break
+        lost, deviation = _solved(boards, shadow, fine, placement, np.flatnonzero(chosen), spread)
+    losses = lost.reshape(height, width)
+    return Defects(
+        losses.astype(np.float32),
+        deviation.reshape(height, width).astype(np.float32),
+        _with_losses(fine, placement, losses),
+    )
+
+
+def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:
+    """Return a mask whose grains (row, column) have lost so much, as `find_defects` gives it."""
+    return _with_losses(_grained(mask), placement, lost)
+
+
+def _residual(shadow: Shadow, board: Board) -> Array:
+    pixels = np.argwhere(board.usable)
+    predicted = shadow.readings(
+        pixels, board.channels[board.usable], board.views_open, board.stage_um, board.shot
+    )
+    scale = np.sqrt(board.variance[board.usable].astype(np.float64))
+    return (board.reading[board.usable] - predicted) / scale
+
+
+def _solved(
+    boards: Sequence[Board],
+    shadow: Shadow,
+    fine: ShadowMask,
+    placement: Placement,
+    chosen: NDArray[np.intp],
+    spread: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the losses of the chosen grains and their deviations, on the flat mask."""
+    place = np.full(fine.cells.shape[1] * fine.cells.shape[2], -1)
+    place[chosen] = np.arange(len(chosen))
+    matrix = sparse.csc_array(sparse.diags_array(np.full(len(chosen), 1 / SIZE**2)))
+    right = np.zeros(len(chosen))
+    for board in boards:
+        residual = _residual(shadow, board)
+        pixels = np.argwhere(board.usable)
+        deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
+        for first in range(0, len(pixels), CHUNK):
+            part = slice(first, first + CHUNK)
+            index, influence = _entries(shadow, board, pixels[part])
+            column = place[index]
+            rows, entries = np.nonzero((column >= 0) & (influence > 0))
+            values = influence[rows, entries] / deviations[part][rows]
+            shape = (len(index), len(chosen))
+            slopes = sparse.csc_array((-values, (rows, column[rows, entries])), shape=shape)
+            matrix = matrix + slopes.T @ slopes
+            right += slopes.T @ (residual[part] / spread)
+    matrix = sparse.csc_array(matrix)
+    solution = np.ravel(np.asarray(spsolve(matrix, right)))
+    lost, deviation = np.zeros(len(place)), np.zeros(len(place))
+    lost[chosen] = np.clip(solution, -1, 1)
+    deviation[chosen] = 1 / np.sqrt(matrix.diagonal())
+    return lost, deviation
+
+
+def _with_losses(fine: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:
+    """Return the mask whose grains pass so much less."""
+    clear, leak = placement.clear, placement.leak
+    through = leak + (clear - leak) * fine.cells
+    passed = through * (1 - lost[None, :, :, None])
+    return replace(fine, cells=((passed - leak) / (clear - leak)).astype(np.float32))

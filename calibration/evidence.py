@@ -1,0 +1,197 @@
+"""How well a Psi explains captured frames without knowing the scene: evidence of small blocks.
+
+Prior of a block: a textured plane of one disparity d, so view (v, u) sees it moved by d (v, u).
+Its brightness is a sum of cubic B-splines on two grids with independent normal coefficients, and
+each colour adds a coarser one of its own; so the block's readings are normal with covariance
+K = A diag(spread^2) A^T + floor^2, A the splines through Psi. The block's amplitude is not known:
+profiled out, what is left is  -n/2 log(y^T K^-1 y) - 1/2 log|K|,  averaged over the disparities
+(Bishop 2006, section 3.5). It peaks where the mask's modulation lies where the frames have it,
+whatever the scene: evidence, not residual, because one to three shots leave any Psi able to
+explain any frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+FINE_PX, COARSE_PX = 2.0, 4.0
+FINE_SPREAD, COARSE_SPREAD, MEAN_SPREAD, CHROMA_SPREAD = 0.15, 0.3, 1.0, 0.15
+FLOOR_SHARE = 0.02
+"""Of a block's mean reading: what the prior does not describe (occlusion, fine texture)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The planes' splines: for every disparity, what grid point adds to what pixel of what view.
+
+    down, across: (disparity, view, pixel, spline), of every grid in turn. grids: (grid, 2), first
+    spline and number. spreads: per grid. Grids: fine, coarse, constant; coarse is also that of
+    the colours.
+    """
+
+    disparities_px: NDArray[np.float64]
+    down: NDArray[np.float64]
+    across: NDArray[np.float64]
+    grids: NDArray[np.int64]
+    side: int
+
+
+def _spline(t: Array) -> Array:
+    """Return the cubic B-spline of unit knot distance."""
+    t = np.abs(t)
+    inner = 2 / 3 - t**2 + t**3 / 2
+    outer = np.clip(2 - t, 0, None) ** 3 / 6
+    return np.where(t < 1, inner, outer)
+
+
+def plane_prior(views: tuple[int, int], side: int, disparities_px: Array) -> Prior:
+    """Return the prior of blocks of side x side pixels for the disparities given."""
+    reach = float(np.abs(disparities_px).max()) * (max(views) - 1) / 2
+    knots, grids = [], []
+    for step in (FINE_PX, COARSE_PX):
+        count = int(np.ceil((side - 1 + 2 * reach) / step)) + 3
+        grids.append((sum(len(one[0]) for one in knots), count))
+        knots.append(((np.arange(count) - (count - 1) / 2) * step, step))
+    grids.append((sum(len(one[0]) for one in knots), 1))
+    pixels = np.arange(side) - (side - 1) / 2
+
+    def table(count: int) -> NDArray[np.float64]:
+        at = np.arange(count) - (count - 1) / 2
+        places = pixels[None, None, :] + disparities_px[:, None, None] * at[None, :, None]
+        parts = [_spline((places[..., None] - points) / step) for points, step in knots]
+        parts.append(np.ones((*places.shape, 1)))
+        return np.concatenate(parts, axis=-1).astype(np.float64)
+
+    return Prior(
+        np.asarray(disparities_px, dtype=np.float64),
+        table(views[0]),
+        table(views[1]),
+        np.array(grids, dtype=np.int64),
+        side,
+    )
+
+
+@njit(cache=True)
+def _add_grid(coefficients, down, across, first, count, matrix, at):
+    """Add to matrix (n, ...) from column `at` the splines of one grid seen through coefficients.
+
+    coefficients: (shot, side^2, v, u).
+    """
+    shots, area, views_v, views_u = coefficients.shape
+    side = down.shape[1]
+    line = np.empty(count)
+    for shot in range(shots):
+        for pixel in range(area):
+            y, x = pixel // side, pixel % side
+            row = shot * area + pixel
+            for v in range(views_v):
+                line[:] = 0
+                for u in range(views_u):
+                    weight = coefficients[shot, pixel, v, u]
+                    for k in range(count):
+                        line[k] += weight * across[u, x, first + k]
+                for i in range(count):
+                    share = down[v, y, first + i]
+                    if share != 0:
+                        for k in range(count):
+                            matrix[row, at + i * count + k] += share * line[k]
+
+
+@njit(cache=True, parallel=True)
+def _evidences(coefficients, colours, readings, noise, down, across, grids, chosen, found):
+    """Set found (block, candidate) to each block's log evidence at its chosen disparities.
+
+    coefficients: (block, shot, pixel, v, u); colours, readings, noise: (block, shot, pixel).
+    chosen: (block, candidate) indices of disparities.
+    """
+    blocks, shots, area = readings.shape
+    n = shots * area
+    fine, coarse = grids[0, 1] ** 2, grids[1, 1] ** 2
+    total = fine + coarse + 1
+    for block in prange(blocks):
+        values = readings[block].copy().reshape(n)
+        level = 0.0
+        for i in range(n):
+            level += values[i] / n
+        colour = colours[block].copy().reshape(n)
+        for candidate in range(chosen.shape[1]):
+            d = chosen[block, candidate]
+            matrix = np.zeros((n, total))
+            at = 0
+            for grid in range(3):
+                _add_grid(
+                    coefficients[block],
+                    down[d],
+                    across[d],
+                    grids[grid, 0],
+                    grids[grid, 1],
+                    matrix,
+                    at,
+                )
+                at += grids[grid, 1] ** 2
+            coloured = matrix[:, fine:] * CHROMA_SPREAD
+            chroma = coloured @ coloured.T
+            matrix[:, :fine] *= FINE_SPREAD
+            matrix[:, fine : fine + coarse] *= COARSE_SPREAD
+            matrix[:, fine + coarse :] *= MEAN_SPREAD
+            covariance = matrix @ matrix.T
+            scale = 0.0
+            for i in range(n):
+                scale += covariance[i, i] / n
+            for i in range(n):
+                for j in range(n):
+                    if colour[i] == colour[j]:
+                        covariance[i, j] += chroma[i, j]
+                relative = noise[block].reshape(n)[i] / max(level * level, 1e-12)
+                covariance[i, i] += scale * (FLOOR_SHARE**2 + relative)
+            root = np.linalg.cholesky(covariance)
+            logarithm, squares = 0.0, 0.0
+            whitened = np.empty(n)
+            for i in range(n):
+                value = values[i]
+                for j in range(i):
+                    value -= root[i, j] * whitened[j]
+                whitened[i] = value / root[i, i]
+                squares += whitened[i] ** 2
+                logarithm += np.log(root[i, i])
+            found[block, candidate] = -0.5 * n * np.log(max(squares, 1e-300)) - logarithm
+
+
+def log_evidence(
+    prior: Prior,
+    coefficients: Array,
+    colours: NDArray[np.uint8],
+    readings: Array,
+    noise: Array,
+    chosen: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the log evidence of every block at its disparities, (block, candidate).
+
+    coefficients: (block, shot, side^2, v, u), Psi's of what each pixel sees. colours, readings,
+    noise: (block, shot, side^2), noise the variance of a reading. chosen: (block, candidate),
+    indices into the prior's disparities.
+    """
+    found = np.empty(chosen.shape)
+    _evidences(
+        np.ascontiguousarray(coefficients, dtype=np.float64),
+        np.ascontiguousarray(colours),
+        np.ascontiguousarray(readings, dtype=np.float64),
+        np.ascontiguousarray(noise, dtype=np.float64),
+        prior.down,
+        prior.across,
+        prior.grids,
+        np.ascontiguousarray(chosen, dtype=np.int64),
+        found,
+    )
+    return found
+
+
+def averaged(evidence: Array) -> NDArray[np.float64]:
+    """Return the log of the mean evidence over candidates, (block,)."""
+    top = evidence.max(axis=1)
+    return top + np.log(np.mean(np.exp(evidence - top[:, None]), axis=1))

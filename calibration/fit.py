@@ -1,0 +1,441 @@
+"""The parametric route: the placement of a known mask from a few whiteboards, robust and weighted.
+
+Levenberg-Marquardt on the posterior of readings weighed by the noise, Tukey's biweight (dust, bad
+pixels) and a wide prior (the bench's tolerances). The normal equations are summed over chunks of
+pixels: time is linear in the pixels, memory is that of one chunk. The fit begins on the middle of
+the picture, registered by correlation, and widens: a small turn or stretch that moves the corner
+by pixels moves the middle by little.
+
+Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from calibration.boards import Board
+from calibration.errors import CalibrationError
+from calibration.placement import (
+    SCALARS,
+    Placement,
+    Tolerances,
+    designed_placement,
+    labels,
+    with_aperture_mean_one,
+)
+from calibration.registration import register
+from calibration.shadow import Shadow, ShadowMask
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.settings import Settings
+
+Array = NDArray[np.floating]
+TUKEY = 4.685
+"""Times the deviation: 95 % as sure as least squares where the noise is normal."""
+CHUNK = 4096
+FIRST_WINDOW_PX = 64
+DECIDED = 0.7
+"""Of the prior's deviation: a parameter told no better stays at the design."""
+MOST_MORE = 200
+LEAST_FIT_CORRELATION = 0.7
+OFFSETS = slice(0, 2)
+
+
+class FitSettings(Settings):
+    """Settings of the fit.
+
+    pixels_per_board: at most so many of each whiteboard, drawn at random over the window; more
+    make the placement surer than the whiteboards make Psi.
+    """
+
+    pixels_per_board: int = Field(default=60_000, ge=500)
+    first_pixels: int = Field(default=6_000, ge=500, description="while the window widens")
+    max_steps: int = Field(default=40, ge=1)
+    tolerance: float = Field(
+        default=0.02, gt=0, description="of a last step, in standard deviations"
+    )
+    seed: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True)
+class BoardCheck:
+    """How one whiteboard agrees with the fit of all: brightness and where its mask stood.
+
+    chi2: mean squared residual over the noise, of the pixels that are no outliers. outliers:
+    their share.
+    """
+
+    name: str
+    brightness: float
+    brightness_deviation: float
+    moved_um: tuple[float, float]
+    moved_deviation_um: float
+    chi2: float
+    outliers: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The placement fitted, how sure it is, and how well it explains the whiteboards.
+
+    covariance: (parameter, parameter), in the order of `placement.vector()`; bound: likewise, the
+    inverse of the Fisher information of the readings used (with the prior), which it does not
+    fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
+    parameters that the prior decides more than the whiteboards; more_boards: how many more of the
+    same kinds would decide them (MOST_MORE: no number of them). history: robust deviation of the
+    residuals over the noise after every step, at least 1.
+    """
+
+    placement: Placement
+    covariance: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    correlation: float
+    chi2: float
+    outliers: float
+    steps: int
+    status: str
+    advice: str
+    undecided: tuple[str, ...]
+    more_boards: int
+    boards: tuple[BoardCheck, ...]
+    history: tuple[float, ...] = field(default=())
+
+    def deviation(self, name: str) -> float:
+        """Return the standard deviation of a parameter by name."""
+        index = labels(np.shape(self.placement.aperture)).index(name)  # type: ignore[arg-type]
+        return float(np.sqrt(self.covariance[index, index]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Some pixels of one board, with what they read."""
+
+    board: Board
+    pixels: NDArray[np.int64]
+    channels: NDArray[np.uint8]
+    reading: Array
+    deviation: Array
+
+
+def _samples(
+    boards: Sequence[Board], half_px: float, limit: int, rng: np.random.Generator
+) -> list[_Sample]:
+    """Return at most `limit` usable pixels of every board within `half_px` of the middle."""
+    found = []
+    for board in boards:
+        rows, columns = board.reading.shape
+        y, x = (np.arange(count) - (count - 1) / 2 for count in (rows, columns))
+        inside = (np.abs(y) <= half_px)[:, None] & (np.abs(x) <= half_px)
+        chosen = np.flatnonzero(board.usable & inside)
+        if len(chosen) > limit:
+            chosen = np.sort(rng.choice(chosen, limit, replace=False))
+        pixels = np.stack(np.unravel_index(chosen, board.reading.shape), axis=1)
+        flat = chosen
+        found.append(
+            _Sample(
+                board,
+                pixels,
+                board.channels.ravel()[flat],
+                board.reading.ravel()[flat].astype(np.float64),
+                np.sqrt(board.variance.ravel()[flat].astype(np.float64)),
+            )
+        )
+    return found
+
+
+def _scaled_residuals(shadow: Shadow, sample: _Sample) -> Array:
+    predicted = shadow.readings(
+        sample.pixels,
+        sample.channels,
+        sample.board.views_open,
+        sample.board.stage_um,
+        sample.board.shot,
+    )
+    return (sample.reading - predicted) / sample.deviation
+
+
+def _spread(residuals: Sequence[Array]) -> float:
+    """Return the robust deviation of the residuals in units of the noise, at least 1."""
+    return max(1.0, float(1.4826 * np.median(np.abs(np.concatenate(residuals)))))
+
+
+def _loss(scaled: Array) -> float:
+    """Return Tukey's loss of residuals in deviations."""
+    within = np.clip((scaled / TUKEY) ** 2, 0, 1)
+    return float(TUKEY**2 / 6 * np.sum(1 - (1 - within) ** 3))
+
+
+def _weights(scaled: Array) -> Array:
+    return np.clip(1 - (scaled / TUKEY) ** 2, 0, None) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Gauss-Newton normal equations, Fisher information, loss and what the residuals are like."""
+
+    matrix: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    information: NDArray[np.float64]
+    spread: float
+    squares: float
+    kept: int
+    count: int
+
+
+def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> _Normal:
+    shadow = Shadow(mask, placement)
+    residuals = [_scaled_residuals(shadow, sample) for sample in samples]
+    spread = _spread(residuals)
+    size = len(placement.vector())
+    matrix, information = np.zeros((size, size)), np.zeros((size, size))
+    gradient = np.zeros(size)
+    squares, kept = 0.0, 0
+    for sample, residual in zip(samples, residuals, strict=True):
+        for first in range(0, len(residual), CHUNK):
+            part = slice(first, first + CHUNK)
+            slope = shadow.with_slopes(
+                sample.pixels[part],
+                sample.channels[part],
+                sample.board.views_open,
+                sample.board.stage_um,
+                sample.board.shot,
+            )[1]
+            slope /= sample.deviation[part, None] * spread
+            scaled = residual[part] / spread
+            weight = _weights(scaled)
+            matrix += slope.T @ (slope * weight[:, None])
+            information += slope.T @ slope
+            gradient += slope.T @ (weight * scaled)
+            inside = weight > 0
+            squares += float((residual[part][inside] ** 2).sum())
+            kept += int(inside.sum())
+    count = sum(len(residual) for residual in residuals)
+    return _Normal(matrix, gradient, information, spread, squares, kept, count)
+
+
+def _posterior(
+    mask: ShadowMask,
+    placement: Placement,
+    samples: Sequence[_Sample],
+    spread: float,
+    prior: Array,
+    centre: Array,
+) -> float:
+    shadow = Shadow(mask, placement)
+    loss = sum(_loss(_scaled_residuals(shadow, sample) / spread) for sample in samples)
+    return loss + 0.5 * float(np.sum(prior * (placement.vector() - centre) ** 2))
+
+
+def fit_placement(
+    boards: Sequence[Board],
+    camera: Camera,
+    mask: ShadowMask,
+    settings: FitSettings | None = None,
+    tolerances: Tolerances | None = None,
+    start: Placement | None = None,
+    on_step: Callable[[float], None] | None = None,
+) -> Fit:
+    """Return the placement that explains the whiteboards.
+
+    start: from an earlier fit, to begin there without registering. Raises CalibrationError
+    without whiteboards, for a mask that is not the design's (with the correlation found), and
+    where the fit does not explain what it was given. Not converging is a status.
+    """
+    settings, tolerances = settings or FitSettings(), tolerances or Tolerances()
+    if not boards:
+        raise CalibrationError("no whiteboard with the mask in: capture at least one")
+    designed = designed_placement(camera)
+    soft = replace(designed, blur_um=0.1 * mask.cell_um)
+    if start is None:
+        clearest = max(boards, key=_contrast)
+        registered = register(clearest, mask, soft)
+        placement = registered.placement
+    else:
+        placement = start
+    centre = soft.vector()
+    deviations = tolerances.deviations(camera.views)
+    # A stage sits where it was found; the prior is for what whiteboards do not tell.
+    centre[OFFSETS] = placement.vector()[OFFSETS]
+    prior = 1 / deviations**2
+    rng = np.random.default_rng(settings.seed)
+    history: list[float] = []
+    steps, converged = 0, False
+    normal = None
+    for half_px, limit in _windows(mask, settings):
+        samples = _samples(boards, half_px, limit, rng)
+        placement, taken, converged, normal = _descend(
+            mask, placement, samples, prior, centre, settings, history, on_step
+        )
+        steps += taken
+    assert normal is not None
+    placement = with_aperture_mean_one(placement)
+    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior)), np.float64)
+    information = normal.information * normal.spread**2 + np.diag(prior)
+    bound = np.asarray(np.linalg.inv(information), np.float64)
+    correlation = _correlation(mask, placement, samples)
+    if correlation < LEAST_FIT_CORRELATION:
+        raise CalibrationError(
+            f"the fit does not explain the whiteboards: their correlation with the shadow of the "
+            f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
+            "needed; check the mask and the camera's description, or use the free route"
+        )
+    told = _told(placement, covariance, tolerances)
+    undecided = tuple(
+        name for name, share in zip(labels(camera.views), told, strict=True) if share > DECIDED
+    )
+    # Precision beyond the prior's grows with the number of whiteboards.
+    have = np.maximum(1 / np.maximum(told, 1e-6) ** 2 - 1, 1e-9)
+    lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
+    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
+    kept = max(normal.kept, 1)
+    return Fit(
+        placement,
+        covariance,
+        bound,
+        correlation,
+        normal.squares / kept,
+        1 - normal.kept / max(normal.count, 1),
+        steps,
+        "converged" if converged else "step limit reached",
+        "" if converged else "raise max_steps, or capture another whiteboard",
+        undecided,
+        more,
+        tuple(_check(mask, placement, sample) for sample in samples),
+        tuple(history),
+    )
+
+
+def _told(
+    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
+) -> NDArray[np.float64]:
+    """Return every parameter's deviation over that of the prior, by their labels.
+
+    Of the aperture's weights what counts is their share of the light: neither their common level
+    nor what a falloff in their place would say is to be decided.
+    """
+    weights = np.array(placement.aperture)
+    views = weights.shape
+    prior = tolerances.deviations((views[0], views[1]))
+    share = np.sqrt(np.diag(covariance)) / prior
+    v, u = ((np.arange(count) - (count - 1) / 2) for count in views)
+    far = (v[:, None] ** 2 + u**2).ravel()
+    far = far / max(far.max(), 1e-12)
+    count, first = weights.size, len(SCALARS)
+    slopes = np.zeros((count, len(covariance)))
+    slopes[:, first:] = np.diag(1 / weights.ravel())
+    slopes[:, SCALARS.index("falloff")] = far / (1 + placement.falloff * far)
+    slopes -= slopes.mean(axis=0)
+    spread = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
+    share[first:] = np.minimum(spread / tolerances.aperture, 1.0)
+    share[SCALARS.index("falloff")] = 0.0
+    return share
+
+
+def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]:
+    """Return half sides of windows, in pixels, that widen to the picture, and how many pixels."""
+    whole = max(mask.pixel_shape()) / 2
+    half, found = float(FIRST_WINDOW_PX), []
+    while half < whole:
+        found.append((half, settings.first_pixels))
+        half *= 2
+    return [*found, (whole, settings.first_pixels), (whole, settings.pixels_per_board)]
+
+
+def _descend(
+    mask: ShadowMask,
+    placement: Placement,
+    samples: Sequence[_Sample],
+    prior: Array,
+    centre: Array,
+    settings: FitSettings,
+    history: list[float],
+    on_step: Callable[[float], None] | None,
+) -> tuple[Placement, int, bool, _Normal]:
+    """Return the placement after Levenberg-Marquardt steps on these samples."""
+    damping = 1e-3
+    normal = _normal(mask, placement, samples)
+    for step in range(settings.max_steps):
+        pull = prior * (centre - placement.vector())
+        value = _posterior(mask, placement, samples, normal.spread, prior, centre)
+        while True:
+            matrix = normal.matrix + np.diag(prior)
+            matrix[np.diag_indices_from(matrix)] *= 1 + damping
+            move = np.linalg.solve(matrix, normal.gradient + pull)
+            trial = placement.moved(move)
+            found = _posterior(mask, trial, samples, normal.spread, prior, centre)
+            if found <= value or damping > 1e6:
+                break
+            damping *= 8
+        damping = max(damping / 5, 1e-7)
+        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior)
+        size = float(np.max(np.abs(trial.vector() - placement.vector()) / deviations))
+        if found <= value:
+            placement = trial
+        normal = _normal(mask, placement, samples)
+        history.append(normal.spread)
+        if on_step is not None:
+            on_step(normal.spread)
+        if size < settings.tolerance or found > value:
+            return placement, step + 1, True, normal
+    return placement, settings.max_steps, False, normal
+
+
+def _contrast(board: Board) -> float:
+    """Return how far above its noise a board varies."""
+    usable = board.usable
+    if not usable.any():
+        raise CalibrationError(f"{board.name}: no usable pixel")
+    return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
+
+
+def _correlation(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> float:
+    """Return the correlation of readings and fit, colour by colour, outliers clipped."""
+    shadow = Shadow(mask, placement)
+    product = mine = theirs = 0.0
+    for sample in samples:
+        fitted = sample.reading - _scaled_residuals(shadow, sample) * sample.deviation
+        for channel in np.unique(sample.channels):
+            seen = sample.channels == channel
+            a = sample.reading[seen] - np.median(sample.reading[seen])
+            a = np.clip(a, -4 * np.std(a), 4 * np.std(a))
+            b = fitted[seen] - fitted[seen].mean()
+            a -= a.mean()
+            product += float(a @ b)
+            mine += float(a @ a)
+            theirs += float(b @ b)
+    return product / np.sqrt(max(mine * theirs, 1e-300))
+
+
+def _check(mask: ShadowMask, placement: Placement, sample: _Sample) -> BoardCheck:
+    """Return how far one board's brightness and mask are off, all else as fitted."""
+    shadow = Shadow(mask, placement)
+    board = sample.board
+    fitted, slope = shadow.with_slopes(
+        sample.pixels, sample.channels, board.views_open, board.stage_um, board.shot
+    )
+    rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
+    residual = (sample.reading - fitted) / sample.deviation
+    weight = np.ones(len(residual))
+    found = np.zeros(3)
+    matrix = np.eye(3)
+    for _ in range(8):
+        matrix = rows.T @ (rows * weight[:, None])
+        found = np.linalg.solve(matrix, rows.T @ (weight * residual))
+        left = residual - rows @ found
+        weight = _weights(left / _spread([left]))
+    spread = _spread([residual])
+    inside = _weights(residual / spread) > 0
+    deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
+    return BoardCheck(
+        board.name,
+        float(1 + found[0]),
+        float(deviation[0]),
+        (float(found[1]), float(found[2])),
+        float(deviation[1:].max()),
+        float(np.mean(residual[inside] ** 2)),
+        float(1 - inside.mean()),
+    )

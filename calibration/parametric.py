@@ -1,0 +1,124 @@
+"""Psi from the placement of the mask: coefficients, how sure they are, at any stage position."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.shadow import ANY_COLOUR, Shadow
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+
+ROWS = 256
+Stages = Sequence[tuple[float, float]]
+SAMPLED = 3_000
+
+
+def shot_stages(camera: Camera) -> Stages:
+    """Return where the mask stage stands in every shot, x and y in um: as the camera says."""
+    (name,) = camera.masks
+    return [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
+
+
+def _one_view(views: tuple[int, int], v: int, u: int) -> NDArray[np.bool_]:
+    chosen = np.zeros(views, dtype=bool)
+    chosen[v, u] = True
+    return chosen
+
+
+def _bands(
+    layout: PsiLayout, shot: int, stored: int
+) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.uint8]]]:
+    """Yield rows of samples with their indices (n, 2) and colours (n,)."""
+    rows, columns = layout.size
+    for first in range(0, rows, ROWS):
+        band = slice(first, min(first + ROWS, rows))
+        y, x = np.mgrid[band, :columns]
+        samples = np.stack([y.ravel(), x.ravel()], axis=1)
+        if layout.colour is None:
+            channels = np.full(len(samples), stored, dtype=np.uint8)
+        else:
+            channels = layout.colour[shot, band].ravel()
+        yield band, samples, channels
+
+
+def coefficient_planes(
+    shadow: Shadow, layout: PsiLayout, stages: Stages
+) -> Iterator[tuple[tuple[int, int, int, int], NDArray[np.float32]]]:
+    """Yield ((shot, v, u, stored colour), coefficients (y, x)) of Psi, one plane in memory.
+
+    stages: per shot.
+    """
+    shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    mask = replace(shadow.mask, binning=1)
+    samples_shadow = Shadow(mask, shadow.placement)
+    scale = stored_colours * layout.binning**2
+    for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
+        plane = np.empty(layout.size, dtype=np.float32)
+        chosen = _one_view((views_v, views_u), v, u)
+        for band, samples, channels in _bands(layout, shot, stored):
+            read = samples_shadow.readings(samples, channels, chosen, stages[shot], shot)
+            plane[band] = read.reshape(plane[band].shape) / scale
+        yield (shot, v, u, stored), plane
+
+
+def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
+    """Return Psi with the mask stage at `stages`, one (x, y) in um per shot."""
+    weights = np.empty(layout.shape, dtype=np.float32)
+    for (shot, v, u, stored), plane in coefficient_planes(shadow, layout, stages):
+        weights[shot, v, u, :, stored] = plane
+    return ImagingMatrix(weights, layout.colour, layout.binning, layout.camera_json)
+
+
+def psi_deviation(
+    shadow: Shadow, layout: PsiLayout, stages: Stages, covariance: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the standard deviation of every coefficient, shaped as Psi's weights.
+
+    covariance: of the placement's parameters.
+    """
+    root = np.linalg.cholesky(covariance + 1e-15 * np.diag(np.diag(covariance)))
+    mask = replace(shadow.mask, binning=1)
+    samples_shadow = Shadow(mask, shadow.placement)
+    deviation = np.empty(layout.shape, dtype=np.float32)
+    shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    scale = stored_colours * layout.binning**2
+    for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
+        chosen = _one_view((views_v, views_u), v, u)
+        for band, samples, channels in _bands(layout, shot, stored):
+            slopes = samples_shadow.with_slopes(samples, channels, chosen, stages[shot], shot)[1]
+            spread = np.sqrt(np.square(slopes @ root).sum(axis=1)) / scale
+            target = deviation[shot, v, u, band, stored]
+            target[...] = spread.reshape(target.shape)
+    return deviation
+
+
+def psi_information(
+    shadow: Shadow, pixels: int = SAMPLED, seed: int = 0
+) -> tuple[NDArray[np.float64], float]:
+    """Return what turns a covariance of the placement into the error of Psi, and |Psi|^2.
+
+    The expected squared Frobenius error of Psi is trace(matrix covariance); both per pixel and
+    coefficient, from `pixels` of them drawn at random, each seeing one colour.
+    """
+    mask = shadow.mask
+    rng = np.random.default_rng(seed)
+    rows, columns = mask.pixel_shape()
+    chosen = np.stack([rng.integers(rows, size=pixels), rng.integers(columns, size=pixels)], 1)
+    channels = rng.integers(ANY_COLOUR, size=pixels).astype(np.uint8)
+    size = len(shadow.placement.vector())
+    matrix, squares = np.zeros((size, size)), 0.0
+    for v, u in np.ndindex(mask.views):
+        values, slopes = shadow.with_slopes(chosen, channels, _one_view(mask.views, v, u))
+        matrix += slopes.T @ slopes
+        squares += float(values @ values)
+    return matrix / pixels, squares / pixels
+
+
+def expected_psi_error(shadow: Shadow, covariance: NDArray[np.float64]) -> float:
+    """Return the expected relative Frobenius error of Psi from the placement's covariance."""
+    matrix, squares = psi_information(shadow)
+    return float(np.sqrt(max(np.trace(matrix @ covariance), 0) / squares))

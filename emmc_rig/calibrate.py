@@ -1,0 +1,409 @@
+"""`emmc-rig calibrate`: whiteboards of the simulated bench to Psi, with the choice of route told.
+
+What a session of a real rig needs instead of `WhiteboardBench` is a `BoardSet` of its frames.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from calibration.boards import BoardSet, as_readings
+from calibration.fit import FitSettings
+from calibration.placement import SCALARS, Placement, designed_placement, labels
+from calibration.planning import (
+    Kind,
+    Light,
+    PlannedFrames,
+    free_error,
+    plan_free,
+    plan_parametric,
+)
+from calibration.routes import Outcome, Parametric, calibrate
+from calibration.sensor import SensorSheet, characterise
+from calibration.shadow import ShadowMask, shadow_mask
+from calibration.stage_map import StageMap, locate, stage_map
+from calibration.whiteboard import Calibration, lamps_needed
+from emmc_rig.calibration_report import write_calibration_report
+from emmc_rig.demo import Silent, Watcher
+from emmc_rig.drift import CALIBRATION, PSI
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.whiteboard_bench import BenchTruth, Setting, WhiteboardBench
+
+PLAN, REPORT = "plan.yaml", "report.html"
+ROUTES = {
+    "auto": ("parametric", "mixed"),
+    "parametric": ("parametric",),
+    "mixed": ("parametric", "mixed"),
+    "free": ("free",),
+    "all": ("parametric", "mixed", "free"),
+}
+FREE_REPEATS = 2
+TARGET = 0.005
+STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
+VERIFY_UM = (-207.0, 118.0)
+STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
+
+
+@dataclass(frozen=True)
+class CalibrateSettings:
+    """What to calibrate: camera, size, route (a key of ROUTES), Psi's error to plan for, seed."""
+
+    camera_name: str
+    camera: Camera
+    size: tuple[int, int]
+    route: str = "auto"
+    target: float = TARGET
+    seed: int = 0
+    truth: BenchTruth = field(default_factory=BenchTruth)
+    fit: FitSettings = field(default_factory=FitSettings)
+    map_stage: bool = False
+
+
+def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
+    """Return what the plan counts on: the exposure of a whiteboard, and how many pixels see it."""
+    rows, columns = mask.pixel_shape()
+    views = bench.camera.views
+    single = bench.camera.sensor.cfa_name != "mono"
+    light = (1 if single else 3) * bench.camera.sensor.binning**2
+    return Light(
+        bench.camera.sensor.noise,
+        bench.board_exposure_s(),
+        views[0] * views[1],
+        light,
+        rows * columns,
+    )
+
+
+def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
+    """Return the design with edges as soft as a bench's may be: what a plan is made for."""
+    return replace(designed_placement(camera), blur_um=0.1 * mask.cell_um)
+
+
+def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: float) -> PlannedFrames:
+    """Return the whiteboards for the parametric route."""
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    kinds = [Kind(None, stage) for stage in stages]
+    kinds += [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    return plan_parametric(mask, soft_design(camera, mask), kinds, light, target)
+
+
+def few_settings(planned: PlannedFrames, lamp: str = "white") -> list[Setting]:
+    """Return a plan as settings of the bench, in shot 0."""
+    return [
+        Setting(0, kind.pinhole, lamp, kind.stage_um, count)
+        for kind, count in planned.counts.items()
+    ]
+
+
+def free_settings(camera: Camera, lamps: Sequence[str], repeats: int) -> list[Setting]:
+    """Return the settings of the free route: every shot, view and lamp."""
+    return [
+        Setting(shot, (v, u), lamp, repeats=repeats)
+        for shot in range(len(camera.shots))
+        for v, u in np.ndindex(camera.views)
+        for lamp in lamps
+    ]
+
+
+def held_out_settings(camera: Camera) -> list[Setting]:
+    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
+    return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
+
+
+def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
+    """Write plan.yaml and metrics.json: how many whiteboards of which kind reach the target."""
+    camera = settings.camera
+    mask = shadow_mask(camera, settings.size)
+    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
+    light = plan_light(bench, mask)
+    planned = parametric_plan(camera, mask, light, settings.target)
+    free = plan_free(mask, soft_design(camera, mask), light, settings.target, len(camera.shots))
+    repeats = max(free.counts.values()) // len(camera.shots)
+    lamps = lamps_needed(build_imaging_matrix(camera, (16, 16)))
+    exposures = {"open_s": light.exposure_s, "pinhole_s": light.exposure_s * light.pinhole_times}
+
+    def rows(plan: PlannedFrames) -> list[dict]:
+        return [
+            {
+                "pinhole": None if kind.pinhole is None else list(kind.pinhole),
+                "stage_um": list(kind.stage_um),
+                "frames": count,
+            }
+            for kind, count in plan.counts.items()
+        ]
+
+    plan = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "target_relative_error": settings.target,
+        "exposures": exposures,
+        "parametric": {
+            "dark_frames": 2 * planned.dark_frames,
+            "reference_frames": planned.reference_frames,
+            "whiteboards": rows(planned),
+            "frames": planned.exposures + planned.dark_frames,
+            "expected_relative_error": planned.expected_error,
+        },
+        "free": {
+            "dark_frames": 2 * free.dark_frames,
+            "reference_frames": free.reference_frames,
+            "repeats": repeats,
+            "lamps": list(lamps),
+            "frames": free.exposures + free.dark_frames,
+            "expected_relative_error": free.expected_error,
+        },
+    }
+    text = yaml.safe_dump(plan, sort_keys=False)
+    (folder / PLAN).write_text(text, encoding="utf-8")
+    metrics = {**plan, "command": command_line(), "versions": versions()}
+    write_metrics(folder, metrics)
+    return metrics
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A calibration of the simulated bench, with everything that the report shows."""
+
+    settings: CalibrateSettings
+    bench: WhiteboardBench
+    outcome: Outcome
+    few: BoardSet | None
+    held_out: BoardSet
+    planned: PlannedFrames | None
+    metrics: dict
+    sensor: SensorSheet
+    stage: StageMap | None
+
+
+def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None) -> Run:
+    """Capture the whiteboards that the route needs from the simulated bench, and calibrate."""
+    watcher = watcher or Silent()
+    if settings.route not in ROUTES:
+        raise AppError(f"--route {settings.route}: use one of {', '.join(ROUTES)}")
+    routes = ROUTES[settings.route]
+    camera = settings.camera
+    watcher.begin("design", None)
+    design = build_imaging_matrix(camera, settings.size)
+    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
+    lamps = lamps_needed(design)
+    few = pinholes = planned = None
+    started = time.perf_counter()
+    if "parametric" in routes:
+        mask = shadow_mask(camera, settings.size)
+        planned = parametric_plan(camera, mask, plan_light(bench, mask), settings.target)
+        wanted = few_settings(planned)
+        watcher.begin("whiteboards for the fit", len(wanted))
+        few = bench.capture(wanted, watcher.step)
+    if "free" in routes:
+        wanted = free_settings(camera, lamps, FREE_REPEATS)
+        watcher.begin("whiteboards through the pinhole", len(wanted))
+        pinholes = bench.capture(wanted, watcher.step)
+    watcher.begin("whiteboards to judge by", None)
+    judges = held_out_settings(camera)[: 2 if "parametric" in routes else 1]
+    held_out = bench.capture(judges, watcher.step)
+    captured_s = time.perf_counter() - started
+    started = time.perf_counter()
+    outcome = calibrate(
+        camera,
+        design,
+        routes,
+        held_out,
+        few,
+        pinholes,
+        settings.fit,
+        on_stage=lambda name: watcher.begin(name, None),
+    )
+    calibrated_s = time.perf_counter() - started
+    watcher.begin("sensor", None)
+    sensor = characterise(*bench.sensor_pairs(), camera.sensor.noise.white_level_dn)
+    stage = None
+    best = outcome.mixed or outcome.parametric
+    if settings.map_stage:
+        if best is None:
+            raise AppError("--stage needs a parametric route: leave --route at auto")
+        stage = measured_stage(bench, design, best, watcher)
+    watcher.begin("the true Psi, for comparison", None)
+    exact = bench.exact_psi(design)
+    errors = {
+        name: psi_error(one.psi, exact, outcome.good) for name, one in outcome.calibrations.items()
+    }
+    metrics = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "route": settings.route,
+        "chosen": outcome.chosen,
+        "why": outcome.why,
+        "advice": list(outcome.advice),
+        "psi_relative_error": errors,
+        "design_relative_error": psi_error(design, exact, outcome.good),
+        "held_out": {
+            name: {
+                "chi2": one.chi2,
+                "chi2_without_worst_percent": one.trimmed,
+                "neighbour_correlation": one.whiteness,
+                "relative_error": one.relative_error,
+            }
+            for name, one in outcome.judged.items()
+        },
+        "frames": dict(outcome.frames),
+        "held_out_frames": held_out.exposures,
+        "bad_pixels": float(1 - outcome.good.mean()),
+        "defects": None if outcome.mixed is None else _defect_count(outcome),
+        "parameters": _parameters(outcome),
+        "fit": _fit_figures(outcome),
+        "sensor": {name: value for name, value, _, _ in sensor.rows()},
+        "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
+        "capture_seconds": captured_s,
+        "calibration_seconds": calibrated_s,
+        "seed": settings.seed,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    return Run(settings, bench, outcome, few, held_out, planned, metrics, sensor, stage)
+
+
+def measured_stage(
+    bench: WhiteboardBench, design: ImagingMatrix, known: Parametric, watcher: Watcher
+) -> StageMap:
+    """Send the mask stage about, from both sides, and return what one whiteboard each tells."""
+    if not bench.camera.moving_masks:
+        raise AppError("--stage: no mask of this camera moves")
+    rng = np.random.default_rng(bench.seed)
+    reach = STAGE_REACH_UM
+    places_um = rng.uniform(-reach, reach, (STAGE_PLACES, 2))
+    # Every pair of sides equally often.
+    wanted = [
+        Setting(
+            stage_um=(float(x), float(y)),
+            repeats=1,
+            came_from=(1 - 2 * (k % 2), 1 - 2 * (k // 2 % 2)),
+        )
+        for k, (x, y) in enumerate(places_um)
+    ]
+    watcher.begin("whiteboards for the stage map", len(wanted))
+    boards = as_readings(bench.capture(wanted, watcher.step), design.layout)
+    places = [locate(board, known.shadow.mask, known.fit.placement) for board in boards]
+    return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
+
+
+def psi_error(psi: ImagingMatrix, exact: ImagingMatrix, good: NDArray[np.bool_]) -> float:
+    """Return |Psi - exact| / |exact| over the good pixels (pixel_y, pixel_x), Frobenius."""
+    samples = good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)
+    chosen = samples[:, None, :]
+    difference = np.where(chosen, psi.weights - exact.weights, 0)
+    whole = np.where(chosen, exact.weights, 0)
+    return float(np.linalg.norm(difference) / np.linalg.norm(whole))
+
+
+def _defect_count(outcome: Outcome) -> int:
+    assert outcome.mixed is not None
+    return 0 if outcome.mixed.defects is None else outcome.mixed.defects.count
+
+
+def _parameters(outcome: Outcome) -> dict[str, dict[str, float]]:
+    best = outcome.mixed or outcome.parametric
+    if best is None:
+        return {}
+    values = best.fit.placement.vector()
+    views = np.array(best.fit.placement.aperture).shape
+    deviations = np.sqrt(np.diag(best.fit.covariance))
+    return {
+        name: {"value": float(values[i]), "deviation": float(deviations[i])}
+        for i, name in enumerate(labels((views[0], views[1])))
+    }
+
+
+def _fit_figures(outcome: Outcome) -> dict[str, object]:
+    best = outcome.mixed or outcome.parametric
+    if best is None:
+        return {}
+    fit = best.fit
+    return {
+        "correlation": fit.correlation,
+        "chi2": fit.chi2,
+        "outliers": fit.outliers,
+        "steps": fit.steps,
+        "status": fit.status,
+        "undecided": list(fit.undecided),
+        "boards": [asdict(one) for one in fit.boards],
+    }
+
+
+def true_parameters(truth: BenchTruth) -> dict[str, float]:
+    """Return the scalars of the placement that the simulated bench really has, where comparable.
+
+    Its vignetting and falloff follow another law.
+    """
+    mounting, optics = truth.mounting, truth.optics
+    return {
+        "offset_x_um": mounting.offset_um[0],
+        "offset_y_um": mounting.offset_um[1],
+        "rotation_rad": float(np.deg2rad(mounting.rotation_deg)),
+        "scale": mounting.stretch,
+        "skew": mounting.skew,
+        "distance_share": mounting.distance_share,
+        "distortion_um": mounting.distortion_um,
+        "blur_um": mounting.edge_blur_um,
+        "clear": optics.clear,
+        "leak": optics.leak,
+    }
+
+
+def save_calibration(path: Path, calibration: Calibration, known: Parametric | None) -> None:
+    """Write what turns frames into readings, how sure Psi is, and the placement, as HDF5."""
+    with h5py.File(path, "w") as file:
+        file.attrs["gain_dn_per_electron"] = calibration.gain.gain_dn_per_electron
+        file.attrs["dark_variance_dn2"] = calibration.gain.dark_variance_dn2
+        file["deviation"] = calibration.deviation
+        file["dark_dn"] = calibration.dark_dn
+        file["white_dn_per_s"] = calibration.white_dn_per_s
+        if calibration.good is not None:
+            file["good"] = calibration.good
+        if known is not None:
+            for name in SCALARS:
+                file.attrs[name] = getattr(known.fit.placement, name)
+            file["aperture"] = np.array(known.fit.placement.aperture)
+            if known.defects is not None:
+                file["lost"] = known.defects.lost
+
+
+def run_calibrate(
+    settings: CalibrateSettings, folder: Path, watcher: Watcher | None = None
+) -> dict:
+    """Calibrate the simulated bench into an existing folder and return the metrics.
+
+    Writes psi.h5, calibration.h5, metrics.json and report.html.
+    """
+    run = run_calibration(settings, watcher)
+    outcome = run.outcome
+    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
+    outcome.calibration.psi.save(folder / PSI)
+    save_calibration(folder / CALIBRATION, outcome.calibration, known)
+    write_calibration_report(
+        folder / REPORT,
+        outcome,
+        run.metrics,
+        true_parameters(settings.truth),
+        run.sensor,
+        run.stage,
+    )
+    write_metrics(folder, run.metrics)
+    return run.metrics
+
+
+def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
+    """Return the error of Psi that the free route's formula expects of so many frames a view."""
+    mask = shadow_mask(settings.camera, settings.size)
+    bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
+    return free_error(mask, soft_design(settings.camera, mask), plan_light(bench, mask), repeats)

@@ -1,0 +1,130 @@
+"""The command `emmc-rig calibrate`: whiteboards to Psi, their plan, and checks of both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from emmc_rig.errors import AppError
+
+DEFAULT_CAMERA = "rgbw-bayer-1shot"
+
+
+def calibrate(
+    camera: Annotated[
+        str, typer.Option("--camera", help="a shipped camera or a YAML file")
+    ] = DEFAULT_CAMERA,
+    size: Annotated[str, typer.Option("--size", help="ROWSxCOLUMNS of samples")] = "192x256",
+    route: Annotated[
+        str, typer.Option("--route", help="auto, parametric, mixed, free, or all to compare")
+    ] = "auto",
+    plan: Annotated[
+        bool, typer.Option("--plan", help="write how many whiteboards, of which kind, it takes")
+    ] = False,
+    check: Annotated[
+        str | None,
+        typer.Option(
+            "--check",
+            help="measure what calibration reaches on the simulated bench: psi, bound, plan, "
+            "sensor, stage, drift, alarms, cost, frames, large; commas between, or all",
+        ),
+    ] = None,
+    drift: Annotated[
+        Path | None,
+        typer.Option(
+            "--drift",
+            help="a folder of frames.h5: does the Psi of --known still fit? Writes one that does",
+        ),
+    ] = None,
+    known: Annotated[
+        Path, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
+    ] = Path("emmc-calibration"),
+    target: Annotated[
+        float, typer.Option("--target", help="relative error of Psi to plan for")
+    ] = 0.005,
+    rays: Annotated[
+        int, typer.Option("--rays", min=16, help="rays per view of the simulated bench")
+    ] = 512,
+    stage: Annotated[
+        bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
+    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
+) -> None:
+    """Measure Psi from whiteboards of the simulated bench, and say how sure it is."""
+    from emmc_rig.calibrate import CalibrateSettings, run_calibrate, write_plan
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import result_folder
+    from emmc_rig.whiteboard_bench import BenchTruth
+
+    if drift is not None:
+        _judge_drift(known, drift, out)
+        return
+    if not 0 < target < 1:
+        raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
+    rows, cross, columns = size.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise AppError(f"--size {size}: write ROWSxCOLUMNS, for instance 192x256")
+    settings = CalibrateSettings(
+        camera,
+        find_camera(camera),
+        (int(rows), int(columns)),
+        route,
+        target,
+        seed,
+        BenchTruth(rays_per_view=rays),
+        map_stage=stage,
+    )
+    if check is not None:
+        from emmc_rig.calibration_check import run_checks
+
+        with result_folder(out) as folder:
+            metrics = run_checks(settings, check, folder)
+        table = Table("target", "measured", "asked", "")
+        for row in metrics["rows"]:
+            table.add_row(row["what"], row["measured"], row["asked"], row["verdict"])
+        Console().print(table)
+        typer.echo(f"read {out / 'metrics.json'}")
+        return
+    if plan:
+        with result_folder(out) as folder:
+            metrics = write_plan(settings, folder)
+        for name in ("parametric", "free"):
+            one = metrics[name]
+            typer.echo(
+                f"{name}: {one['frames']} frames for a relative error of Psi of "
+                f"{one['expected_relative_error']:.2%}"
+            )
+        typer.echo(f"read {out / 'plan.yaml'}")
+        return
+    from emmc_rig.cli import Bars, shown_progress
+
+    with result_folder(out) as folder, shown_progress() as progress:
+        bars = Bars(progress)
+        metrics = run_calibrate(settings, folder, bars)
+        bars.finish()
+    chosen = metrics["chosen"]
+    typer.echo(
+        f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
+        f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
+        f"(the design is off by {metrics['design_relative_error']:.0%})"
+    )
+    for line in metrics["advice"]:
+        typer.echo(f"measure again: {line}")
+    typer.echo(f"open {out / 'report.html'}")
+
+
+def _judge_drift(known: Path, frames: Path, out: Path) -> None:
+    from emmc_rig.drift import run_drift
+    from emmc_rig.output import result_folder
+
+    with result_folder(out) as folder:
+        metrics = run_drift(known, frames, folder)
+    typer.echo(metrics["words"])
+    for kind, value in metrics["values"].items():
+        typer.echo(f"    {kind} {value:+.4g} +- {metrics['deviations'][kind]:.2g}")
+    typer.echo(f"use {out / 'psi.h5'}")

@@ -1,0 +1,284 @@
+"""Whiteboards of a simulated bench that is wrong in every way the calibration is not told of.
+
+The only part of the calibration that knows a simulator: whoever reads whiteboards from a rig or a
+session makes the same `BoardSet`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.boards import BoardFrame, BoardSet
+from calibration.frames import MeanFrame, average
+from calibration.sensor import Pair
+from calibration.whiteboard import IDEAL_DN, Whiteboards, lamps_needed, measure_psi
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.sensing import ImagingMatrix
+from simulators.bench import Bench, MountingErrors
+from simulators.flaws import OpticsFlaws, SensorFlaws
+
+Array = NDArray[np.floating]
+DARK_REPEATS = 2
+REFERENCE_REPEATS = 4
+BOARD_LEVEL = 0.7
+DARK_EXPOSURES_S = (0.01, 1.0, 4.0)
+FLAT_SHARES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.3)
+"""Of the exposure that fills the well."""
+RAYS_PER_VIEW = 512
+HARSH_MOUNTING = MountingErrors(
+    offset_um=(23.7, -14.2),
+    rotation_deg=0.11,
+    stretch=1.0012,
+    skew=0.0006,
+    distance_share=0.045,
+    distortion_um=1.5,
+    edge_blur_um=2.5,
+)
+HARSH_OPTICS = OpticsFlaws(
+    aperture_spread=0.04, vignetting=2.0, clear=0.94, leak=0.03, dust_specks=6
+)
+HARSH_SENSOR = SensorFlaws(
+    response_spread=0.01,
+    offset_spread_dn=1.0,
+    dark_electrons_per_s=20.0,
+    bad_share=0.002,
+    full_well_electrons=80_000.0,
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One whiteboard to take: how the bench stands, and how many frames.
+
+    stage_um: beyond the shot's own offset of the mask. came_from: the side, +1 where an axis moved
+    up to its place.
+    """
+
+    shot: int = 0
+    pinhole: tuple[int, int] | None = None
+    lamp: str = "white"
+    stage_um: tuple[float, float] = (0.0, 0.0)
+    repeats: int = 2
+    came_from: tuple[int, int] = (1, 1)
+
+
+@dataclass(frozen=True)
+class StageFaults:
+    """How a mask stage strays: scale and turn of its axes, backlash, repeatability, in um."""
+
+    scale: float = 1.0
+    rotation_deg: float = 0.0
+    backlash_um: tuple[float, float] = (0.0, 0.0)
+    repeatability_um: float = 0.0
+
+    def real_um(
+        self, sent_um: tuple[float, float], came_from: tuple[int, int]
+    ) -> tuple[float, float]:
+        """Return where the stage stands when sent to a place from a side; the same each time."""
+        turn = np.deg2rad(self.rotation_deg)
+        x, y = sent_um
+        key = [round(value * 1e3) & 0xFFFFFFFF for value in (x, y)]
+        strays = np.random.default_rng([*key, *(side + 1 for side in came_from)])
+        off = strays.normal(0, 1, 2) * self.repeatability_um
+        # Places approached from below are where the stage says.
+        off += np.array(self.backlash_um) * (np.array(came_from) - 1) / 2
+        return (
+            float(self.scale * (np.cos(turn) * x - np.sin(turn) * y) + off[0]),
+            float(self.scale * (np.sin(turn) * x + np.cos(turn) * y) + off[1]),
+        )
+
+
+@dataclass(frozen=True)
+class BenchTruth:
+    """What is wrong with the simulated bench."""
+
+    mounting: MountingErrors = HARSH_MOUNTING
+    optics: OpticsFlaws = HARSH_OPTICS
+    sensor: SensorFlaws = HARSH_SENSOR
+    rays_per_view: int = RAYS_PER_VIEW
+    stage: StageFaults = StageFaults()
+
+
+@dataclass
+class WhiteboardBench:
+    """A simulated bench before a white board; `scene` lets it look at a light field too."""
+
+    camera: Camera
+    size: tuple[int, int]
+    truth: BenchTruth = field(default_factory=BenchTruth)
+    seed: int = 0
+    scene: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        rows, columns = self.size
+        names = ("mask_x", "mask_y", "aperture_x", "aperture_y")
+        self._at_um: dict[str, float] = dict.fromkeys(names, 0.0)
+        self._window_um = 2 * max(self.camera.views) * self.camera.lens.aperture_cell_um
+        shape = (*self.camera.views, rows, columns, 3)
+        scene = np.ones(shape, np.float32) if self.scene is None else self.scene
+        self.bench = Bench(
+            self.camera,
+            scene,
+            self.size,
+            lambda: self._at_um,
+            self._window_um,
+            np.random.default_rng(self.seed),
+            self.truth.mounting,
+            self.truth.rays_per_view,
+            self.truth.optics,
+            self.truth.sensor,
+        )
+        self.bench.target = "whiteboard"
+        self._readings: dict[tuple[Setting, bool], Array] = {}
+
+    def reading(self, setting: Setting, masks_in: bool = True) -> Array:
+        """Return the noise-free reading of a setting, (pixel_y, pixel_x), the falloff in it."""
+        key = (replace(setting, repeats=1), masks_in)
+        if key not in self._readings:
+            self._stand(setting, masks_in)
+            self._readings[key] = self.bench.readings()
+        return self._readings[key]
+
+    def _stand(self, setting: Setting, masks_in: bool) -> None:
+        real = self.truth.stage.real_um(self.sent_um(setting), setting.came_from)
+        self._at_um["mask_x"], self._at_um["mask_y"] = real
+        if setting.pinhole is None:
+            self._at_um["aperture_x"], self._at_um["aperture_y"] = self._window_um, 0.0
+        else:
+            cell_um = self.camera.lens.aperture_cell_um
+            v, u = setting.pinhole
+            self._at_um["aperture_y"] = float(centred_grid(self.camera.views[0], cell_um)[v])
+            self._at_um["aperture_x"] = float(centred_grid(self.camera.views[1], cell_um)[u])
+        self.bench.shot, self.bench.lamp = setting.shot, setting.lamp
+        self.bench.masks_in = masks_in
+
+    def board_exposure_s(self) -> float:
+        """Return the exposure that fills BOARD_LEVEL of the range without masks."""
+        noise = self.camera.sensor.noise
+        range_electrons = (noise.white_level_dn - noise.black_level_dn) / noise.gain_dn_per_electron
+        well = self.truth.sensor.full_well_electrons or range_electrons
+        light = 3 * self.camera.sensor.binning**2 if self.camera.sensor.cfa_name == "mono" else 1
+        return BOARD_LEVEL * min(well, range_electrons) / (noise.electrons_per_s * light)
+
+    def _frames(
+        self, setting: Setting, exposure_s: float, masks_in: bool, count: int, what: str
+    ) -> MeanFrame:
+        sensor, noise = self.truth.sensor, self.camera.sensor.noise
+        reading = self.reading(setting, masks_in)
+        light = self.bench.light(setting.shot)
+        frames = (
+            sensor.expose_dn(noise, reading, exposure_s, light, self.bench.rng)
+            for _ in range(count)
+        )
+        return average(frames, exposure_s, noise.white_level_dn, what)
+
+    def capture(
+        self, settings: Sequence[Setting], on_frame: Callable[[str], None] = lambda label: None
+    ) -> BoardSet:
+        """Return the dark frames, the references and the whiteboards asked for."""
+        board_s = self.board_exposure_s()
+        views = self.camera.views[0] * self.camera.views[1]
+        exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
+        darks = tuple(self._dark(exposure_s) for exposure_s in sorted({board_s, *exposures}))
+        references, frames = {}, []
+        # Every shot has its reference; shots behind the same filter share one.
+        lamps = sorted({one.lamp for one in settings})
+        for shot, lamp in product(range(len(self.camera.shots)), lamps):
+            alike = next(
+                (
+                    frame
+                    for (other, named), frame in references.items()
+                    if named == lamp
+                    and self.camera.shots[other].filter == self.camera.shots[shot].filter
+                ),
+                None,
+            )
+            if alike is None:
+                label = f"reference, shot {shot + 1}, {lamp} lamp"
+                setting = Setting(shot, lamp=lamp)
+                alike = self._frames(setting, board_s, False, REFERENCE_REPEATS, label)
+                on_frame(label)
+            references[shot, lamp] = alike
+        for setting in settings:
+            exposure_s = board_s if setting.pinhole is None else board_s * views
+            label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
+            frame = self._frames(setting, exposure_s, True, setting.repeats, label)
+            on_frame(label)
+            sent = self.sent_um(setting)
+            frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
+        return BoardSet(darks, references, tuple(frames))
+
+    def sent_um(self, setting: Setting) -> tuple[float, float]:
+        """Return where a setting sends the mask stage: the shot's offset and what is beyond."""
+        moving = [
+            self.camera.shots[setting.shot].offset_um.get(name, (0.0, 0.0))
+            for name in self.camera.moving_masks
+        ]
+        x, y = moving[0] if moving else (0.0, 0.0)
+        return (x + setting.stage_um[0], y + setting.stage_um[1])
+
+    def sensor_pairs(self) -> tuple[list[Pair], list[Pair]]:
+        """Return pairs of dark frames, and of whiteboards without masks from dim to saturated."""
+        noise, sensor = self.camera.sensor.noise, self.truth.sensor
+        white = self.reading(Setting(), False)
+        light = self.bench.light(0)
+        full_s = self.board_exposure_s() / BOARD_LEVEL
+
+        def pairs(reading: Array, times: Sequence[float]) -> list[Pair]:
+            return [
+                Pair(
+                    float(t),
+                    *(sensor.expose_dn(noise, reading, t, light, self.bench.rng) for _ in range(2)),
+                )
+                for t in times
+            ]
+
+        flats = pairs(white, [share * full_s for share in FLAT_SHARES])
+        return pairs(0 * white, DARK_EXPOSURES_S), flats
+
+    def _dark(self, exposure_s: float) -> MeanFrame:
+        noise = self.camera.sensor.noise
+        nothing = np.zeros_like(self.reading(Setting(), False))
+        frames = (
+            self.truth.sensor.expose_dn(noise, nothing, exposure_s, 1.0, self.bench.rng)
+            for _ in range(DARK_REPEATS)
+        )
+        return average(frames, exposure_s, noise.white_level_dn, "dark frame")
+
+    def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
+        """Return the true Psi: what a noise-free sensor measures through the pinhole."""
+        lamps = lamps_needed(design)
+
+        def frame(reading: Array) -> MeanFrame:
+            return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
+
+        references = {
+            (shot, lamp): frame(self.reading(Setting(shot, lamp=lamp), False))
+            for shot, lamp in product(range(design.shots), lamps)
+        }
+        pinholes = {
+            (shot, v, u, lamp): frame(self.reading(Setting(shot, (v, u), lamp)))
+            for shot, v, u in np.ndindex(design.weights.shape[:3])
+            for lamp in lamps
+        }
+        dark = frame(np.zeros(design.frames_shape[1:]))
+        return measure_psi(Whiteboards(dark, references, pinholes), design).psi
+
+    def capture_scene(self) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
+        """Return the shots of the scene, (shot, pixel_y, pixel_x) in DN, and their exposures."""
+        exposures_s = self.camera.exposures_s()
+        frames = []
+        self.bench.target = "scene"
+        try:
+            for shot, exposure_s in enumerate(exposures_s):
+                self._stand(Setting(shot), True)
+                frames.append(self.bench.expose(float(exposure_s)))
+        finally:
+            self.bench.target = "whiteboard"
+        return np.stack(frames), exposures_s

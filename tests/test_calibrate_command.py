@@ -1,0 +1,225 @@
+"""`emmc-rig calibrate`: what it writes, what it says, and what it refuses."""
+
+import json
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from calibration.drift import DriftSettings
+from calibration.placement import SCALARS
+from emmc_rig import cli
+from emmc_rig.calibrate import CalibrateSettings, psi_error, run_calibrate, run_calibration
+from emmc_rig.calibration_check import moved_truth, run_checks
+from emmc_rig.calibration_report import write_calibration_report
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.drift import run_drift
+from emmc_rig.errors import AppError
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.output import save_frames
+from emmc_rig.scene import fine_scene
+from emmc_rig.whiteboard_bench import BenchTruth, StageFaults, WhiteboardBench
+
+SIZE = ["--size", "32x40", "--rays", "64"]
+
+
+@pytest.fixture(scope="module")
+def camera_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("camera") / "small.yaml"
+    path.write_text(
+        yaml.safe_dump(
+            {
+                "title": "small",
+                "views": [3, 3],
+                "lens": {"aperture_cell_mm": 8.0},
+                "sensor": {"cfa": "rggb"},
+                "masks": {
+                    "code": {
+                        "distance_mm": 0.12,
+                        "cell_um": 36,
+                        "pattern": {"kind": "random_rgbw"},
+                    }
+                },
+                "more_shots_step_um": {"code": [270, 162]},
+            }
+        )
+    )
+    return path
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run the program in-process: returns exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        shown = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else code), shown.out, shown.err
+
+    return call
+
+
+def test_calibrate_writes_psi_its_uncertainty_and_a_page(run, camera_file, tmp_path):
+    out = tmp_path / "result"
+    code, said, _ = run("calibrate", "--camera", camera_file, *SIZE, "--route", "all", "--out", out)
+    assert code == 0
+    psi = ImagingMatrix.load(out / "psi.h5")
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert psi.size == (32, 40)
+    assert set(metrics["psi_relative_error"]) == {"parametric", "mixed", "free"}
+    assert max(metrics["psi_relative_error"].values()) < 0.1 < metrics["design_relative_error"]
+    assert metrics["chosen"] in said
+    with h5py.File(out / "calibration.h5") as file:
+        assert np.asarray(file["deviation"]).shape == psi.weights.shape
+        assert np.asarray(file["good"]).shape == (32, 40)
+        assert set(SCALARS) <= set(file.attrs) or metrics["chosen"] == "free"
+    page = (out / "report.html").read_text()
+    for words in ("What to measure again", "Residual maps", "Photon transfer", "Edge blur"):
+        assert words in page
+    assert "http" not in page.split("</style>")[1].replace("http://www.w3.org", "")
+
+
+def test_the_plan_is_written_and_asks_for_more_frames_where_psi_must_be_surer(
+    run, camera_file, tmp_path
+):
+    frames = []
+    for target in ("0.05", "0.01"):
+        out = tmp_path / target
+        code, said, _ = run(
+            "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
+        )
+        assert code == 0
+        assert "frames for a relative error of Psi" in said
+        plan = yaml.safe_load((out / "plan.yaml").read_text())
+        assert plan["parametric"]["expected_relative_error"] <= float(target)
+        boards = plan["parametric"]["whiteboards"]
+        assert sum(one["frames"] for one in boards) < plan["free"]["frames"]
+        frames.append(sum(one["frames"] for one in boards))
+    assert frames[1] > frames[0]
+
+
+def test_the_stage_is_mapped_and_shown(camera_file, tmp_path):
+    camera = find_camera(str(camera_file))
+    faults = StageFaults(1.002, 0.3, (2.0, 1.0), 0.05)
+    settings = CalibrateSettings(
+        "small", camera, (32, 40), truth=BenchTruth(rays_per_view=64), map_stage=True
+    )
+    still = run_calibration(settings)
+    assert still.stage is not None
+    assert still.stage.scale == pytest.approx((1.0, 1.0), abs=2e-3)
+    assert still.stage.repeatability_um[0] < 1.0
+    path = tmp_path / "page.html"
+    write_calibration_report(path, still.outcome, still.metrics, None, still.sensor, still.stage)
+    assert "Backlash, x" in path.read_text()
+    down, up = faults.real_um((10.0, 0.0), (-1, 1)), faults.real_um((10.0, 0.0), (1, 1))
+    assert up[0] - down[0] == pytest.approx(2.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--route", "best"], "--route best: use one of auto, parametric, mixed, free, all"),
+        (["--target", "2"], "a relative error lies between 0 and 1"),
+        (["--size", "32"], "write ROWSxCOLUMNS"),
+        (["--check", "speed"], "--check speed: use all, or some of psi, bound"),
+        (["--camera", "conventional"], "one mask between lens and sensor"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, message):
+    code, _, error = run("calibrate", *SIZE, *arguments, "--out", tmp_path / "result")
+    assert code == 1
+    assert message in " ".join(error.split())
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_sensor_check_measures_what_the_simulated_sensor_is(tmp_path):
+    settings = CalibrateSettings("rgbw-bayer-1shot", find_camera("rgbw-bayer-1shot"), (96, 96))
+    metrics = run_checks(settings, "sensor", tmp_path)
+    figures = metrics["details"]["sensor"]
+    assert isinstance(figures, dict)
+    for name, limit in (("gain_dn_per_electron", 0.03), ("dark_current_electrons_per_s", 0.05)):
+        found, truth = figures[name]
+        assert found == pytest.approx(truth, rel=limit)
+    with pytest.raises(AppError, match="use all, or some of"):
+        run_checks(settings, "nothing", tmp_path)
+
+
+def test_the_error_of_psi_leaves_bad_pixels_out(coded_psi):
+    psi = coded_psi(binning=2, size=(8, 8))
+    spoilt = psi.weights.copy()
+    spoilt[:, :, :, :2, :, :2] *= 3
+    good = np.ones((4, 4), dtype=bool)
+    other = ImagingMatrix(spoilt, psi.colour, 2)
+    assert psi_error(other, psi, good) > 0.1
+    good[0, 0] = False
+    assert psi_error(other, psi, good) == 0
+
+
+@pytest.fixture(scope="module")
+def calibrated(camera_file, tmp_path_factory):
+    """A calibration on disk, and the camera."""
+    camera = find_camera(str(camera_file))
+    folder = tmp_path_factory.mktemp("known")
+    truth = BenchTruth(rays_per_view=256)
+    run_calibrate(CalibrateSettings("small", camera, (48, 64), "mixed", truth=truth), folder)
+    return folder, camera, truth
+
+
+def frames_of(folder, camera, truth):
+    fine = fine_scene("deep-occlusions", 2, 2, size=(48, 64), views=camera.views, seed=3)
+    bench = WhiteboardBench(camera, (48, 64), truth, 7, fine.samples)
+    frames, exposures_s = bench.capture_scene()
+    noise, times = camera.sensor.noise, exposures_s[:, None, None]
+    readings = noise.normalise(frames, times, 1.0)
+    deviation = np.sqrt(noise.variance(readings, times, 1.0))
+    hot, dead = truth.sensor.bad((48, 64))
+    usable = ~noise.saturated(frames) & ~(hot | dead)
+    folder.mkdir()
+    save_frames(
+        folder / "frames.h5", frames, readings, exposures_s, deviation=deviation, usable=usable
+    )
+    return folder
+
+
+def test_a_capture_after_the_mask_has_moved_is_told_and_psi_mended(calibrated, tmp_path):
+    known, camera, truth = calibrated
+    moved = moved_truth(truth, (9.0, -8.0, 0.0, 0.0, 0.0))
+    frames = frames_of(tmp_path / "frames", camera, moved)
+    out = tmp_path / "mended"
+    out.mkdir()
+    quick = DriftSettings(
+        blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6
+    )
+    told = run_drift(known, frames, out, quick)
+    assert told["drifted"]
+    assert "Psi no longer fits" in told["words"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["values"]["shift_x_um"] == pytest.approx(9.0, abs=1.0)
+    assert metrics["values"]["shift_y_um"] == pytest.approx(-8.0, abs=1.0)
+    before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
+    exact = WhiteboardBench(camera, (48, 64), moved).exact_psi(before)
+    good = np.ones((48, 64), dtype=bool)
+    assert psi_error(after, exact, good) < 0.3 * psi_error(before, exact, good)
+
+
+def test_drift_refuses_frames_of_another_size_and_a_free_psi(run, calibrated, tmp_path):
+    known, camera, truth = calibrated
+    frames = frames_of(tmp_path / "frames", camera, truth)
+    with h5py.File(frames / "frames.h5", "a") as file:
+        for name in ("readings", "deviation", "usable"):
+            cut = np.asarray(file[name])[:, :-2]
+            del file[name]
+            file[name] = cut
+    code, _, error = run("calibrate", "--drift", frames, "--known", known)
+    assert code == 1
+    assert "this calibration is for (1, 48, 64)" in " ".join(error.split())
+    code, _, error = run("calibrate", "--drift", frames, "--known", tmp_path)
+    assert code == 1
+    assert "name a folder that `emmc-rig calibrate` wrote" in " ".join(error.split())

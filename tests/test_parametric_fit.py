@@ -1,0 +1,288 @@
+"""The parametric and mixed routes on a bench that is wrong in every way they are not told of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
+from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
+from calibration.defects import find_defects
+from calibration.errors import CalibrationError
+from calibration.fit import FitSettings, fit_placement
+from calibration.parametric import expected_psi_error, psi_at, shot_stages
+from calibration.placement import designed_placement, labels
+from calibration.registration import register
+from calibration.routes import calibrate, fit_advice
+from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.whiteboard_bench import (
+    HARSH_OPTICS,
+    HARSH_SENSOR,
+    BenchTruth,
+    Setting,
+    WhiteboardBench,
+)
+from simulators.bench import MountingErrors
+
+SIZE = (44, 60)
+VIEWS = (3, 3)
+MOUNTING = MountingErrors((31.0, -22.0), 0.15, 1.002, 0.0008, 0.05, 1.0, 3.0)
+CAMERA = Camera.model_validate(
+    {
+        "title": "test",
+        "views": VIEWS,
+        "lens": {"aperture_cell_mm": 8.0},
+        "sensor": {"cfa": "rggb"},
+        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
+        "more_shots_step_um": {"code": (270, 162)},
+    }
+)
+FEW = [
+    Setting(repeats=4),
+    Setting(stage_um=(270.0, 162.0), repeats=4),
+    *(Setting(pinhole=view, repeats=2) for view in ((1, 1), (0, 0), (2, 0), (0, 2), (2, 2))),
+]
+HELD_OUT = [Setting(repeats=4), Setting(stage_um=(-207.0, 118.0), repeats=4)]
+
+
+@pytest.fixture(scope="module")
+def bench():
+    optics = replace(HARSH_OPTICS, dust_specks=4, seed=3)
+    truth = BenchTruth(MOUNTING, optics, HARSH_SENSOR, rays_per_view=1024)
+    return WhiteboardBench(CAMERA, SIZE, truth)
+
+
+@pytest.fixture(scope="module")
+def design():
+    return build_imaging_matrix(CAMERA, SIZE)
+
+
+@pytest.fixture(scope="module")
+def few(bench):
+    return bench.capture(FEW)
+
+
+@pytest.fixture(scope="module")
+def outcome(bench, design, few):
+    return calibrate(CAMERA, design, ("parametric", "mixed"), bench.capture(HELD_OUT), few)
+
+
+def test_the_fit_finds_where_the_mask_sits(outcome):
+    at = outcome.parametric.fit.placement
+    assert at.offset_x_um == pytest.approx(31.0, abs=0.02 * 24)
+    assert at.offset_y_um == pytest.approx(-22.0, abs=0.02 * 24)
+    assert np.degrees(at.rotation_rad) == pytest.approx(0.15, abs=0.005)
+    assert 1 + at.distance_share == pytest.approx(1.05, rel=0.005)
+    assert at.scale == pytest.approx(1.002, abs=1e-4)
+    assert at.clear == pytest.approx(HARSH_OPTICS.clear, abs=0.003)
+    assert at.leak == pytest.approx(HARSH_OPTICS.leak, abs=0.003)
+    assert outcome.parametric.fit.status == "converged"
+
+
+def test_dust_is_found_and_psi_is_better_for_it(bench, design, outcome):
+    exact = bench.exact_psi(design)
+    errors = {
+        name: one.psi.relative_difference(exact) for name, one in outcome.calibrations.items()
+    }
+    assert design.relative_difference(exact) > 0.3
+    assert errors["mixed"] < 0.8 * errors["parametric"] < 0.03
+    assert outcome.judged["mixed"].chi2 < 0.6 * outcome.judged["parametric"].chi2
+    assert outcome.chosen == "mixed"
+
+
+def test_bad_pixels_are_found_and_left_out(bench, outcome):
+    hot, dead = HARSH_SENSOR.bad(SIZE)
+    assert not outcome.good[hot | dead].any()
+    assert (~outcome.good).sum() <= (hot | dead).sum() + 3
+    usable = outcome.calibration.usable(np.zeros(design_shape := (1, *SIZE)), 65_535)
+    assert usable.shape == design_shape
+    assert not usable[0][hot | dead].any()
+
+
+def test_one_frame_verifies_a_stage_position_that_was_never_calibrated(outcome, bench, design):
+    boards = as_readings(
+        bench.capture([Setting(stage_um=(133.0, -71.0))]), design.layout, outcome.good
+    )
+    judged = judge("mixed", boards[0], predicted_by_shadow(outcome.mixed.shadow, boards[0]))
+    assert judged.trimmed < 1.5
+    assert judged.relative_error < 0.01
+
+
+def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
+    """Whiteboards drawn from the model itself, with its noise: for statistics alone."""
+    rng = np.random.default_rng(seed)
+    mask = shadow_mask(CAMERA, SIZE)
+    shadow = Shadow(mask, placement)
+    boards = []
+    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
+    for setting in settings:
+        views_open = np.full(VIEWS, setting.pinhole is None)
+        if setting.pinhole is not None:
+            views_open[setting.pinhole] = True
+        clean = shadow.readings(pixels, design.colour[0].ravel(), views_open, setting.stage_um)
+        deviation = noise * clean.max()
+        read = (clean + rng.normal(0, deviation, len(clean))).reshape(SIZE)
+        variance = np.full(SIZE, deviation**2, np.float32)
+        boards.append(
+            Board(
+                "test",
+                read.astype(np.float32),
+                variance,
+                design.colour[0],
+                views_open,
+                setting.stage_um,
+                0,
+            )
+        )
+    return boards
+
+
+def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
+    mask = shadow_mask(CAMERA, SIZE)
+    truth = replace(
+        designed_placement(CAMERA), offset_x_um=4.0, rotation_rad=0.001, blur_um=3.0, leak=0.02
+    )
+    fits = []
+    for seed in range(8):
+        boards = synthetic(design, truth, 0.02, seed)
+        settings = FitSettings(seed=seed, first_pixels=1500)
+        fits.append(fit_placement(boards, CAMERA, mask, settings, start=truth))
+    errors = np.array([fit.placement.vector() - truth.vector() for fit in fits])
+    stated = np.mean([np.diag(fit.covariance) for fit in fits], axis=0)
+    bound = np.mean([np.diag(fit.bound) for fit in fits], axis=0)
+    names = labels(VIEWS)
+    told = [i for i, name in enumerate(names) if name not in fits[0].undecided][:11]
+    ratio = np.mean(errors[:, told] ** 2 / bound[told])
+    # 8 x 11 nearly independent squares: their mean is known to 0.16.
+    assert ratio == pytest.approx(1.05, abs=0.5)
+    assert np.all(stated[told] < 1.25 * bound[told])
+
+
+def test_a_mask_that_is_not_the_design_is_refused_with_the_correlation(design, bench, few):
+    other = CAMERA.model_copy(
+        update={
+            "masks": {
+                "code": CAMERA.masks["code"].model_copy(
+                    update={"pattern": CAMERA.masks["code"].pattern.model_copy(update={"seed": 9})}
+                )
+            }
+        }
+    )
+    boards = as_readings(few, design.layout)
+    with pytest.raises(CalibrationError, match=r"not the mask of the design.*correlation is 0\.\d"):
+        fit_placement(boards, other, shadow_mask(other, SIZE))
+
+
+def test_a_mirrored_mask_is_named_as_such(design):
+    mask = shadow_mask(CAMERA, SIZE)
+    mirrored = replace(mask, cells=np.ascontiguousarray(mask.cells[:, :, ::-1]))
+    boards = synthetic(design, designed_placement(CAMERA), settings=FEW[:1])
+    with pytest.raises(CalibrationError, match="mirrored left to right"):
+        register(boards[0], mirrored, designed_placement(CAMERA))
+
+
+@pytest.mark.parametrize(("x", "y", "turn_deg"), [(130.0, -80.0, 0.0), (40.0, 210.0, 0.9)])
+def test_registration_finds_a_mask_that_sits_far_off(design, x, y, turn_deg):
+    truth = replace(
+        designed_placement(CAMERA),
+        offset_x_um=x,
+        offset_y_um=y,
+        rotation_rad=np.deg2rad(turn_deg),
+        blur_um=3.0,
+    )
+    boards = synthetic(design, truth, settings=FEW[:1])
+    found = register(boards[0], shadow_mask(CAMERA, SIZE), designed_placement(CAMERA))
+    assert found.placement.offset_x_um == pytest.approx(x, abs=12)
+    assert found.placement.offset_y_um == pytest.approx(y, abs=12)
+    assert found.correlation > 0.6
+
+
+def test_flicker_and_a_moved_stage_are_told_by_the_board_that_has_them(design):
+    truth = replace(designed_placement(CAMERA), blur_um=3.0)
+    boards = synthetic(design, truth)
+    flickered = replace(boards[1], reading=(boards[1].reading * 1.05).astype(np.float32))
+    moved = replace(
+        synthetic(design, replace(truth, offset_x_um=3.0), settings=FEW[2:3])[0], name="third"
+    )
+    seen = [boards[0], replace(flickered, name="second"), moved, *boards[3:]]
+    fit = fit_placement(seen, CAMERA, shadow_mask(CAMERA, SIZE))
+    advice = " ".join(fit_advice(fit))
+    assert "second" in advice
+    assert "in brightness against the others" in advice
+    assert "third: the mask stands" in advice
+
+
+def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
+    boards = synthetic(design, designed_placement(CAMERA), 0.05, settings=FEW[:1])
+    fit = fit_placement(boards, CAMERA, shadow_mask(CAMERA, SIZE))
+    assert any(name.startswith("aperture") for name in fit.undecided)
+    assert fit.more_boards > 0
+    assert "too few whiteboards" in fit_advice(fit)[-1]
+    enough = fit_placement(
+        synthetic(design, designed_placement(CAMERA), 0.005), CAMERA, shadow_mask(CAMERA, SIZE)
+    )
+    assert enough.undecided == ()
+    assert enough.more_boards == 0
+
+
+def test_no_defects_are_found_on_a_clean_mask(design):
+    truth = replace(designed_placement(CAMERA), blur_um=3.0)
+    boards = synthetic(design, truth)
+    assert find_defects(boards, shadow_mask(CAMERA, SIZE), truth).count == 0
+
+
+def test_the_expected_error_of_psi_is_the_error_of_psi(design):
+    mask = shadow_mask(CAMERA, SIZE)
+    truth = replace(designed_placement(CAMERA), blur_um=3.0)
+    exact = psi_at(Shadow(mask, truth), design.layout, shot_stages(CAMERA))
+    squares, expected = [], []
+    for seed in range(4):
+        fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, mask, start=truth)
+        psi = psi_at(Shadow(mask, fit.placement), design.layout, shot_stages(CAMERA))
+        squares.append(psi.relative_difference(exact) ** 2)
+        expected.append(expected_psi_error(Shadow(mask, fit.placement), fit.covariance) ** 2)
+    assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.35)
+
+
+def test_frames_of_another_camera_are_refused(few, design):
+    cut = [
+        BoardFrame(replace(one.frame, mean_dn=one.frame.mean_dn[:-2]), one.stage_um, one.shot)
+        for one in few.frames
+    ]
+    with pytest.raises(CalibrationError, match="42 x 60 pixels, the camera has 44 x 60"):
+        as_readings(few.with_frames(cut), design.layout)
+
+
+def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
+    dark = few.dark_at(few.frames[0].frame.exposure_s)
+    off = BoardFrame(replace(few.frames[0].frame, mean_dn=dark.mean_dn), (0.0, 0.0))
+    with pytest.raises(CalibrationError, match="is the lamp on, and the aperture open"):
+        as_readings(few.with_frames([off]), design.layout)
+    red = BoardFrame(few.frames[0].frame, (0.0, 0.0), lamp="red")
+    with pytest.raises(CalibrationError, match="no reference whiteboard under that lamp"):
+        as_readings(few.with_frames([red]), design.layout)
+    with pytest.raises(CalibrationError, match="no dark frame"):
+        BoardSet((), few.references, few.frames)
+    with pytest.raises(CalibrationError, match="no whiteboard with the mask in"):
+        fit_placement([], CAMERA, shadow_mask(CAMERA, SIZE))
+
+
+def test_the_simplest_route_at_the_noise_is_chosen():
+    def judged(route, chi2):
+        return HeldOut(route, chi2, chi2, 0.0, 0.0, np.zeros((2, 2), np.float32))
+
+    def pick(*pairs):
+        return choose([judged(*pair) for pair in pairs])[0].route
+
+    assert pick(("free", 1.0), ("mixed", 1.1), ("parametric", 1.2)) == "parametric"
+    assert pick(("parametric", 3.0), ("mixed", 1.2), ("free", 1.0)) == "mixed"
+    assert pick(("parametric", 9.0), ("mixed", 5.0), ("free", 2.5)) == "free"
+    assert "none reaches the noise" in choose([judged("mixed", 8.0)])[1]
+
+
+def test_dark_current_is_drawn_as_a_line_between_two_dark_exposures(few):
+    first, last = few.darks
+    middle = few.dark_at((first.exposure_s + last.exposure_s) / 2)
+    np.testing.assert_allclose(middle.mean_dn, (first.mean_dn + last.mean_dn) / 2, rtol=1e-5)
+    assert sensor_blemishes(few).mean() > 0.99

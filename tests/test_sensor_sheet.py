@@ -1,0 +1,109 @@
+"""EMVA 1288 from dark and flat frames of a sensor whose figures are known."""
+
+import numpy as np
+import pytest
+
+from calibration.errors import CalibrationError
+from calibration.sensor import Pair, characterise
+from emmc_rig.model.noise import SensorNoise
+from simulators.flaws import SensorFlaws
+
+SIZE = (120, 160)
+WHITE_DN = 65_535
+NOISE = SensorNoise(black_level_dn=256, gain_dn_per_electron=0.8, read_noise_electrons=2.5)
+FLAWS = SensorFlaws(
+    response_spread=0.01,
+    offset_spread_dn=1.5,
+    dark_electrons_per_s=12.0,
+    bad_share=0.002,
+    full_well_electrons=50_000.0,
+)
+DARKS_S = (0.01, 2.0)
+FLATS_S = (0.005, 0.01, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3)
+
+
+def frames(flaws=FLAWS, lit=True, times=FLATS_S, seed=0):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    tile = np.array([[0.6, 1.0], [1.0, 0.7]])[y % 2, x % 2]
+    falloff = 1 - 0.1 * ((x / SIZE[1] - 0.5) ** 2 + (y / SIZE[0] - 0.4) ** 2)
+    reading = tile * falloff if lit else np.zeros(SIZE)
+    return [
+        Pair(t, *(flaws.expose_dn(NOISE, reading, t, 1.0, rng) for _ in range(2))) for t in times
+    ]
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return characterise(frames(lit=False, times=DARKS_S), frames(), WHITE_DN)
+
+
+def within(sheet, name, truth, deviations=4.0, floor=0.0):
+    assert abs(getattr(sheet, name) - truth) < deviations * sheet.deviations[name] + floor
+
+
+def test_the_gain_is_the_slope_of_the_photon_transfer_curve(sheet):
+    within(sheet, "gain_dn_per_electron", 0.8)
+    assert sheet.deviations["gain_dn_per_electron"] < 0.02
+
+
+def test_read_noise_black_level_and_dark_current_come_out(sheet):
+    within(sheet, "read_noise_electrons", 2.5)
+    assert sheet.read_noise_electrons == pytest.approx(2.5, rel=0.05)
+    within(sheet, "black_level_dn", 256.0, floor=0.1)
+    within(sheet, "dark_current_electrons_per_s", 12.0)
+    assert sheet.dark_current_electrons_per_s == pytest.approx(12, rel=0.05)
+
+
+def test_the_full_well_is_where_the_variance_is_greatest(sheet):
+    # Exposures are steps: the last below the well is what is found.
+    assert 0.8 * 50_000 < sheet.full_well_electrons < 1.03 * 50_000
+    assert sheet.snr_max_db == pytest.approx(10 * np.log10(sheet.full_well_electrons))
+    noise_floor = np.sqrt(2.5**2 + 1 / 12 / 0.8**2) + 0.5
+    expected = 20 * np.log10(sheet.full_well_electrons / noise_floor)
+    assert sheet.dynamic_range_db == pytest.approx(expected, abs=0.5)
+
+
+def test_the_pixels_own_differences_are_told_from_noise_and_from_the_lamp(sheet):
+    assert sheet.prnu_percent == pytest.approx(1.0, rel=0.08)
+    assert sheet.dsnu_electrons == pytest.approx(1.5 / 0.8, rel=0.1)
+
+
+def test_hot_and_dead_pixels_are_those_that_are(sheet):
+    hot, dead = FLAWS.bad(SIZE)
+    assert sheet.hot_pixels == hot.sum()
+    assert sheet.dead_pixels == dead.sum()
+    np.testing.assert_array_equal(sheet.good, ~(hot | dead))
+
+
+def test_a_straight_sensor_is_straight_and_a_bent_one_bends():
+    darks = frames(lit=False, times=DARKS_S)
+    straight = characterise(darks, frames(), WHITE_DN)
+    bent_flaws = SensorFlaws(full_well_electrons=50_000.0, bend=0.08)
+    bent = characterise(frames(bent_flaws, lit=False, times=DARKS_S), frames(bent_flaws), WHITE_DN)
+    assert straight.linearity_error_percent < 0.3
+    assert bent.linearity_error_percent > 1.0
+
+
+def test_the_stated_deviation_of_the_gain_is_that_of_repeated_measurements():
+    gains, stated = [], []
+    for seed in range(8):
+        one = characterise(
+            frames(lit=False, times=DARKS_S, seed=100 + seed), frames(seed=seed), WHITE_DN
+        )
+        gains.append(one.gain_dn_per_electron)
+        stated.append(one.deviations["gain_dn_per_electron"])
+    assert 0.5 < np.std(gains, ddof=1) / np.mean(stated) < 1.8
+
+
+def test_too_few_exposures_no_light_and_other_sizes_are_refused():
+    darks = frames(lit=False, times=DARKS_S)
+    with pytest.raises(CalibrationError, match="two exposures at least"):
+        characterise(darks[:1], frames(), WHITE_DN)
+    with pytest.raises(CalibrationError, match="3 flat exposures"):
+        characterise(darks, frames(times=FLATS_S[:3]), WHITE_DN)
+    with pytest.raises(CalibrationError, match=r"brighter|below 70 %|between 5 and 95"):
+        characterise(darks, frames(lit=False, times=FLATS_S[:5]), WHITE_DN)
+    small = [Pair(1.0, darks[0].first[:50], darks[0].second[:50])] * 4
+    with pytest.raises(CalibrationError, match="are they of one camera"):
+        characterise(darks, small, WHITE_DN)

@@ -1,0 +1,188 @@
+"""The mask's shadow: the camera model where nothing is wrong, and derivatives that are its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.errors import CalibrationError
+from calibration.parametric import psi_at, shot_stages
+from calibration.placement import (
+    LEAST_BLUR_UM,
+    SCALARS,
+    designed_placement,
+    labels,
+    with_aperture_mean_one,
+)
+from calibration.shadow import ANY_COLOUR, Shadow, shadow_mask, share_tables
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+
+SIZE = (16, 22)
+VIEWS = (3, 4)
+
+
+def camera_of(cfa="rggb", binning=1, pattern=None, **more):
+    return Camera.model_validate(
+        {
+            "title": "test",
+            "views": VIEWS,
+            "sensor": {"cfa": cfa, "binning": binning},
+            "masks": {
+                "code": {
+                    "distance_mm": 0.2,
+                    "cell_um": 40,
+                    "pattern": pattern or {"kind": "uniform_colour", "seed": 4},
+                }
+            },
+            "shots": [{}, {"offset_um": {"code": [52.0, -31.0]}}],
+            **more,
+        }
+    )
+
+
+def sharp(camera):
+    return replace(designed_placement(camera), blur_um=LEAST_BLUR_UM)
+
+
+def everywhere(size=SIZE):
+    return np.moveaxis(np.mgrid[: size[0], : size[1]], 0, -1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(("cfa", "binning"), [("rggb", 1), ("mono", 1), ("rggb", 2), ("mono", 2)])
+def test_a_mask_that_sits_as_designed_casts_the_shadow_of_the_camera_model(cfa, binning):
+    camera = camera_of(cfa, binning)
+    design = build_imaging_matrix(camera, SIZE)
+    shadow = Shadow(shadow_mask(camera, SIZE), sharp(camera))
+    found = psi_at(shadow, design.layout, shot_stages(camera))
+    # The shadow's edges are LEAST_BLUR_UM soft, and its tables are linear between their places.
+    assert found.relative_difference(design) < 5e-4
+
+
+def test_an_open_whiteboard_is_the_sum_of_the_coefficients():
+    camera = camera_of()
+    design = build_imaging_matrix(camera, SIZE)
+    shadow = Shadow(shadow_mask(camera, SIZE), sharp(camera))
+    every = np.ones(VIEWS, dtype=bool)
+    assert design.colour is not None
+    read = shadow.readings(everywhere(), design.colour[0].ravel(), every)
+    white = design.forward(np.ones(design.light_field_shape, np.float32))[0]
+    np.testing.assert_allclose(read.reshape(SIZE), white, atol=2e-4)
+
+
+def askew(camera):
+    rng = np.random.default_rng(0)
+    weights = tuple(tuple(1 + 0.1 * row) for row in rng.standard_normal(VIEWS))
+    return replace(
+        designed_placement(camera),
+        offset_x_um=7.0,
+        offset_y_um=-5.0,
+        rotation_rad=0.004,
+        scale=1.003,
+        skew=0.002,
+        distance_share=0.1,
+        distortion_um=5.0,
+        blur_um=4.0,
+        clear=0.93,
+        leak=0.04,
+        vignetting=0.1,
+        falloff=-0.2,
+        aperture=weights,
+    )
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize("name", [*SCALARS, "aperture_0_0", "aperture_2_1"])
+def test_derivatives_are_those_of_the_readings(name, binning):
+    camera = camera_of(binning=binning)
+    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    pixels = everywhere(mask.pixel_shape())
+    colours = np.arange(len(pixels), dtype=np.uint8) % 4
+    open_views = np.random.default_rng(1).random(VIEWS) < 0.6
+    place = labels(VIEWS).index(name)
+    _, slopes = Shadow(mask, at).with_slopes(pixels, colours, open_views, (12.0, 3.0))
+    step = np.zeros(len(at.vector()))
+    # The tables' interpolation errs with the reach of the blur: a small step would see that.
+    step[place] = 0.2 if name == "blur_um" else 1e-3 * max(abs(at.vector()[place]), 0.01)
+    ahead, behind = (
+        Shadow(mask, at.moved(sign * step)).readings(pixels, colours, open_views, (12.0, 3.0))
+        for sign in (1, -1)
+    )
+    expected = (ahead - behind) / (2 * step[place])
+    error = np.linalg.norm(slopes[:, place] - expected) / np.linalg.norm(expected)
+    assert error < 0.01
+
+
+def test_moving_the_stage_is_moving_the_mask():
+    camera = camera_of()
+    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    pixels, colours = everywhere(), np.full(SIZE[0] * SIZE[1], ANY_COLOUR, np.uint8)
+    every = np.ones(VIEWS, dtype=bool)
+    staged = Shadow(mask, at).readings(pixels, colours, every, (30.0, -11.0))
+    moved = replace(at, offset_x_um=at.offset_x_um + 30.0, offset_y_um=at.offset_y_um - 11.0)
+    np.testing.assert_allclose(staged, Shadow(mask, moved).readings(pixels, colours, every))
+
+
+def test_brightness_of_the_whole_aperture_cancels_against_the_reference():
+    camera = camera_of()
+    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    pixels, colours = everywhere(), np.zeros(SIZE[0] * SIZE[1], np.uint8)
+    every = np.ones(VIEWS, dtype=bool)
+    brighter = replace(at, aperture=tuple(tuple(3 * w for w in row) for row in at.aperture))
+    read = Shadow(mask, at).readings(pixels, colours, every)
+    np.testing.assert_allclose(read, Shadow(mask, brighter).readings(pixels, colours, every))
+    normal = with_aperture_mean_one(brighter)
+    assert np.mean(normal.aperture) == pytest.approx(1)
+
+
+def test_a_clear_plate_reads_its_transmittance_everywhere():
+    camera = camera_of(pattern={"kind": "open"})
+    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    pixels, colours = everywhere(), np.zeros(SIZE[0] * SIZE[1], np.uint8)
+    read = Shadow(mask, at).readings(pixels, colours, np.ones(VIEWS, dtype=bool))
+    np.testing.assert_allclose(read, at.clear, rtol=1e-9)
+
+
+@pytest.mark.parametrize("blur_um", [0.3, 3.0, 12.0])
+def test_the_shares_of_the_cells_sum_to_one_and_their_derivatives_to_none(blur_um):
+    camera = camera_of()
+    mask = shadow_mask(camera, SIZE)
+    tables, reach = share_tables(mask, replace(designed_placement(camera), blur_um=blur_um))
+    np.testing.assert_allclose(tables[0].sum(axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(tables[1:].sum(axis=2), 0, atol=1e-6)
+    assert (tables[0] > -1e-9).all()
+    # The same by brute force: three kernels convolved on a fine grid, centred at the reach.
+    grain = 5e-4
+    grid = np.arange(-2.5, 2.5, grain)
+    ratio = mask.distance_um / mask.lens_um
+    widths = (1 - ratio) * mask.pixel_um / mask.cell_um, ratio * mask.aperture_um / mask.cell_um
+    density = np.exp(-0.5 * (grid / (blur_um / mask.cell_um)) ** 2)
+    for width in widths:
+        density = np.convolve(density, np.abs(grid) <= width / 2, mode="same")
+    density /= density.sum()
+    for place in (0, 200, 400):
+        at = grid + reach + place / 512
+        shares, _ = np.histogram(at, np.arange(tables.shape[2] + 1), weights=density)
+        np.testing.assert_allclose(tables[0][place], shares, atol=2e-3)
+
+
+def test_a_footprint_list_gives_the_same_reading():
+    camera = camera_of()
+    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    shadow, pixels = Shadow(mask, at), everywhere()
+    colours = np.zeros(len(pixels), np.uint8)
+    every = np.ones(VIEWS, dtype=bool)
+    corners, down, across, weights = shadow.footprints(pixels, every, (4.0, 0.0))
+    read = np.zeros(len(pixels))
+    for view in range(corners.shape[1]):
+        for a in range(down.shape[2]):
+            for b in range(across.shape[2]):
+                cell = mask.cells[0, corners[:, view, 0] + a, corners[:, view, 1] + b, 0]
+                share = weights[:, view] * down[:, view, a] * across[:, view, b]
+                read += share * (at.leak + (at.clear - at.leak) * cell)
+    np.testing.assert_allclose(read, shadow.readings(pixels, colours, every, (4.0, 0.0)), rtol=3e-3)
+
+
+def test_a_camera_without_one_mask_before_its_sensor_is_sent_to_the_free_route():
+    camera = camera_of(masks={}, shots=[{}])
+    with pytest.raises(CalibrationError, match="use the free route"):
+        shadow_mask(camera, SIZE)
