@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,39 @@ def test_a_full_disk_keeps_what_was_counted(undisturbed):
     disk.capacity_bytes = float("inf")
     run_on(disk)
     assert_whole(disk, expected)
+
+
+def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
+    """The simulated disk is not kinder than a real one: the tests above could fail."""
+    operations, _ = undisturbed
+
+    class Forgetful(SimulatedDisk):
+        def sync_folder(self, path):
+            self.operations += 1
+
+    rng = np.random.default_rng(0)
+    lost = 0
+    for cut in range(operations // 2, operations, 5):
+        disk = Forgetful()
+        disk.cut_power_at(cut)
+        with pytest.raises(PowerCutError):
+            run_on(disk)
+        before = set(Session(ROOT / "s", disk).stored)
+        survived = disk.after_power_cut(rng)
+        try:
+            session = Session(ROOT / "s", survived)
+            lost += bool(verify(session).damaged) or set(session.stored) != before
+        except AppError:
+            lost += 1
+    assert lost > 3
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
+def test_a_disk_that_is_really_full_is_told_by_the_system():
+    file = SYSTEM_DISK.append(Path("/dev/full"))
+    with pytest.raises(OSError, match="space"):
+        file.write(b"one byte too many")
+    file.close()
 
 
 def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
@@ -281,6 +315,15 @@ def test_pruning_removes_leftovers_and_nothing_else(on_disk):
     prune(opened)
     gone = before - set((on_disk.folder / FRAMES).iterdir())
     assert {path.name for path in gone} == {part.name, entry["file"]}
+
+
+def test_a_folder_of_frames_that_somebody_removed_is_filled_again(on_disk, tmp_path, undisturbed):
+    shutil.rmtree(on_disk.folder / FRAMES)
+    verdict = verify(Session(on_disk.folder))
+    assert len(verdict.damaged) == len(undisturbed[1])
+    again = run_on(SYSTEM_DISK, tmp_path)
+    assert verify(again).is_complete
+    assert {name: again.read(name) for name in undisturbed[1]} == undisturbed[1]
 
 
 def test_two_programs_do_not_work_on_one_session(on_disk):

@@ -157,6 +157,7 @@ class Sequencer:
         session = self._session
         self._began_s = self._timer()
         with self._writer, self._bench_left_safe():
+            session.make_ready()
             session.note("run", **self._facts())
             self._run = session.runs
             whole = set(session.stored)
@@ -186,12 +187,17 @@ class Sequencer:
         from emmc_rig.output import command_line, versions
 
         rig, camera = self._rig, self._camera
+        settings = {}
+        with suppress(DriverError):
+            # What else a camera tells, such as its battery, it may also not tell.
+            settings = dict(getattr(camera, "details", dict)())
         return {
             "wall": self._wall(),
             "versions": versions(),
             "command": command_line(),
             "resumed": bool(self._session.stored),
             "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
+            "camera_settings": settings,
             "stage": {
                 axis: {
                     "limits_um": list(rig.stage.limits_um(axis)),
