@@ -21,8 +21,10 @@ import numpy as np
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.raw import RawFrame, decode_raw
-from emmc_rig.capture.plan import Plan, expand, planned_camera
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.expand import expand
+from emmc_rig.capture.plan import Plan, planned_camera
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line

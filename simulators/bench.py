@@ -179,7 +179,7 @@ class Bench:
         self.shot = 0
         self.masks_in = True
         self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
-        self._positions_um, self._window_um, self._rng = positions_um, window_um, rng
+        self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
         self._points = ray_points(views, rays_per_view)
         self._plates = draw_plates(camera, size)
@@ -198,11 +198,7 @@ class Bench:
     def expose(self, exposure_s: float) -> NDArray[np.uint16]:
         """Return one noisy frame (pixel_y, pixel_x) in DN."""
         noise, light = self._camera.sensor.noise, self._light[self.shot]
-        return noise.expose_dn(self.readings(), exposure_s, light, self._rng)
-
-    def reseed(self, rng: np.random.Generator) -> None:
-        """Draw the noise of the frames that follow from another source."""
-        self._rng = rng
+        return noise.expose_dn(self.readings(), exposure_s, light, self.rng)
 
     def _trace(self, at_um: Mapping[str, float]) -> Array:
         camera = self._camera

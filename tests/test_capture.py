@@ -28,7 +28,8 @@ from emmc_rig.capture.command import (
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.plan import Checks, Retries
 from emmc_rig.capture.retries import GaveUpError, Mending, mending
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.scene import fine_scene

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from capture_rigs import begun, frame_bytes, plan_and_camera, still_rig
 
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.prune import prune

@@ -15,16 +15,17 @@ import yaml
 
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import Estimate, estimate
+from emmc_rig.capture.expand import expand
 from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Plan,
-    expand,
     first_difference,
     load_plan,
     planned_camera,
 )
-from emmc_rig.capture.sequencer import Outcome, Sequencer, Watcher
+from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.watcher import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera
