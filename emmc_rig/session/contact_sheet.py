@@ -141,7 +141,7 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
     left = pictures
     for kind in reversed(KINDS):
-        frames = [frame for frame in session.frames if frame.kind == kind]
+        frames = sorted((f for f in session.frames if f.kind == kind), key=_place_in_plan)
         if not frames:
             continue
         shown = _chosen(frames, left)
@@ -153,6 +153,11 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
         )
         body = "".join(_picture(session, frame) for frame in shown)
         yield kind, HEADINGS[kind], f'<div class="sheet">{body}</div>{more}'
+
+
+def _place_in_plan(frame: PlannedFrame) -> tuple:
+    """Return what frames are shown in the order of: they were taken in another one."""
+    return frame.bench.shot, frame.view or (), frame.exposure_s or 0.0, frame.repeat
 
 
 def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
