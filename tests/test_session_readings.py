@@ -1,5 +1,7 @@
 """From a session to readings: brackets, gains, and plans without whiteboards."""
 
+import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +12,16 @@ from capture_rigs import begun
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import simulated_rig
+from emmc_rig.hardware import open_camera, simulated_rig
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
 from emmc_rig.scene import fine_scene
+from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.readings import session_readings, whiteboards
+from simulators.clock import ManualClock
 from simulators.disk import SimulatedDisk
+from simulators.u3v import U3vCameraSimulator
+from simulators.usb import SimulatedUsb
 
 SIZE = (24, 32)
 BRIGHT = 0.08
@@ -117,3 +123,21 @@ def test_a_misspelt_key_of_a_rig_names_the_nearest(tmp_path):
     with pytest.raises(AppError, match="did you mean 'zero_um'"):
         rig_description(str(tmp_path / "rig.yaml"), ImagedRig(scene="dark"))
     assert rig_description(SIMULATED, ImagedRig(scene="dark"))["scene"] == "dark"
+
+
+def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
+    """USB3 Vision: the file holds leader, payload and trailer, the journal what they do not say."""
+    rng = np.random.default_rng(0)
+    scene = rng.integers(64, 4000, (48, 64)).astype(np.uint16)
+    clock = ManualClock()
+    bus = SimulatedUsb(clock, U3vCameraSimulator(lambda exposure_s: scene, clock, scene.shape))
+    with closing(open_camera("u3v:", clock, bus)) as camera:
+        camera.set_exposure_s(0.02)
+        frame = camera.snap()
+    assert suffix_of(frame) == ".bin"
+    entry = json.loads(json.dumps({"file": f"00000-x{suffix_of(frame)}", **frame_facts(frame)}))
+    back = decode_frame(frame.original, entry)
+    np.testing.assert_array_equal(back.mosaic, frame.mosaic)
+    np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
+    assert (back.cfa, back.white_level_dn) == (frame.cfa, frame.white_level_dn)
+    assert (back.exposure_s, back.gain) == (frame.exposure_s, frame.gain)
