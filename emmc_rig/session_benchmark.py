@@ -43,7 +43,7 @@ SMALL_SHAPE = (24, 32)
 BLACK_DN, WHITE_DN = 256, 4095
 ZERO_UM, WINDOW_UM = 30_000.0, 60_000.0
 PLACES = 7
-MOVE_S = 0.15
+MOVE_S = 0.3
 
 
 @dataclass(frozen=True)
