@@ -19,11 +19,11 @@ from drivers.errors import DriverError
 from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
-from emmc_rig.output import shown_bytes
+from emmc_rig.output import metrics_text, shown_bytes
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import METRICS, Session
 from emmc_rig.session.storage import write_whole
 from emmc_rig.session.timeline import (
     COLOURS,
@@ -31,6 +31,7 @@ from emmc_rig.session.timeline import (
     SHOWN_FRAMES,
     overlap,
     run_entries,
+    session_metrics,
     timeline_svg,
 )
 from emmc_rig.session.verify import counts
@@ -49,10 +50,12 @@ HEADINGS = {
 
 
 def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> None:
-    """Write the page, whole or not at all; raises AppError."""
-    page = sheet(session, pictures).encode()
+    """Write the page, and metrics.json beside it, each whole or not at all; raises AppError."""
+    page = sheet(session, pictures)
+    figures = metrics_text(session_metrics(session))
     try:
-        write_whole(session.disk, path, page)
+        write_whole(session.disk, path.with_name(METRICS), figures.encode())
+        write_whole(session.disk, path, page.encode())
     except OSError as fault:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
 

@@ -51,8 +51,8 @@ HEADER, PLAN, CAMERA, RIG, ORDER = (
     "frames.json",
 )
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
-JOURNAL, FRAMES, REPORT = "journal.jsonl", "frames", "report.html"
-KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT}
+JOURNAL, FRAMES, REPORT, METRICS = "journal.jsonl", "frames", "report.html", "metrics.json"
+KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS}
 FORMAT = 1
 
 
