@@ -85,7 +85,7 @@ def overlap(entries: Sequence[Entry]) -> Overlap:
 
 
 def session_metrics(session: Session) -> dict[str, object]:
-    """Return the figures of a session: frames, bytes, retries, and how its runs spent their time."""
+    """Return the figures of a session: frames, bytes, retries, and how its runs spent time."""
     entries = session.journal.entries
     return {
         "title": session.header["title"],
