@@ -1,6 +1,6 @@
-"""`emmc-rig calibrate`: whiteboards of the simulated bench to Psi, with the choice of route told.
+"""`emmc-rig calibrate`: whiteboards to Psi, with the choice of route told.
 
-What a session of a real rig needs instead of `WhiteboardBench` is a `BoardSet` of its frames.
+They come from a session that `capture` took, or from a simulated bench whose truth is known.
 """
 
 from __future__ import annotations
@@ -32,15 +32,29 @@ from calibration.shadow import ShadowMask, shadow_mask
 from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
 from emmc_rig.calibration_report import write_calibration_report
+from emmc_rig.capture.plan import (
+    METERING_EXPOSURE_S,
+    Boards,
+    Darks,
+    OpenBoard,
+    Plan,
+    PlannedShot,
+)
 from emmc_rig.demo import Silent, Watcher
 from emmc_rig.drift import CALIBRATION, PSI
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.session.readings import session_outcome
+from emmc_rig.session.session import Session
 from emmc_rig.whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
 PLAN, REPORT = "plan.yaml", "report.html"
+PLAN_HEAD = """\
+# Whiteboards for the parametric route, then the shots: emmc-rig capture plan.yaml --rig ...
+# and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
+"""
 ROUTES = {
     "auto": ("parametric", "mixed"),
     "parametric": ("parametric",),
@@ -121,8 +135,41 @@ def held_out_settings(camera: Camera) -> list[Setting]:
     return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
 
 
+def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Light) -> Plan:
+    """Return the plan of a capture: whiteboards of the parametric route, and the camera's shots."""
+    pinholes = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
+    fitted = [
+        OpenBoard(mask_um=kind.stage_um, repeats=count)
+        for kind, count in planned.counts.items()
+        if kind.pinhole is None and count
+    ]
+    judging = [
+        OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
+        for one in held_out_settings(settings.camera)
+    ]
+    views = tuple(view for view, count in pinholes.items() if count)
+    return Plan(
+        title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
+        camera=settings.camera_name,
+        shots=tuple(PlannedShot() for _ in settings.camera.shots),
+        whiteboards=Boards(
+            views=views,
+            shots=(0,),
+            repeats=max([1, *pinholes.values()]),
+            references=max(2, planned.reference_frames),
+            open=(*fitted, *judging),
+        ),
+        darks=Darks(
+            exposure_s=(METERING_EXPOSURE_S, round(light.exposure_s, 4)),
+            repeats=max(2, planned.dark_frames),
+        ),
+    )
+
+
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
-    """Write plan.yaml and metrics.json: how many whiteboards of which kind reach the target."""
+    """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
+    kind reach the target by each route.
+    """
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
@@ -164,8 +211,11 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
             "expected_relative_error": free.expected_error,
         },
     }
-    text = yaml.safe_dump(plan, sort_keys=False)
-    (folder / PLAN).write_text(text, encoding="utf-8")
+    to_capture = capture_plan(settings, planned, light).model_dump(
+        mode="json", exclude_defaults=True
+    )
+    text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
+    (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
     metrics = {**plan, "command": command_line(), "versions": versions()}
     write_metrics(folder, metrics)
     return metrics
@@ -242,11 +292,27 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         "camera": settings.camera_name,
         "size": list(settings.size),
         "route": settings.route,
+        **outcome_figures(outcome),
+        "psi_relative_error": errors,
+        "design_relative_error": psi_error(design, exact, outcome.good),
+        "held_out_frames": held_out.exposures,
+        "sensor": {name: value for name, value, _, _ in sensor.rows()},
+        "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
+        "capture_seconds": captured_s,
+        "calibration_seconds": calibrated_s,
+        "seed": settings.seed,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    return Run(settings, bench, outcome, few, held_out, planned, metrics, sensor, stage)
+
+
+def outcome_figures(outcome: Outcome) -> dict:
+    """Return what a calibration says of itself, for metrics.json and the report."""
+    return {
         "chosen": outcome.chosen,
         "why": outcome.why,
         "advice": list(outcome.advice),
-        "psi_relative_error": errors,
-        "design_relative_error": psi_error(design, exact, outcome.good),
         "held_out": {
             name: {
                 "chi2": one.chi2,
@@ -257,20 +323,11 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
             for name, one in outcome.judged.items()
         },
         "frames": dict(outcome.frames),
-        "held_out_frames": held_out.exposures,
         "bad_pixels": float(1 - outcome.good.mean()),
         "defects": None if outcome.mixed is None else _defect_count(outcome),
         "parameters": _parameters(outcome),
         "fit": _fit_figures(outcome),
-        "sensor": {name: value for name, value, _, _ in sensor.rows()},
-        "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
-        "capture_seconds": captured_s,
-        "calibration_seconds": calibrated_s,
-        "seed": settings.seed,
-        "command": command_line(),
-        "versions": versions(),
     }
-    return Run(settings, bench, outcome, few, held_out, planned, metrics, sensor, stage)
 
 
 def measured_stage(
@@ -386,13 +443,10 @@ def run_calibrate(
     Writes psi.h5, calibration.h5, metrics.json and report.html.
     """
     run = run_calibration(settings, watcher)
-    outcome = run.outcome
-    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
-    outcome.calibration.psi.save(folder / PSI)
-    save_calibration(folder / CALIBRATION, outcome.calibration, known)
+    _save(folder, run.outcome)
     write_calibration_report(
         folder / REPORT,
-        outcome,
+        run.outcome,
         run.metrics,
         true_parameters(settings.truth),
         run.sensor,
@@ -400,6 +454,46 @@ def run_calibrate(
     )
     write_metrics(folder, run.metrics)
     return run.metrics
+
+
+def calibrate_session(
+    session: Session, folder: Path, route: str = "auto", watcher: Watcher | None = None
+) -> dict:
+    """Calibrate a session's whiteboards into an existing folder and return the metrics.
+
+    Writes what `run_calibrate` writes. `auto` takes the parametric routes where the session has
+    whiteboards for them, and the free one else. Raises AppError or CalibrationError.
+    """
+    watcher = watcher or Silent()
+    if route not in ROUTES:
+        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
+    started = time.perf_counter()
+    watcher.begin("frames", None)
+    outcome = session_outcome(
+        session,
+        None if route == "auto" else ROUTES[route],
+        lambda name: watcher.begin(name, None),
+    )
+    metrics = {
+        "camera": session.header["title"] or session.folder.name,
+        "session": str(session.folder),
+        "size": list(outcome.calibration.psi.size),
+        "route": route,
+        **outcome_figures(outcome),
+        "calibration_seconds": time.perf_counter() - started,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    _save(folder, outcome)
+    write_calibration_report(folder / REPORT, outcome, metrics)
+    write_metrics(folder, metrics)
+    return metrics
+
+
+def _save(folder: Path, outcome: Outcome) -> None:
+    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
+    outcome.calibration.psi.save(folder / PSI)
+    save_calibration(folder / CALIBRATION, outcome.calibration, known)
 
 
 def free_route_error(settings: CalibrateSettings, repeats: int) -> float:

@@ -15,6 +15,10 @@ DEFAULT_CAMERA = "rgbw-bayer-1shot"
 
 
 def calibrate(
+    session: Annotated[
+        Path | None,
+        typer.Argument(help="a session of `capture`; without one, a simulated bench"),
+    ] = None,
     camera: Annotated[
         str, typer.Option("--camera", help="a shipped camera or a YAML file")
     ] = DEFAULT_CAMERA,
@@ -55,7 +59,7 @@ def calibrate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
 ) -> None:
-    """Measure Psi from whiteboards of the simulated bench, and say how sure it is."""
+    """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
     from emmc_rig.calibrate import CalibrateSettings, run_calibrate, write_plan
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import result_folder
@@ -63,6 +67,11 @@ def calibrate(
 
     if drift is not None:
         _judge_drift(known, drift, out)
+        return
+    if session is not None:
+        if plan or check is not None or stage:
+            raise typer.BadParameter("--plan, --check and --stage are for the simulated bench")
+        _calibrate_session(session, route, out)
         return
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
@@ -99,7 +108,7 @@ def calibrate(
                 f"{name}: {one['frames']} frames for a relative error of Psi of "
                 f"{one['expected_relative_error']:.2%}"
             )
-        typer.echo(f"read {out / 'plan.yaml'}")
+        typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         return
     from emmc_rig.cli import Bars, shown_progress
 
@@ -112,6 +121,28 @@ def calibrate(
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
         f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
         f"(the design is off by {metrics['design_relative_error']:.0%})"
+    )
+    for line in metrics["advice"]:
+        typer.echo(f"measure again: {line}")
+    typer.echo(f"open {out / 'report.html'}")
+
+
+def _calibrate_session(path: Path, route: str, out: Path) -> None:
+    from emmc_rig.calibrate import calibrate_session
+    from emmc_rig.cli import Bars, shown_progress
+    from emmc_rig.output import result_folder
+    from emmc_rig.session.session import Session
+
+    captured = Session(path)
+    with result_folder(out) as folder, shown_progress() as progress:
+        bars = Bars(progress)
+        metrics = calibrate_session(captured, folder, route, bars)
+        bars.finish()
+    chosen = metrics["chosen"]
+    judged = metrics["held_out"][chosen]
+    typer.echo(
+        f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
+        f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
     for line in metrics["advice"]:
         typer.echo(f"measure again: {line}")

@@ -268,7 +268,7 @@ def _provenance(metrics: Mapping) -> str:
         "command": metrics["command"],
         "camera": metrics["camera"],
         "size": "x".join(map(str, metrics["size"])),
-        "seed": metrics["seed"],
+        **({"session": metrics["session"]} if "session" in metrics else {"seed": metrics["seed"]}),
         "seconds to calibrate": f"{metrics['calibration_seconds']:.1f}",
         **metrics["versions"],
     }

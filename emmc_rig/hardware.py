@@ -194,7 +194,7 @@ def simulated_rig(
 
     def announced(name: str) -> None:
         digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
-        bench.reseed(np.random.default_rng(int.from_bytes(digest)))
+        bench.rng = np.random.default_rng(int.from_bytes(digest))
 
     rig = SimulatedRig(
         stage,

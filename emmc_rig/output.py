@@ -81,9 +81,13 @@ def parse_size(
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
-    """Write metrics.json; values that are not finite become null, as JSON has none."""
-    text = json.dumps(_finite(metrics), indent=2, allow_nan=False)
-    (folder / METRICS).write_text(text + "\n", encoding="utf-8")
+    """Write metrics.json."""
+    (folder / METRICS).write_text(metrics_text(metrics), encoding="utf-8")
+
+
+def metrics_text(metrics: Mapping[str, object]) -> str:
+    """Return metrics as JSON; values that are not finite become null, as JSON has none."""
+    return json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
 
 
 def _finite(value: object) -> object:

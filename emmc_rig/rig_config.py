@@ -48,27 +48,35 @@ class ImagedRig(Settings):
 
 
 class AskingAttendant:
-    """An `Attendant` who is a person: he is asked, and asked again only when something changes."""
+    """An `Attendant` who is a person: asked, and asked again only when something changes."""
 
     def __init__(self, camera: Camera, ask: Ask) -> None:
         self._camera, self._ask = camera, ask
+        self._done: dict[str, str] = {}
 
     def set_lamp(self, colour: str) -> None:
         """Ask for the lamp."""
-        self._ask("switch the lamp off" if colour == "off" else f"switch the {colour} lamp on")
+        off = "switch the lamp off"
+        self._want("lamp", off if colour == "off" else f"switch the {colour} lamp on")
 
     def place(self, target: str) -> None:
         """Ask for the scene or the board."""
-        self._ask(f"put the {target} before the camera")
+        self._want("target", f"put the {target} before the camera")
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
         """Ask for masks and filter."""
         names = ", ".join(self._camera.shot_masks(shot)) if fitted else ""
         chosen = self._camera.shots[shot].filter
-        self._ask(
-            (f"put in the masks {names}" if names else "take all masks out")
-            + ("" if chosen == "none" else f", and the {chosen} filter in")
-        )
+        masks = f"put in the masks {names}" if names else "take all masks out"
+        colour = "take any filter out" if chosen == "none" else f"put in the {chosen} filter"
+        self._want("masks", masks)
+        if any(one.filter != "none" for one in self._camera.shots):
+            self._want("filter", colour)
+
+    def _want(self, what: str, wish: str) -> None:
+        if self._done.get(what) != wish:
+            self._ask(wish)
+            self._done[what] = wish
 
 
 class NoAttendant:

@@ -247,10 +247,6 @@ class Bench:
         """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
         return self._light[shot]
 
-    def reseed(self, rng: np.random.Generator) -> None:
-        """Draw the noise of the frames that follow from another source."""
-        self._rng = rng
-
     def _trace(self, at_um: Mapping[str, float]) -> Array:
         camera = self._camera
         lens, sensor = camera.lens, camera.sensor

@@ -15,7 +15,8 @@ from pathlib import Path
 from capture_rigs import begun, plan_and_camera, still_rig
 
 from emmc_rig.capture import writer
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.session import journal, session, storage
 from emmc_rig.session.session import Session

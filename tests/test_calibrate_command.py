@@ -96,7 +96,7 @@ def test_the_plan_is_written_and_asks_for_more_frames_where_psi_must_be_surer(
         )
         assert code == 0
         assert "frames for a relative error of Psi" in said
-        plan = yaml.safe_load((out / "plan.yaml").read_text())
+        plan = json.loads((out / "metrics.json").read_text())
         assert plan["parametric"]["expected_relative_error"] <= float(target)
         boards = plan["parametric"]["whiteboards"]
         assert sum(one["frames"] for one in boards) < plan["free"]["frames"]

@@ -1,5 +1,6 @@
 """The sequencer: what it takes, retries, refuses, and how it leaves the bench."""
 
+import errno
 import os
 import signal
 import threading
@@ -28,7 +29,8 @@ from emmc_rig.capture.command import (
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.plan import Checks, Retries
 from emmc_rig.capture.retries import GaveUpError, Mending, mending
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.scene import fine_scene
@@ -468,6 +470,21 @@ def test_a_full_disk_is_told_in_one_line_with_what_is_safe():
     assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(told.value)
     assert rig.attendant.lamp == "off"
     assert rig.stage.stops == 1
+
+
+def test_a_read_only_disk_is_told_in_one_line():
+    rig = still_rig()
+    disk = SimulatedDisk()
+    session, plan = started(rig, disk=disk)
+
+    def refuse(number, name):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    disk.before = refuse
+    with pytest.raises(AppError, match="disk is read-only") as told, disk_faults_told(session):
+        Sequencer(session, plan, rig).run()
+    assert "\n" not in str(told.value)
+    assert rig.stage.moves == 0
 
 
 def test_a_disk_that_is_too_small_is_told_before_anything_is_made():

@@ -171,6 +171,15 @@ def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured,
     assert np.corrcoef(fused[0].ravel(), rate.ravel())[0, 1] > 0.99
 
 
+def test_the_metrics_lie_beside_what_was_captured(captured):
+    metrics = json.loads((captured / "plan-session" / "metrics.json").read_text())
+    assert metrics["complete"]
+    assert metrics["frames"] == metrics["stored"] == 62
+    assert metrics["retries"] == 0
+    assert metrics["runs"][0]["frames"] == 62
+    assert 0 <= metrics["runs"][0]["hidden_share"] <= 1
+
+
 def test_the_report_opens_offline_and_shows_frames_and_timeline(captured):
     page = (captured / "plan-session" / "report.html").read_text()
     assert page.count("<img ") == 62

@@ -9,14 +9,12 @@ import yaml
 
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.capture.estimate import estimate
+from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
     Plan,
-    expand,
-    exposures_s,
     first_difference,
-    fittings,
     load_plan,
     plan_schema,
     planned_camera,

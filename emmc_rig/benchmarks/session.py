@@ -21,8 +21,10 @@ import numpy as np
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.raw import RawFrame, decode_raw
-from emmc_rig.capture.plan import Plan, expand, planned_camera
-from emmc_rig.capture.sequencer import Sequencer, Unwatched
+from emmc_rig.capture.expand import expand
+from emmc_rig.capture.plan import Plan, planned_camera
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line
@@ -41,7 +43,7 @@ SMALL_SHAPE = (24, 32)
 BLACK_DN, WHITE_DN = 256, 4095
 ZERO_UM, WINDOW_UM = 30_000.0, 60_000.0
 PLACES = 7
-MOVE_S = 0.15
+MOVE_S = 0.3
 
 
 @dataclass(frozen=True)

@@ -119,15 +119,13 @@ def _run(
         return not dry_run
 
     go_on = f"go on with: emmc-rig capture {wish.out}"
-
     try:
         with display.shown():
             captured = run_capture(wish, display, ask, agreed, control)
     except KeyboardInterrupt as stop:
-        kept = f"what was captured is kept, {go_on}"
-        nothing = "nothing was begun"
-        told = kept if is_session(wish.out) else nothing
-        raise CaptureStoppedError(f"stopped at once; {told}") from stop
+        begun = is_session(wish.out)
+        kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
+        raise CaptureStoppedError(f"stopped at once; {kept}") from stop
     if captured is None:
         return
     session, outcome = captured

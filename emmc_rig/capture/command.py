@@ -15,16 +15,17 @@ import yaml
 
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import Estimate, estimate
+from emmc_rig.capture.expand import expand
 from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Plan,
-    expand,
     first_difference,
     load_plan,
     planned_camera,
 )
-from emmc_rig.capture.sequencer import Outcome, Sequencer, Watcher
+from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.watcher import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera
@@ -33,7 +34,15 @@ from emmc_rig.model.settings import validated
 from emmc_rig.output import command_line, shown_bytes, versions
 from emmc_rig.rig_config import Ask, opened_rig
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import Frozen, Session, is_session, only_program, wall_time
+from emmc_rig.session.session import (
+    HEADER,
+    JOURNAL,
+    Frozen,
+    Session,
+    is_session,
+    only_program,
+    wall_time,
+)
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
 
 DISK_RESERVE_BYTES = 100_000_000
@@ -87,6 +96,10 @@ def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
         session = Session(wish.out, disk)
         _refuse_changes(wish, session)
         return session
+    if (wish.out / HEADER).is_file():
+        raise AppError(
+            f"{wish.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
+        )
     if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
         raise AppError(
             f"--out {wish.out}: holds something else than a session; choose another folder"

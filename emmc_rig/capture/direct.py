@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calibration.frames import average
 from calibration.whiteboard import Whiteboards
-from emmc_rig.capture.plan import METERING_EXPOSURE_S, mask_offsets_um
+from emmc_rig.capture.expand import mask_offsets_um
+from emmc_rig.capture.plan import METERING_EXPOSURE_S
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera

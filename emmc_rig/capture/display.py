@@ -54,6 +54,7 @@ class CaptureDisplay:
         self._line = Text()
         self._live: Live | None = None
         self._done = self._planned = 0
+        self._asking = False
 
     @contextmanager
     def shown(self) -> Iterator[None]:
@@ -78,8 +79,9 @@ class CaptureDisplay:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Leave the terminal to a question."""
+        """Leave the terminal, its keys too, to a question."""
         live = self._live
+        self._asking = True
         if live is not None:
             live.stop()
         try:
@@ -87,6 +89,7 @@ class CaptureDisplay:
         finally:
             if live is not None:
                 live.start()
+            self._asking = False
 
     def begin(self, done: int, planned: int) -> None:
         """Start the bar."""
@@ -134,7 +137,7 @@ class CaptureDisplay:
 
     def _listen(self, pressed, ended: threading.Event) -> None:
         while not ended.wait(KEY_POLL_S):
-            key = pressed()
+            key = "" if self._asking else pressed()
             if key == PAUSE_KEY:
                 if self._control.paused:
                     self._control.resume()

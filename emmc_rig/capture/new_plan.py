@@ -28,6 +28,8 @@ shots:
 # without masks. `whiteboards: null` leaves them out.
 whiteboards:
   views: all                # or a list: [[0, 0], [2, 2]]
+  # open: [{{mask_um: [0, 0]}}, {{mask_um: [0, 0], held_out: true}}]   # masks in, whole aperture:
+  #                         few frames, for the parametric route of `emmc-rig calibrate`
   # lamps: [white]          # default: what the sensor needs
   repeats: 2
   references: 4

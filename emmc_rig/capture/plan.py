@@ -1,26 +1,18 @@
-"""The plan of a capture: frozen, validated, and every frame that follows from it.
-
-Source of the whiteboard procedure: see `calibration.whiteboard`.
-"""
+"""The plan of a capture, frozen and validated: shots, whiteboards, darks, order, checks."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, Shot
-from emmc_rig.model.geometry import centred_grid
-from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.settings import Settings, read_yaml, validated
-from emmc_rig.session.planned import Bench, PlannedFrame
 
 METERING_EXPOSURE_S = 0.01
 SCHEMA_FILE = "plan.schema.json"
@@ -73,11 +65,28 @@ class PlannedShot(Settings):
         return self
 
 
+class OpenBoard(Settings):
+    """A whiteboard through the masks with the whole aperture open: what a fit of the mask needs.
+
+    mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
+    """
+
+    mask_um: tuple[float, float] = (0.0, 0.0)
+    repeats: Repeats = 2
+    held_out: bool = False
+
+
 class Boards(Settings):
     """Whiteboards: the pinhole before every view, and the open aperture without masks."""
 
     views: Literal["all"] | tuple[tuple[int, int], ...] = Field(
-        default="all", description="all, or a list of [v, u]"
+        default="all", description="all, or a list of [v, u]; [] for none"
+    )
+    open: tuple[OpenBoard, ...] = Field(
+        default=(), description="masks in, whole aperture: for the parametric route of `calibrate`"
+    )
+    shots: Literal["all"] | tuple[Annotated[int, Field(ge=0)], ...] = Field(
+        default="all", description="for which shots the pinhole is stepped: all, or a list"
     )
     lamps: tuple[Lamp, ...] | None = Field(
         default=None, min_length=1, description="default: what the sensor needs"
@@ -193,160 +202,6 @@ def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
             for name in moving
         }
     return own.model_copy(update={"offset_um": offsets})
-
-
-def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...]]:
-    """Return each shot's exposures, shortest first; camera: as planned."""
-    own = camera.exposures_s()
-    return [
-        tuple(sorted(set(shot.exposure_s or (float(own[place]),))))
-        for place, shot in enumerate(plan.shots)
-    ]
-
-
-def expand(plan: Plan, camera: Camera, window_um: float) -> tuple[PlannedFrame, ...]:
-    """Return every frame of a plan, in its order; camera: as planned.
-
-    window_um: what the stage's aperture_x adds to open the aperture. Raises AppError for views
-    that the camera does not have, and for a shot whose masks stand at several places.
-    """
-    frames = [
-        *_darks(plan),
-        *_references(plan, camera, window_um),
-        *_boards(plan, camera, window_um),
-        *_shots(plan, camera, window_um),
-    ]
-    return tuple(frames)
-
-
-def _darks(plan: Plan) -> Iterator[PlannedFrame]:
-    if plan.darks is None:
-        return
-    bench = Bench("scene", "off", 0, 0, masks_in=True)
-    for place, exposure_s in enumerate(sorted(set(plan.darks.exposure_s))):
-        for repeat in range(plan.darks.repeats):
-            name = f"dark-{place}-r{repeat}"
-            yield PlannedFrame(name, "dark", bench, exposure_s, repeat=repeat)
-
-
-def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
-    """Return the lamps of the whiteboards: white alone where a pixel sees one colour only."""
-    if plan.whiteboards is not None and plan.whiteboards.lamps is not None:
-        return plan.whiteboards.lamps
-    several = cfa_tile(camera.sensor.cfa).sum(axis=-1).max() > 1
-    filtered = all(shot.filter != "none" for shot in camera.shots)
-    return LAMP_COLOURS if several and not filtered else ("white",)
-
-
-def _metering_id(shot: int, lamp: str) -> str:
-    return f"meter-s{shot}-{lamp}"
-
-
-def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
-    window = {"aperture_x": window_um, "aperture_y": 0.0}
-    fitted = fittings(camera)
-    for shot in range(len(camera.shots)):
-        for lamp in lamps_of(plan, camera):
-            bench = Bench("whiteboard", lamp, shot, fitted[shot], False, window)
-            metered_by = None
-            if boards.exposure_s is None:
-                metered_by = _metering_id(shot, lamp)
-                yield PlannedFrame(metered_by, "metering", bench, METERING_EXPOSURE_S)
-            for repeat in range(boards.references):
-                yield PlannedFrame(
-                    f"reference-s{shot}-{lamp}-r{repeat}",
-                    "reference",
-                    bench,
-                    boards.exposure_s,
-                    repeat=repeat,
-                    metered_by=metered_by,
-                )
-
-
-def _boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
-    rows, columns = camera.views
-    views = boards.views
-    if views == "all":
-        views = tuple((v, u) for v in range(rows) for u in range(columns))
-    for v, u in views:
-        if not (0 <= v < rows and 0 <= u < columns):
-            raise AppError(
-                f"whiteboards.views: [{v}, {u}] is none of the camera's {rows}x{columns} views; "
-                "rows and columns count from 0"
-            )
-    cell_um = camera.lens.aperture_cell_um
-    y_um, x_um = centred_grid(rows, cell_um), centred_grid(columns, cell_um)
-    # The pinhole lets one view's light pass, the reference that of all.
-    light = float(rows * columns)
-    fitted = fittings(camera)
-    for shot in range(len(camera.shots)):
-        masks_um = mask_offsets_um(camera, shot)
-        for v, u in views:
-            pinhole = {"aperture_x": float(x_um[u]), "aperture_y": float(y_um[v])}
-            for lamp in lamps_of(plan, camera):
-                bench = Bench("whiteboard", lamp, shot, fitted[shot], True, masks_um | pinhole)
-                metered = boards.exposure_s is None
-                for repeat in range(boards.repeats):
-                    yield PlannedFrame(
-                        f"board-s{shot}-v{v}-u{u}-{lamp}-r{repeat}",
-                        "whiteboard",
-                        bench,
-                        None if boards.exposure_s is None else boards.exposure_s * light,
-                        repeat=repeat,
-                        view=(v, u),
-                        metered_by=_metering_id(shot, lamp) if metered else None,
-                        light=light,
-                    )
-
-
-def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    fitted = fittings(camera)
-    for place, (shot, bracket) in enumerate(
-        zip(plan.shots, exposures_s(plan, camera), strict=True)
-    ):
-        offsets_um = mask_offsets_um(camera, place)
-        offsets_um |= {"aperture_x": window_um, "aperture_y": 0.0}
-        bench = Bench("scene", shot.lamp, place, fitted[place], True, offsets_um)
-        for step, exposure_s in enumerate(bracket):
-            for repeat in range(shot.repeats):
-                name = f"shot-{place}-e{step}-r{repeat}"
-                yield PlannedFrame(name, "shot", bench, exposure_s, shot.gain, repeat)
-
-
-def fittings(camera: Camera) -> list[int]:
-    """Return, for each shot, the first shot with the same masks, patterns and filter in the beam.
-
-    Nobody has to change anything between shots of one fitting.
-    """
-    keys = []
-    for place, shot in enumerate(camera.shots):
-        names = camera.shot_masks(place)
-        counts = [camera.masks[n].pattern.frame_count(len(camera.shots)) for n in names]
-        keys.append((names, tuple(place % count for count in counts), shot.filter))
-    return [keys.index(key) for key in keys]
-
-
-def mask_offsets_um(camera: Camera, shot: int) -> dict[str, float]:
-    """Return where the mask stage stands for a shot, by axis; none where nothing moves.
-
-    Raises AppError when a shot wants two masks at different places: there is one mask stage.
-    """
-    wanted = {
-        camera.shots[shot].offset_um.get(name, (0.0, 0.0))
-        for name in camera.moving_masks
-        if name in camera.shot_masks(shot)
-    }
-    if len(wanted) > 1:
-        raise AppError(f"shot {shot} moves two masks apart, the rig has one mask stage")
-    return {
-        axis: value for x_um, y_um in wanted for axis, value in (("mask_x", x_um), ("mask_y", y_um))
-    }
 
 
 def plan_schema() -> dict[str, Any]:

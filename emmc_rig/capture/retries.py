@@ -48,6 +48,11 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0
 class GaveUpError(AppError):
     """The capture stops because a fault stays; everything captured so far is kept."""
 
+    def __init__(self, frame_id: str, reason: str) -> None:
+        super().__init__(
+            f"frame {frame_id}: {reason}; what was captured is kept, the same command goes on"
+        )
+
 
 @dataclass(frozen=True)
 class Mending:
@@ -82,14 +87,15 @@ class Budget:
     def spend(self, frame_id: str, error: DriverError, attempt: int) -> None:
         """Count the `attempt`-th fault of a frame, from 1; raises `GaveUpError`."""
         if isinstance(error, HOPELESS):
-            raise GaveUpError(f"frame {frame_id}: {error}") from error
+            raise GaveUpError(frame_id, str(error)) from error
         if attempt > self._retries.per_frame:
             raise GaveUpError(
-                f"frame {frame_id}: gave up after {attempt} tries, the last time because: {error}"
+                frame_id, f"gave up after {attempt} tries, the last time because: {error}"
             ) from error
         if self.spent >= self._retries.per_session:
             raise GaveUpError(
-                f"frame {frame_id}: all {self._retries.per_session} retries of the session are "
-                f"spent, the last fault: {error}"
+                frame_id,
+                f"all {self._retries.per_session} retries of the session are spent, the last "
+                f"fault: {error}",
             ) from error
         self.spent += 1

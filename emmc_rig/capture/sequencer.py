@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import Camera as CameraDevice
-from drivers.errors import CameraSettingError, DriverError
+from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import (
     LEAST_LIKENESS,
@@ -31,66 +31,30 @@ from emmc_rig.capture.checks import (
     registered,
 )
 from emmc_rig.capture.control import Control, uninterrupted
+from emmc_rig.capture.metering import (
+    METERING_TRIES,
+    better_metering_s,
+    first_meterings,
+    metered_exposure_s,
+)
 from emmc_rig.capture.plan import Boards, Plan
+from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
+from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
+from emmc_rig.output import command_line, shown_bytes, versions
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session, wall_time
 from emmc_rig.session.verify import verify_frames
 
-STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
-METERING_STEP = 4.0
-METERING_TRIES = 8
-METERING_RANGE = (0.02, 0.95)
+TOLD_BYTES = 1_000_000_000
+"""Hashing more takes long enough to be told."""
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
-
-
-class Watcher(Protocol):
-    """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
-
-    def begin(self, done: int, planned: int) -> None:
-        """So many frames are there already."""
-        ...
-
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """A step of a frame begins: one of `STEPS`."""
-        ...
-
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """A frame passed its checks."""
-        ...
-
-    def stored(self, frame: PlannedFrame) -> None:
-        """A frame is on the disk."""
-        ...
-
-    def tell(self, message: str) -> None:
-        """Something that people should know."""
-        ...
-
-
-class Unwatched:
-    """A watcher that shows nothing."""
-
-    def begin(self, done: int, planned: int) -> None:
-        """Ignore it."""
-
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """Ignore it."""
-
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Ignore it."""
-
-    def stored(self, frame: PlannedFrame) -> None:
-        """Ignore it."""
-
-    def tell(self, message: str) -> None:
-        """Ignore it."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +109,7 @@ class Sequencer:
         self._taken = self._run = 0
         # How long the frame before took to hand over: its own line is written by then.
         self._handed: dict[str, list[float]] = {}
-        brackets = _brackets(session.frames)
-        self._may_saturate = {name for ids in brackets for name in ids[1:]}
+        self._may_saturate = _may_saturate(session.frames)
 
     def run(self) -> Outcome:
         """Take what is missing.
@@ -157,14 +120,15 @@ class Sequencer:
         session = self._session
         self._began_s = self._timer()
         with self._writer, self._bench_left_safe():
+            session.make_ready()
             session.note("run", **self._facts())
             self._run = session.runs
             whole = set(session.stored)
             self._discard_damaged(whole)
-            self._metered = _metered_before(session)
+            self._metered = first_meterings(session)
             frames = session.missing()
             self._watcher.begin(len(session.frames) - len(frames), len(session.frames))
-            self._preflight(frames)
+            refuse_impossible(self._rig, frames)
             if frames:
                 self._retrying("home", self._home)
                 self._compare_with_last_good()
@@ -183,15 +147,18 @@ class Sequencer:
         )
 
     def _facts(self) -> dict[str, Any]:
-        from emmc_rig.output import command_line, versions
-
         rig, camera = self._rig, self._camera
+        settings = {}
+        with suppress(DriverError):
+            # What else a camera tells, such as its battery, it may also not tell.
+            settings = dict(getattr(camera, "details", dict)())
         return {
             "wall": self._wall(),
             "versions": versions(),
             "command": command_line(),
             "resumed": bool(self._session.stored),
             "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
+            "camera_settings": settings,
             "stage": {
                 axis: {
                     "limits_um": list(rig.stage.limits_um(axis)),
@@ -201,40 +168,6 @@ class Sequencer:
                 for axis in rig.stage.axes
             },
         }
-
-    def _preflight(self, frames: tuple[PlannedFrame, ...]) -> None:
-        """Raise AppError for what the rig can never do, before anything moves."""
-        rig = self._rig
-        low_s, high_s = self._camera.exposure_limits_s
-        low, high = self._camera.gain_limits
-        for frame in frames:
-            for axis, offset_um in frame.bench.offsets_um.items():
-                if axis not in rig.stage.axes or axis not in rig.zero_um:
-                    raise AppError(
-                        f"frame {frame.id} needs a stage axis '{axis}', the rig has "
-                        f"{', '.join(rig.zero_um) or 'none'}: name it in the rig's file"
-                    )
-                low_um, high_um = rig.stage.limits_um(axis)
-                if not low_um <= rig.zero_um[axis] + offset_um <= high_um:
-                    raise AppError(
-                        f"frame {frame.id}: {axis} cannot go {offset_um:g} um from its zero "
-                        f"({rig.zero_um[axis]:g} um), it reaches {low_um:g} to {high_um:g} um"
-                    )
-            # A camera whose exposure cannot be chosen says for each frame what it is.
-            if (
-                low_s < high_s
-                and frame.exposure_s is not None
-                and not (low_s * (1 - 1e-9) <= frame.exposure_s <= high_s * (1 + 1e-9))
-            ):
-                raise AppError(
-                    f"frame {frame.id}: the camera exposes from {low_s:g} to {high_s:g} s, not "
-                    f"{frame.exposure_s:g} s: change the plan"
-                )
-            if not low * (1 - 1e-9) <= frame.gain <= high * (1 + 1e-9):
-                raise AppError(
-                    f"frame {frame.id}: the camera's gain goes from {low:g} to {high:g}, not to "
-                    f"{frame.gain:g}: change the plan"
-                )
 
     def _home(self) -> None:
         if self._rig.stage.axes:
@@ -315,7 +248,7 @@ class Sequencer:
         with self._span("read back", planned, spans):
             read_um = self._read_back(planned)
         with self._span("check", planned, spans):
-            may_saturate = planned.kind == "metering" or planned.id in self._may_saturate
+            may_saturate = planned.id in self._may_saturate
             check(planned, frame, found, self._before, self._plan.checks, may_saturate)
         return frame, found, read_um
 
@@ -371,17 +304,10 @@ class Sequencer:
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         if planned.kind != "metering":
             return self._snap(planned, exposure_s)
-        low_s, high_s = self._camera.exposure_limits_s
         for _ in range(METERING_TRIES):
-            frame, found = self._snap(planned, min(max(exposure_s, low_s), high_s))
-            span = frame.white_level_dn - float(frame.black_level_dn.mean())
-            level = found.bright_dn / span
-            if METERING_RANGE[0] <= level <= METERING_RANGE[1]:
-                break
-            next_s = exposure_s * (
-                METERING_STEP if level < METERING_RANGE[0] else 1 / METERING_STEP
-            )
-            if not low_s <= next_s <= high_s:
+            frame, found = self._snap(planned, exposure_s)
+            next_s = better_metering_s(frame, found, exposure_s, self._camera.exposure_limits_s)
+            if next_s is None:
                 break
             exposure_s = next_s
         return frame, found
@@ -462,6 +388,9 @@ class Sequencer:
         session = self._session
         planned = {frame.id for frame in session.frames} & ids
         entries = [entry for name, entry in session.stored.items() if name in planned]
+        size = sum(entry["bytes"] for entry in entries)
+        if size > TOLD_BYTES:
+            self._watcher.tell(f"hashing {len(entries)} frames, {shown_bytes(size)}")
         damaged = verify_frames(session, entries)
         for name, fault in damaged.items():
             session.discard(name, fault)
@@ -550,47 +479,16 @@ class Sequencer:
                 self._note("stopped", reason=reason, wall=self._wall())
 
 
-def metered_exposure_s(
-    metered: Entry, level: float, light: float, limits_s: tuple[float, float]
-) -> float:
-    """Return the exposure at which `light` times less light reads `level` of white.
-
-    metered: the journal line of the metering frame. Clipped to the camera's limits. Raises
-    `CameraSettingError` where the board was dark.
-    """
-    black_dn = float(np.mean(metered["black_level_dn"]))
-    bright_dn = metered["figures"]["bright_dn"]
-    if bright_dn < 1:
-        raise CameraSettingError("exposure", "cannot be metered, the board is dark: light the lamp")
-    wanted = level * (metered["white_level_dn"] - black_dn) / bright_dn
-    low_s, high_s = limits_s
-    return min(max(metered["exposure_s"] * wanted * light, low_s), high_s)
-
-
-def _metered_before(session: Session) -> dict[str, Entry]:
-    """Return the first journal line of every metering frame.
-
-    The first counts even where its file is damaged by now: frames exposed by it are there, and
-    those still to come must be exposed alike.
-    """
-    ids = {frame.id for frame in session.frames if frame.kind == "metering"}
-    found: dict[str, Entry] = {}
-    for entry in session.journal.entries:
-        if entry["kind"] == "frame" and entry["id"] in ids:
-            found.setdefault(entry["id"], entry)
-    return found
-
-
-def _brackets(frames: tuple[PlannedFrame, ...]) -> list[list[str]]:
-    """Return, for each shot, the frames of its bracket, shortest exposure first."""
-    shots: dict[int, list[PlannedFrame]] = {}
+def _may_saturate(frames: tuple[PlannedFrame, ...]) -> set[str]:
+    """Return the ids of metering frames, and of those with a shorter exposure in their bracket."""
+    shortest_s: dict[int, float] = {}
     for frame in frames:
-        if frame.kind == "shot":
-            shots.setdefault(frame.bench.shot, []).append(frame)
-    found = []
-    for bracket in shots.values():
-        shortest_s = min(frame.exposure_s or 0.0 for frame in bracket)
-        short = [frame.id for frame in bracket if frame.exposure_s == shortest_s]
-        longer = [frame.id for frame in bracket if frame.exposure_s != shortest_s]
-        found.append([short[0], *longer])
-    return found
+        if frame.kind == "shot" and frame.exposure_s is not None:
+            shot = frame.bench.shot
+            shortest_s[shot] = min(frame.exposure_s, shortest_s.get(shot, frame.exposure_s))
+    return {
+        frame.id
+        for frame in frames
+        if frame.kind == "metering"
+        or (frame.kind == "shot" and frame.exposure_s != shortest_s[frame.bench.shot])
+    }

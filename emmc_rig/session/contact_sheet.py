@@ -19,11 +19,11 @@ from drivers.errors import DriverError
 from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
-from emmc_rig.output import shown_bytes
+from emmc_rig.output import metrics_text, shown_bytes
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import METRICS, Session
 from emmc_rig.session.storage import write_whole
 from emmc_rig.session.timeline import (
     COLOURS,
@@ -31,6 +31,7 @@ from emmc_rig.session.timeline import (
     SHOWN_FRAMES,
     overlap,
     run_entries,
+    session_metrics,
     timeline_svg,
 )
 from emmc_rig.session.verify import counts
@@ -44,15 +45,19 @@ HEADINGS = {
     "metering": "Metering",
     "reference": "References: whiteboard, open aperture, no masks",
     "whiteboard": "Whiteboards: the pinhole before each view",
+    "open": "Open whiteboards: masks in, whole aperture",
+    "held-out": "Held out: open whiteboards that judge the calibration",
     "shot": "Shots of the scene",
 }
 
 
 def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> None:
-    """Write the page, whole or not at all; raises AppError."""
-    page = sheet(session, pictures).encode()
+    """Write the page, and metrics.json beside it, each whole or not at all; raises AppError."""
+    page = sheet(session, pictures)
+    figures = metrics_text(session_metrics(session))
     try:
-        write_whole(session.disk, path, page)
+        write_whole(session.disk, path.with_name(METRICS), figures.encode())
+        write_whole(session.disk, path, page.encode())
     except OSError as fault:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
 
@@ -141,7 +146,7 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
     left = pictures
     for kind in reversed(KINDS):
-        frames = [frame for frame in session.frames if frame.kind == kind]
+        frames = sorted((f for f in session.frames if f.kind == kind), key=_place_in_plan)
         if not frames:
             continue
         shown = _chosen(frames, left)
@@ -153,6 +158,11 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
         )
         body = "".join(_picture(session, frame) for frame in shown)
         yield kind, HEADINGS[kind], f'<div class="sheet">{body}</div>{more}'
+
+
+def _place_in_plan(frame: PlannedFrame) -> tuple:
+    """Return what frames are shown in the order of: they were taken in another one."""
+    return frame.bench.shot, frame.view or (), frame.exposure_s or 0.0, frame.repeat
 
 
 def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
-from drivers.u3v import decode_u3v
 from emmc_rig.session.journal import Entry
 
 STREAMED = ".bin"
@@ -40,6 +39,9 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
 def decode_frame(data: bytes, entry: Entry) -> RawFrame:
     """Return the frame in a session's file; entry: its journal line. Raises a `DriverError`."""
     if Path(entry["file"]).suffix == STREAMED:
+        # Its kernels take half a second to load, and most cameras write files.
+        from drivers.u3v import decode_u3v
+
         black_dn = float(entry["black_level_dn"][0][0])
         frame = decode_u3v(data, black_dn, entry["white_level_dn"])
     else:

@@ -6,8 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Kind = Literal["dark", "metering", "reference", "whiteboard", "shot"]
-KINDS: tuple[Kind, ...] = ("dark", "metering", "reference", "whiteboard", "shot")
+Kind = Literal["dark", "metering", "reference", "whiteboard", "open", "held-out", "shot"]
+KINDS: tuple[Kind, ...] = (
+    "dark",
+    "metering",
+    "reference",
+    "whiteboard",
+    "open",
+    "held-out",
+    "shot",
+)
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,16 @@ Frames are decoded one at a time and averaged or fused as they come.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.boards import BoardFrame, BoardSet
 from calibration.bracket import LinearFrame, fuse
 from calibration.frames import MeanFrame, SensorGain, average
+from calibration.routes import Outcome, calibrate
 from calibration.whiteboard import Calibration, Whiteboards, measure_psi
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
@@ -59,13 +61,11 @@ def whiteboards(session: Session) -> Whiteboards:
 
     Raises AppError where the plan has no whiteboards, no darks, or they were not all captured.
     """
-    references: dict[tuple[int, str], list[PlannedFrame]] = defaultdict(list)
+    references = _references(session)
     pinholes: dict[tuple[int, int, int, str], list[PlannedFrame]] = defaultdict(list)
     for frame in session.frames:
         shot, lamp = frame.bench.shot, frame.bench.lamp
-        if frame.kind == "reference":
-            references[shot, lamp].append(frame)
-        elif frame.kind == "whiteboard" and frame.view is not None:
+        if frame.kind == "whiteboard" and frame.view is not None:
             pinholes[shot, *frame.view, lamp].append(frame)
     if not references:
         raise AppError(f"{session.folder}: its plan has no whiteboards")
@@ -76,13 +76,57 @@ def whiteboards(session: Session) -> Whiteboards:
     )
 
 
+def board_sets(session: Session) -> tuple[BoardSet | None, BoardSet | None, BoardSet | None]:
+    """Return the whiteboards for the parametric fit, for the free route, and those held out.
+
+    None where the plan has no such frames. For the fit they are those of the open aperture, and
+    those through the pinhole as well.
+    """
+    groups: dict[tuple[str, str], list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        if frame.kind in ("open", "held-out", "whiteboard"):
+            groups[frame.kind, frame.id.rpartition("-r")[0]].append(frame)
+    if not groups:
+        raise AppError(f"{session.folder}: its plan has no whiteboards")
+    found: dict[str, list[BoardFrame]] = defaultdict(list)
+    for (kind, _), frames in groups.items():
+        bench = frames[0].bench
+        stage_um = bench.offsets_um.get("mask_x", 0.0), bench.offsets_um.get("mask_y", 0.0)
+        board = BoardFrame(_mean(session, frames), stage_um, bench.shot, frames[0].view, bench.lamp)
+        found[kind].append(board)
+    references = {key: _mean(session, frames) for key, frames in _references(session).items()}
+    darks = tuple(
+        _mean(session, [frame for frame in _darks(session) if frame.exposure_s == exposure_s])
+        for exposure_s in sorted({frame.exposure_s or 0.0 for frame in _darks(session)})
+    )
+    few = [*found["open"], *(found["whiteboard"] if found["open"] else ())]
+    fit, free, held_out = (
+        BoardSet(darks, references, tuple(frames)) if frames else None
+        for frames in (few, found["whiteboard"], found["held-out"])
+    )
+    return fit, free, held_out
+
+
+def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
+    found: dict[tuple[int, str], list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        if frame.kind == "reference":
+            found[frame.bench.shot, frame.bench.lamp].append(frame)
+    return found
+
+
 def mean_dark(session: Session) -> MeanFrame:
     """Return the average of the dark frames of the shortest exposure; raises AppError."""
+    darks = _darks(session)
+    shortest_s = min(frame.exposure_s or 0.0 for frame in darks)
+    return _mean(session, [frame for frame in darks if frame.exposure_s == shortest_s])
+
+
+def _darks(session: Session) -> list[PlannedFrame]:
     darks = [frame for frame in session.frames if frame.kind == "dark"]
     if not darks:
         raise AppError(f"{session.folder}: its plan has no darks")
-    shortest_s = min(frame.exposure_s or 0.0 for frame in darks)
-    return _mean(session, [frame for frame in darks if frame.exposure_s == shortest_s])
+    return darks
 
 
 def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
@@ -133,10 +177,48 @@ def fused_shot(
 
 
 def session_calibration(session: Session) -> Calibration:
-    """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError."""
-    camera = camera_of(session)
+    """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError.
+
+    Whiteboards of the open aperture are fitted, and judged by those held out; where there are
+    none, every coefficient is measured through the pinhole.
+    """
+    if any(frame.kind == "open" for frame in session.frames):
+        return session_outcome(session).calibration
     boards = whiteboards(session)
-    return measure_psi(boards, _designed(camera, boards.dark.mean_dn.shape))
+    return measure_psi(boards, designed_psi(session, boards.dark))
+
+
+def session_outcome(
+    session: Session,
+    routes: Sequence[str] | None = None,
+    on_stage: Callable[[str], None] = lambda name: None,
+) -> Outcome:
+    """Return Psi by the routes named, by default the parametric ones, and by the free one too
+    where its whiteboards are there; with the choice among them.
+
+    Raises AppError where the session has not what a route needs, or CalibrationError.
+    """
+    few, pinholes, held_out = board_sets(session)
+    camera = camera_of(session)
+    if routes is None:
+        routes = ("parametric", "mixed") if few is not None else ("free",)
+    wanting = [
+        what
+        for needed, there, what in (
+            ({"parametric", "mixed"} & set(routes), few, "open whiteboards"),
+            ("free" in routes, pinholes, "whiteboards through the pinhole"),
+            (True, held_out, "whiteboards held out (`held_out: true`)"),
+        )
+        if needed and there is None
+    ]
+    if wanting:
+        raise AppError(
+            f"{session.folder}: its plan has no {' and no '.join(wanting)}, which this route "
+            "needs; `emmc-rig calibrate --plan` writes a plan that has"
+        )
+    assert held_out is not None
+    design = designed_psi(session, held_out.dark)
+    return calibrate(camera, design, routes, held_out, few, pinholes, on_stage=on_stage)
 
 
 def session_readings(session: Session) -> SessionReadings:
@@ -145,13 +227,14 @@ def session_readings(session: Session) -> SessionReadings:
     Without whiteboards, by the designed Psi and the camera's own noise model, which is coarser.
     """
     dark = mean_dark(session)
-    if any(frame.kind == "whiteboard" for frame in session.frames):
+    if any(frame.kind in ("whiteboard", "open") for frame in session.frames):
         calibration = session_calibration(session)
         psi, white, gain = calibration.psi, calibration.white_dn_per_s, calibration.gain
+        good = True if calibration.good is None else calibration.good
     else:
         camera = camera_of(session)
         noise = camera.sensor.noise
-        psi = _designed(camera, dark.mean_dn.shape)
+        psi, good = designed_psi(session, dark), True
         gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
         per_second = noise.gain_dn_per_electron * noise.electrons_per_s
         white = per_second * pixel_light(camera, psi.size)
@@ -165,10 +248,13 @@ def session_readings(session: Session) -> SessionReadings:
         scale = np.where(seen, white[shot], 1.0)
         readings[shot] = linear.dn_per_s / scale
         variance[shot] = linear.variance / scale**2
-        usable[shot] = linear.usable & seen
+        usable[shot] = linear.usable & seen & good
     return SessionReadings(psi, readings, variance, usable)
 
 
-def _designed(camera: Camera, shape: tuple[int, ...]) -> ImagingMatrix:
+def designed_psi(session: Session, frame: MeanFrame) -> ImagingMatrix:
+    """Return Psi as the camera is designed, at the size of the frames captured."""
+    camera = camera_of(session)
     k = camera.sensor.binning
-    return build_imaging_matrix(camera, (shape[0] * k, shape[1] * k))
+    rows, columns = frame.mean_dn.shape
+    return build_imaging_matrix(camera, (rows * k, columns * k))

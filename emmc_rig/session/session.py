@@ -51,8 +51,8 @@ HEADER, PLAN, CAMERA, RIG, ORDER = (
     "frames.json",
 )
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
-JOURNAL, FRAMES, REPORT = "journal.jsonl", "frames", "report.html"
-KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT}
+JOURNAL, FRAMES, REPORT, METRICS = "journal.jsonl", "frames", "report.html", "metrics.json"
+KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS}
 FORMAT = 1
 
 
@@ -236,6 +236,11 @@ class Session:
         self.journal.append(entry)
         _count(self.stored, entry)
 
+    def make_ready(self) -> None:
+        """Make what a capture needs and somebody may have removed; raises `OSError`."""
+        self.disk.make_folder(self.folder / FRAMES)
+        self.disk.sync_folder(self.folder)
+
     def discard(self, frame_id: str, reason: str) -> None:
         """Count a frame as not taken; its file stays until it is taken again."""
         self.note("discarded", id=frame_id, reason=reason)
@@ -250,7 +255,11 @@ class Session:
                 leftovers.append(name)
             elif name not in KNOWN:
                 foreign.append(name)
-        for name in self.disk.sizes(self.folder / FRAMES):
+        try:
+            names = self.disk.sizes(self.folder / FRAMES)
+        except FileNotFoundError:
+            names = {}
+        for name in names:
             if is_part(name) or (name not in ours and Path(name).stem in planned):
                 leftovers.append(f"{FRAMES}/{name}")
             elif name not in ours:

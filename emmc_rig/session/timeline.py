@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from emmc_rig.session.journal import Entry
+from emmc_rig.session.session import Session
 
 BENCH = ("attend", "move", "settle", "expose", "read back", "check")
 COLOURS = {
@@ -81,6 +82,26 @@ def overlap(entries: Sequence[Entry]) -> Overlap:
         spent("write"),
         _common(bench, writes),
     )
+
+
+def session_metrics(session: Session) -> dict[str, object]:
+    """Return the figures of a session: frames, bytes, retries, and how its runs spent time."""
+    entries = session.journal.entries
+    return {
+        "title": session.header["title"],
+        "frames": len(session.frames),
+        "stored": len(session.stored),
+        "complete": session.is_complete,
+        "bytes": sum(entry["bytes"] for entry in session.stored.values()),
+        "retries": sum(entry["kind"] == "retry" for entry in entries),
+        "runs": [
+            {"frames": len(run), **asdict(told), "hidden_share": told.hidden_share}
+            for run in run_entries(entries)
+            for told in (overlap(run),)
+        ],
+        "command": session.header["command"],
+        "versions": session.header["versions"],
+    }
 
 
 def _common(ones: Sequence[Span], others: Sequence[Span]) -> float:

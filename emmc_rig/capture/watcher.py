@@ -1,0 +1,54 @@
+"""Whoever shows a capture: what the sequencer tells him, and one who shows nothing."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from drivers.raw import RawFrame
+from emmc_rig.capture.checks import Figures
+from emmc_rig.session.planned import PlannedFrame
+
+STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+
+
+class Watcher(Protocol):
+    """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
+
+    def begin(self, done: int, planned: int) -> None:
+        """So many frames are there already."""
+        ...
+
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """A step of a frame begins: one of `STEPS`."""
+        ...
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """A frame passed its checks."""
+        ...
+
+    def stored(self, frame: PlannedFrame) -> None:
+        """A frame is on the disk."""
+        ...
+
+    def tell(self, message: str) -> None:
+        """Something that people should know."""
+        ...
+
+
+class Unwatched:
+    """A watcher that shows nothing."""
+
+    def begin(self, done: int, planned: int) -> None:
+        """Ignore it."""
+
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """Ignore it."""
+
+    def stored(self, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def tell(self, message: str) -> None:
+        """Ignore it."""

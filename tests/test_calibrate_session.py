@@ -1,0 +1,97 @@
+"""A session's whiteboards to Psi: planned by `calibrate --plan`, captured, fitted, used."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from emmc_rig import cli
+from emmc_rig.capture.plan import load_plan
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.session.readings import camera_of, session_readings
+from emmc_rig.session.session import Session
+
+SIZE = (64, 96)
+RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "64x96")
+
+
+def program(*arguments):
+    """Run the program in this process and return its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    return stop.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """A folder with a plan of `calibrate --plan` and its session."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    plan = ("calibrate", "--plan", "--size", "64x96", "--out", folder / "plan")
+    assert program(*plan) == 0
+    out = folder / "session"
+    assert program("capture", folder / "plan" / "plan.yaml", *RIG, "--out", out) == 0
+    return folder
+
+
+def relative(psi, other):
+    return float(np.linalg.norm(psi.weights - other.weights) / np.linalg.norm(other.weights))
+
+
+def test_the_plan_written_is_one_that_captures(captured):
+    plan = load_plan(captured / "plan" / "plan.yaml")
+    assert plan.whiteboards is not None
+    kinds = [board.held_out for board in plan.whiteboards.open]
+    assert True in kinds
+    assert False in kinds
+    metrics = json.loads((captured / "plan" / "metrics.json").read_text())
+    planned = [one["frames"] for one in metrics["parametric"]["whiteboards"] if not one["pinhole"]]
+    assert [b.repeats for b in plan.whiteboards.open if not b.held_out] == [n for n in planned if n]
+
+
+def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
+    out = captured / "calibration"
+    assert program("calibrate", captured / "session", "--out", out) == 0
+    told = capsys.readouterr().out
+    assert "of the noise's variance" in told
+    metrics = json.loads((out / "metrics.json").read_text())
+    judged = metrics["held_out"][metrics["chosen"]]
+    assert judged["chi2"] < 1.5
+    session = Session(captured / "session")
+    design = build_imaging_matrix(camera_of(session), SIZE)
+    psi = ImagingMatrix.load(out / "psi.h5")
+    # The simulated rig's mask is neither where the design has it, nor as straight.
+    assert relative(design, psi) > 0.05
+    assert "session" in (out / "report.html").read_text()
+
+
+def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
+    found = session_readings(Session(captured / "session"))
+    psi = ImagingMatrix.load(captured / "calibration" / "psi.h5")
+    np.testing.assert_allclose(found.psi.weights, psi.weights, rtol=1e-4, atol=1e-6)
+    assert found.usable.mean() > 0.95
+    assert np.isfinite(found.readings[found.usable]).all()
+
+
+def test_a_route_without_its_whiteboards_says_which_plan_has_them(captured, capsys):
+    code = program("calibrate", captured / "session", "--route", "free", "--out", captured / "no")
+    told = capsys.readouterr().err
+    assert code == 1
+    assert "--plan" in told or "view" in told
+    assert not (captured / "no").exists()
+
+
+def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path, capsys):
+    for wrong, line in (
+        ({"shots": [3]}, "none of the 1 shots"),
+        ({"open": [{"mask_um": [0, 0], "held": True}]}, "held_out"),
+    ):
+        path = tmp_path / "plan.yaml"
+        plan = {"camera": "rgbw-bayer-1shot", "shots": [{}], "whiteboards": wrong}
+        path.write_text(yaml.safe_dump(plan))
+        assert program("capture", path, *RIG, "--out", tmp_path / "out") == 1
+        assert line in capsys.readouterr().err.replace("\n", " ")

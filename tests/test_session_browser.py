@@ -1,0 +1,58 @@
+"""The report of a session in a real browser: complete, silent, readable on a narrow screen."""
+
+import shutil
+
+import pytest
+from capture_rigs import begun, still_rig
+
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.session.contact_sheet import write_sheet
+from emmc_rig.session.session import REPORT
+from emmc_rig.session.storage import SYSTEM_DISK
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: extra `browser`")
+from selenium.webdriver.common.by import By  # noqa: E402
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+CHROMEDRIVER = shutil.which("chromedriver")
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(
+        CHROMIUM is None or CHROMEDRIVER is None, reason="needs chromium and chromedriver on PATH"
+    ),
+]
+
+
+@pytest.fixture
+def browser(tmp_path):
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM or ""
+    for option in ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"):
+        options.add_argument(option)
+    options.add_argument(f"--user-data-dir={tmp_path / 'profile'}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    yield driver
+    driver.quit()
+
+
+def test_the_report_of_a_session_shows_everything_and_asks_for_nothing(browser, tmp_path):
+    rig = still_rig()
+    session, plan = begun(tmp_path, SYSTEM_DISK, rig)
+    Sequencer(session, plan, rig).run()
+    page = session.folder / REPORT
+    write_sheet(session, page)
+    browser.get(page.as_uri())
+    pictures = browser.find_elements(By.CSS_SELECTOR, ".sheet img")
+    assert len(pictures) == len(session.frames)
+    assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)
+    assert browser.find_element(By.CSS_SELECTOR, ".card .value").text == "complete"
+    spans = browser.find_elements(By.CSS_SELECTOR, "#timeline svg rect title")
+    assert len(spans) > 6 * len(session.frames)
+    assert browser.get_log("browser") == []
+    for width in (1280, 420):
+        browser.set_window_size(width, 900)
+        wide = browser.execute_script("return document.documentElement.scrollWidth")
+        seen = browser.execute_script("return document.documentElement.clientWidth")
+        assert wide <= seen

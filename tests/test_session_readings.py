@@ -1,0 +1,143 @@
+"""From a session to readings: brackets, gains, and plans without whiteboards."""
+
+import json
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from capture_rigs import begun
+
+from emmc_rig.capture.plan import Plan, planned_camera
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.errors import AppError
+from emmc_rig.hardware import open_camera, simulated_rig
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
+from emmc_rig.scene import fine_scene
+from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
+from emmc_rig.session.readings import session_readings, whiteboards
+from simulators.clock import ManualClock
+from simulators.disk import SimulatedDisk
+from simulators.u3v import U3vCameraSimulator
+from simulators.usb import SimulatedUsb
+
+SIZE = (24, 32)
+BRIGHT = 0.08
+
+
+def captured(text):
+    """Run a plan on the simulated rig; returns its session and the camera as planned."""
+    camera = planned_camera(Plan.model_validate(yaml.safe_load(text)))
+    samples = fine_scene("near-planar", 1, 1, size=SIZE, views=camera.views).samples
+    rig, _ = simulated_rig(camera, samples, SIZE, seed=0)
+    session, plan = begun(Path("/disk"), SimulatedDisk(), rig, text)
+    assert Sequencer(session, plan, rig).run().complete
+    return session, camera
+
+
+@pytest.fixture(scope="module")
+def without_boards():
+    return captured(f"""
+camera: rgbw-bayer-1shot
+shots:
+  - {{mask_um: [0, 0], exposure_s: {BRIGHT}, repeats: 2}}
+  - {{mask_um: [0, 0], exposure_s: {BRIGHT}, gain: 4, repeats: 2}}
+  - {{mask_um: [0, 0], exposure_s: [0.005, {BRIGHT}]}}
+whiteboards: null
+darks: {{repeats: 8}}
+""")
+
+
+def test_a_plan_without_whiteboards_is_read_by_the_design(without_boards):
+    session, camera = without_boards
+    taken = session_readings(session)
+    design = build_imaging_matrix(camera, SIZE)
+    np.testing.assert_array_equal(taken.psi.weights, design.weights)
+    light_field = fine_scene("near-planar", 1, 1, size=SIZE, views=camera.views).scene.light_field
+    foretold = design.forward(light_field)
+    # The masks sit elsewhere than designed; on average the light is the same.
+    assert taken.readings.mean() == pytest.approx(foretold.mean(), rel=0.05)
+    with pytest.raises(AppError, match="has no whiteboards"):
+        whiteboards(session)
+
+
+def test_readings_do_not_depend_on_the_gain_and_their_deviation_is_true(without_boards):
+    taken = session_readings(without_boards[0])
+    for other in (1, 2):
+        score = (taken.readings[0] - taken.readings[other]) / np.sqrt(
+            taken.variance[0] + taken.variance[other]
+        )
+        assert abs(score.mean()) < 0.2
+        # The dark frames are shared, so that the difference is a little surer than foretold.
+        assert 0.85 < score.std() < 1.1
+
+
+def test_a_person_is_asked_again_only_when_something_changes():
+    camera = planned_camera(Plan.model_validate({"camera": "rgbw-bayer-2shots", "shots": [{}, {}]}))
+    asked = []
+    attendant = AskingAttendant(camera, asked.append)
+    for _ in range(3):
+        attendant.place("whiteboard")
+        attendant.set_lamp("white")
+        attendant.fit_masks(0, fitted=False)
+    attendant.fit_masks(0)
+    attendant.set_lamp("off")
+    assert asked == [
+        "put the whiteboard before the camera",
+        "switch the white lamp on",
+        "take all masks out",
+        "put in the masks mask",
+        "switch the lamp off",
+    ]
+
+
+def test_a_wish_that_failed_is_asked_again():
+    camera = planned_camera(Plan.model_validate({"camera": "conventional", "shots": [{}]}))
+    asked = []
+
+    def ask(wish):
+        asked.append(wish)
+        if len(asked) == 1:
+            raise AppError("nobody there")
+
+    attendant = AskingAttendant(camera, ask)
+    with pytest.raises(AppError):
+        attendant.set_lamp("red")
+    attendant.set_lamp("red")
+    assert asked == ["switch the red lamp on"] * 2
+
+
+def test_a_stage_file_is_looked_for_beside_the_rig_s(tmp_path):
+    (tmp_path / "stage.yaml").write_text("protocol: zaber\nport: /dev/ttyUSB0\n")
+    rig = {"stage": "stage.yaml", "camera": "ptp:", "zero_um": {"mask_x": 1.0}}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    described = rig_description(str(tmp_path / "rig.yaml"), ImagedRig(scene="dark"))
+    assert described["stage"] == str(tmp_path / "stage.yaml")
+    assert RealRig.model_validate({k: v for k, v in described.items() if k != "kind"}).by_hand
+
+
+def test_a_misspelt_key_of_a_rig_names_the_nearest(tmp_path):
+    (tmp_path / "rig.yaml").write_text("stage: simulated\ncamera: simulated\nzero: {}\n")
+    with pytest.raises(AppError, match="did you mean 'zero_um'"):
+        rig_description(str(tmp_path / "rig.yaml"), ImagedRig(scene="dark"))
+    assert rig_description(SIMULATED, ImagedRig(scene="dark"))["scene"] == "dark"
+
+
+def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
+    """USB3 Vision: the file holds leader, payload and trailer, the journal what they do not say."""
+    rng = np.random.default_rng(0)
+    scene = rng.integers(64, 4000, (48, 64)).astype(np.uint16)
+    clock = ManualClock()
+    bus = SimulatedUsb(clock, U3vCameraSimulator(lambda exposure_s: scene, clock, scene.shape))
+    with closing(open_camera("u3v:", clock, bus)) as camera:
+        camera.set_exposure_s(0.02)
+        frame = camera.snap()
+    assert suffix_of(frame) == ".bin"
+    entry = json.loads(json.dumps({"file": f"00000-x{suffix_of(frame)}", **frame_facts(frame)}))
+    back = decode_frame(frame.original, entry)
+    np.testing.assert_array_equal(back.mosaic, frame.mosaic)
+    np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
+    assert (back.cfa, back.white_level_dn) == (frame.cfa, frame.white_level_dn)
+    assert (back.exposure_s, back.gain) == (frame.exposure_s, frame.gain)

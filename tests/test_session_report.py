@@ -1,0 +1,150 @@
+"""What a session shows of itself: timeline, contact sheet, terminal, and what it costs."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_rigs import begun, still_rig
+from rich.console import Console
+
+from emmc_rig import session_benchmark
+from emmc_rig.capture.checks import figures
+from emmc_rig.capture.control import Control
+from emmc_rig.capture.display import CaptureDisplay
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.frame_view import thinned
+from emmc_rig.session.contact_sheet import sheet
+from emmc_rig.session.session import Session
+from emmc_rig.session.storage import SYSTEM_DISK
+from emmc_rig.session.timeline import overlap, run_entries, timeline_svg
+from simulators.disk import SimulatedDisk
+from simulators.still import StillStage
+
+ROOT = Path("/disk")
+
+
+def entry(name, run=1, **spans):
+    spans_s = {key.replace("_", " "): list(span) for key, span in spans.items()}
+    return {"kind": "frame", "id": name, "run": run, "spans_s": spans_s}
+
+
+def test_writing_counts_as_hidden_only_while_the_bench_works():
+    entries = [
+        entry("a", move=(0, 1), expose=(1, 2), write=(2, 5)),
+        entry("b", move=(2.5, 4), expose=(4, 4.5), write=(5, 6)),
+    ]
+    told = overlap(entries)
+    assert told.seconds == 6
+    assert told.moving_s == 2.5
+    assert told.exposing_s == 1.5
+    assert told.writing_s == 4
+    assert told.hidden_s == 2
+    assert told.hidden_share == 0.5
+
+
+def test_runs_are_told_apart_and_other_lines_passed_over():
+    entries = [entry("a", 1, write=(0, 1)), {"kind": "retry"}, entry("b", 2, write=(0, 1))]
+    assert [[e["id"] for e in run] for run in run_entries(entries)] == [["a"], ["b"]]
+
+
+def test_the_timeline_draws_every_span_in_its_lane():
+    svg = timeline_svg([entry("a<b", move=(0, 1), expose=(1, 2), write=(2, 3))])
+    assert svg.count("<title>") == 3
+    assert "a&lt;b: move, 1000.0 ms" in svg
+    assert timeline_svg([]) == ""
+
+
+@pytest.fixture
+def captured(tmp_path):
+    rig = still_rig()
+    session, plan = begun(tmp_path, SYSTEM_DISK, rig)
+    Sequencer(session, plan, rig).run()
+    return session
+
+
+def test_the_contact_sheet_shows_what_is_missing_and_what_is_damaged(captured):
+    captured.discard("shot-0-e0-r0", "for the test")
+    path = captured.path_of(captured.stored["shot-1-e0-r0"])
+    path.write_bytes(path.read_bytes()[:-9])
+    page = sheet(Session(captured.folder))
+    assert "not captured" in page
+    assert "is damaged" in page
+    assert "not complete" in page
+    assert page.count("<img ") == len(captured.frames) - 2
+
+
+def test_a_contact_sheet_of_few_pictures_says_so(captured):
+    page = sheet(captured, pictures=4)
+    assert page.count("<img ") == 4
+    assert "of 4 are shown" in page
+
+
+def test_a_page_shows_names_as_text(captured):
+    captured.note("retry", id="<b>", fault="<script>alert(1)</script>", attempt=1, at_s=0.0)
+    page = sheet(captured)
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+
+
+def test_a_terminal_shows_the_bar_the_histogram_and_the_saturation():
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=120, height=30)
+    display = CaptureDisplay(console, Control())
+    rig = still_rig()
+    session, plan = begun(ROOT, SimulatedDisk(), rig)
+    with display.shown():
+        Sequencer(session, plan, rig, display).run()
+    text = out.getvalue()
+    assert f"{len(session.frames)}/{len(session.frames)}" in text
+    assert "saturated 0.00%" in text
+    for colour in ("red", "green", "blue"):
+        assert colour in text
+
+
+def test_thinning_keeps_the_places_of_the_colours_and_the_figures():
+    rows, columns = np.indices((400, 600))
+    mosaic = (1000 * (rows % 2) + 100 * (columns % 2) + 5).astype(np.uint16)
+    few = thinned(mosaic, 10_000)
+    assert 5_000 < few.size < 40_000
+    for i in (0, 1):
+        for j in (0, 1):
+            assert (few[i::2, j::2] == mosaic[i, j]).all()
+
+
+def test_the_figures_of_a_frame_are_its_saturation_mean_and_brightest():
+    frame = session_benchmark._frame((100, 120), 0)
+    dn = frame.mosaic.astype(float)
+    found = figures(frame)
+    assert found.mean_dn == pytest.approx(dn.mean() - 256)
+    assert found.bright_dn == pytest.approx(np.percentile(dn, 99.9) - 256, abs=2)
+    assert found.saturated == 0
+
+
+def test_the_benchmark_measures_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_benchmark, "LARGE_SHAPE", (40, 60))
+    monkeypatch.setattr(session_benchmark, "MOVE_S", 0.0)
+    small, large = session_benchmark.overheads(tmp_path, 8)
+    for one in (small, large):
+        assert one.shots == 8
+        assert one.sequencing_ms > 0
+        assert 0 <= one.hidden_share <= 1
+    rates = session_benchmark.verification(tmp_path, 3)
+    assert rates.megabytes == pytest.approx(3 * 40 * 60 * 2 / 1e6, rel=0.2)
+    assert rates.share > 0
+    assert session_benchmark.listing_seconds(tmp_path, 5) > 0
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_still_stage_refuses_what_a_real_one_would():
+    from drivers.errors import LimitExceededError, NotHomedError
+    from simulators.clock import ManualClock
+
+    stage = StillStage(("x",), ManualClock(), move_s=0.5)
+    with pytest.raises(NotHomedError):
+        stage.move_to_um({"x": 1.0})
+    stage.home()
+    with pytest.raises(LimitExceededError):
+        stage.move_to_um({"x": -1.0})
+    assert stage.move_to_um({"x": 7.0}) == {"x": 7.0}
+    assert stage.position_um("x") == 7.0
