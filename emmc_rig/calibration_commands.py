@@ -80,7 +80,7 @@ def calibrate(
         map_stage=stage,
     )
     if check is not None:
-        from emmc_rig.calibration_check import run_checks
+        from emmc_rig.calibration_checks.command import run_checks
 
         with result_folder(out) as folder:
             metrics = run_checks(settings, check, folder)
