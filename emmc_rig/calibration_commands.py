@@ -47,7 +47,7 @@ def calibrate(
         float, typer.Option("--target", help="relative error of Psi to plan for")
     ] = 0.005,
     rays: Annotated[
-        int, typer.Option("--rays", min=16, help="rays per view of the simulated bench")
+        int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
     stage: Annotated[
         bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
