@@ -40,6 +40,8 @@ CHUNK = 4096
 FIRST_WINDOW_PX = 64
 DECIDED = 0.7
 """Of the prior's deviation: a parameter told no better stays at the design."""
+LEAST_GAIN = 0.01
+"""Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 MOST_MORE = 200
 LEAST_FIT_CORRELATION = 0.7
 OFFSETS = slice(0, 2)
@@ -379,7 +381,7 @@ def _descend(
         history.append(normal.spread)
         if on_step is not None:
             on_step(normal.spread)
-        if size < settings.tolerance or found > value:
+        if size < settings.tolerance or value - found < LEAST_GAIN:
             return placement, step + 1, True, normal
     return placement, settings.max_steps, False, normal
 

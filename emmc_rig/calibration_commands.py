@@ -51,7 +51,7 @@ def calibrate(
         float, typer.Option("--target", help="relative error of Psi to plan for")
     ] = 0.005,
     rays: Annotated[
-        int, typer.Option("--rays", min=16, help="rays per view of the simulated bench")
+        int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
     stage: Annotated[
         bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
@@ -89,7 +89,7 @@ def calibrate(
         map_stage=stage,
     )
     if check is not None:
-        from emmc_rig.calibration_check import run_checks
+        from emmc_rig.calibration_checks.command import run_checks
 
         with result_folder(out) as folder:
             metrics = run_checks(settings, check, folder)

@@ -46,7 +46,7 @@ from emmc_rig.stage_config import (
     parse_stage,
 )
 from simulators.apt import AptController
-from simulators.bench import Bench
+from simulators.bench import RAYS_PER_VIEW, Bench
 from simulators.clock import ManualClock
 from simulators.firmware import SimulatedController
 from simulators.grbl import GrblController
@@ -143,6 +143,7 @@ def simulated_rig(
     size: tuple[int, int],
     seed: int,
     clock: Clock | None = None,
+    rays_per_view: int = RAYS_PER_VIEW,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 

@@ -12,7 +12,8 @@ from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig import cli
 from emmc_rig.calibrate import CalibrateSettings, psi_error, run_calibrate, run_calibration
-from emmc_rig.calibration_check import moved_truth, run_checks
+from emmc_rig.calibration_checks.command import run_checks
+from emmc_rig.calibration_checks.scenes import moved_truth
 from emmc_rig.calibration_report import write_calibration_report
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.drift import run_drift

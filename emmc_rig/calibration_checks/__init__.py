@@ -1,0 +1,1 @@
+"""Measurements of the calibration on the simulated bench, against its targets."""
