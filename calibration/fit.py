@@ -366,8 +366,7 @@ def _descend(
         while True:
             matrix = normal.matrix + np.diag(prior)
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            move = np.linalg.solve(matrix, normal.gradient + pull)
-            trial = placement.moved(move)
+            trial = _stepped(placement, matrix, normal.gradient + pull)
             found = _posterior(mask, trial, samples, normal.spread, prior, centre)
             if found <= value or damping > 1e6:
                 break
@@ -384,6 +383,21 @@ def _descend(
         if size < settings.tolerance or value - found < LEAST_GAIN:
             return placement, step + 1, True, normal
     return placement, settings.max_steps, False, normal
+
+
+def _stepped(placement: Placement, matrix: Array, gradient: Array) -> Placement:
+    """Return the placement after a step; one that meets a limit lets the others move without it."""
+    here = placement.vector()
+    move = np.linalg.solve(matrix, gradient)
+    trial = placement.moved(move)
+    held = np.abs(trial.vector() - here - move) > 1e-12
+    if not held.any():
+        return trial
+    free = ~held
+    move[held] = (trial.vector() - here)[held]
+    rest = gradient[free] - matrix[np.ix_(free, held)] @ move[held]
+    move[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
+    return placement.moved(move)
 
 
 def _contrast(board: Board) -> float:

@@ -23,7 +23,7 @@ from rich.table import Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
-from emmc_rig.calibration_commands import calibrate
+from emmc_rig.calibrate.cli import calibrate
 from emmc_rig.capture.cli import CaptureStoppedError, capture
 from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError

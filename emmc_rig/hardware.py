@@ -149,7 +149,8 @@ def simulated_rig(
 
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. A frame that is
-    announced by its name has its own noise, whatever was exposed before it.
+    announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
+    pixel; few are quick, and grainy beside a good sensor's noise.
     """
     clock = clock or ManualClock()
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
@@ -169,7 +170,10 @@ def simulated_rig(
         }
 
     window_um = 2 * aperture_um
-    bench = Bench(camera, fine_scene, size, positions_um, window_um, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    bench = Bench(
+        camera, fine_scene, size, positions_um, window_um, rng, rays_per_view=rays_per_view
+    )
     stage = ZaberStage(
         chain.transport(),
         STAGE_AXES,

@@ -15,6 +15,7 @@ from emmc_rig.hardware import Rig, open_camera, open_stage, simulated_rig
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings, read_yaml, validated
 from emmc_rig.scene import fine_scene
+from simulators.bench import RAYS_PER_VIEW
 
 SIMULATED = "simulated"
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
@@ -39,12 +40,16 @@ class RealRig(Settings):
 
 
 class ImagedRig(Settings):
-    """The simulated rig before a scene; size: rows and columns of the light field."""
+    """The simulated rig before a scene; size: rows and columns of the light field.
+
+    rays: per view and pixel; calibration to a per cent needs 1024 or more.
+    """
 
     scene: str
     size: tuple[int, int] | None = None
     seed: int = Field(default=0, ge=0)
     real_time: bool = False
+    rays: int = Field(default=RAYS_PER_VIEW, ge=16)
 
 
 class AskingAttendant:
@@ -129,7 +134,9 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         )
         height, width = fine.scene.light_field.shape[2:4]
         clock = SYSTEM_CLOCK if imaged.real_time else None
-        yield simulated_rig(camera, fine.samples, (height, width), imaged.seed, clock)[0]
+        yield simulated_rig(camera, fine.samples, (height, width), imaged.seed, clock, imaged.rays)[
+            0
+        ]
         return
     real = validated(RealRig, settings, "the rig", AppError)
     with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:

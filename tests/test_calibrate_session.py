@@ -13,9 +13,10 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session.readings import camera_of, session_readings
 from emmc_rig.session.session import Session
+from simulators.bench import MountingErrors
 
-SIZE = (64, 96)
-RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "64x96")
+SIZE = (32, 48)
+RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "32x48", "--rays", "1024")
 
 
 def program(*arguments):
@@ -31,7 +32,7 @@ def program(*arguments):
 def captured(tmp_path_factory):
     """A folder with a plan of `calibrate --plan` and its session."""
     folder = tmp_path_factory.mktemp("calibrated")
-    plan = ("calibrate", "--plan", "--size", "64x96", "--out", folder / "plan")
+    plan = ("calibrate", "--plan", "--size", "32x48", "--out", folder / "plan")
     assert program(*plan) == 0
     out = folder / "session"
     assert program("capture", folder / "plan" / "plan.yaml", *RIG, "--out", out) == 0
@@ -60,12 +61,15 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     assert "of the noise's variance" in told
     metrics = json.loads((out / "metrics.json").read_text())
     judged = metrics["held_out"][metrics["chosen"]]
-    assert judged["chi2"] < 1.5
+    assert judged["relative_error"] < 0.01
+    found = {name: one["value"] for name, one in metrics["parameters"].items()}
+    errors = MountingErrors()
+    assert (found["offset_x_um"], found["offset_y_um"]) == pytest.approx(errors.offset_um, abs=0.2)
+    assert np.degrees(found["rotation_rad"]) == pytest.approx(errors.rotation_deg, abs=0.01)
     session = Session(captured / "session")
     design = build_imaging_matrix(camera_of(session), SIZE)
     psi = ImagingMatrix.load(out / "psi.h5")
-    # The simulated rig's mask is neither where the design has it, nor as straight.
-    assert relative(design, psi) > 0.05
+    assert relative(design, psi) > 10 * judged["relative_error"]
     assert "session" in (out / "report.html").read_text()
 
 

@@ -15,14 +15,14 @@ from calibration.placement import designed_placement, labels
 from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.whiteboard_bench import (
+from emmc_rig.calibrate.bench import (
     HARSH_OPTICS,
     HARSH_SENSOR,
     BenchTruth,
     Setting,
     WhiteboardBench,
 )
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from simulators.bench import MountingErrors
 
 SIZE = (44, 60)

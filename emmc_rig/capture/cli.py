@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from emmc_rig.rig_config import ImagedRig
 
 OptionalPath = Path | None
 
@@ -38,6 +41,9 @@ def capture(
         str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
+    rays: Annotated[
+        int, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
+    ] = 128,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
     ] = False,
@@ -59,7 +65,13 @@ def capture(
         return
     if plan is None:
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
-    _run(plan, rig, scene, size, seed, real_time, dry_run, out)
+    from emmc_rig.output import parse_size
+    from emmc_rig.rig_config import ImagedRig
+
+    imaged = ImagedRig(
+        scene=scene, size=parse_size(size), seed=seed, real_time=real_time, rays=rays
+    )
+    _run(plan, rig, imaged, dry_run, out)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -74,10 +86,7 @@ def _write_plan(name: str, path: Path) -> None:
 def _run(
     plan: Path,
     rig: str | None,
-    scene: str,
-    size: str | None,
-    seed: int,
-    real_time: bool,
+    imaged: ImagedRig,
     dry_run: bool,
     out: Path | None,
 ) -> None:
@@ -85,12 +94,11 @@ def _run(
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
-    from emmc_rig.output import parse_size, shown_bytes, shown_seconds
-    from emmc_rig.rig_config import ImagedRig, rig_description
+    from emmc_rig.output import shown_bytes, shown_seconds
+    from emmc_rig.rig_config import rig_description
     from emmc_rig.session.contact_sheet import quick_pictures, write_sheet
     from emmc_rig.session.session import REPORT, is_session
 
-    imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time)
     chosen = None if rig is None else rig_description(rig, imaged)
     if is_session(plan):
         wish = wish_from_session(plan, chosen)

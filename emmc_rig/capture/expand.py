@@ -113,7 +113,7 @@ def _boards(plan: Plan, camera: Camera) -> Iterator[PlannedFrame]:
     for shot in shots:
         if shot >= len(camera.shots):
             raise AppError(
-                f"whiteboards.shots: {shot} is none of the {len(camera.shots)} shots, counted from 0"
+                f"whiteboards.shots: {shot} is none of the {len(camera.shots)} shots, from 0"
             )
     # The pinhole lets one view's light pass, the reference that of all.
     light = float(rows * columns)

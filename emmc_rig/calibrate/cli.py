@@ -60,10 +60,10 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
 ) -> None:
     """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
-    from emmc_rig.calibrate import CalibrateSettings, run_calibrate, write_plan
+    from emmc_rig.calibrate.bench import BenchTruth
+    from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import result_folder
-    from emmc_rig.whiteboard_bench import BenchTruth
 
     if drift is not None:
         _judge_drift(known, drift, out)
@@ -89,7 +89,7 @@ def calibrate(
         map_stage=stage,
     )
     if check is not None:
-        from emmc_rig.calibration_checks.command import run_checks
+        from emmc_rig.calibrate.checks.command import run_checks
 
         with result_folder(out) as folder:
             metrics = run_checks(settings, check, folder)
@@ -128,7 +128,7 @@ def calibrate(
 
 
 def _calibrate_session(path: Path, route: str, out: Path) -> None:
-    from emmc_rig.calibrate import calibrate_session
+    from emmc_rig.calibrate.run import calibrate_session
     from emmc_rig.cli import Bars, shown_progress
     from emmc_rig.output import result_folder
     from emmc_rig.session.session import Session
@@ -150,7 +150,7 @@ def _calibrate_session(path: Path, route: str, out: Path) -> None:
 
 
 def _judge_drift(known: Path, frames: Path, out: Path) -> None:
-    from emmc_rig.drift import run_drift
+    from emmc_rig.calibrate.drift import run_drift
     from emmc_rig.output import result_folder
 
     with result_folder(out) as folder:

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from calibration.boards import as_readings
 from calibration.sensor import Pair, characterise
 from calibration.stage_map import locate
-from emmc_rig.calibrate import (
+from emmc_rig.calibrate.bench import (
+    Setting,
+    StageFaults,
+    WhiteboardBench,
+)
+from emmc_rig.calibrate.checks.rows import Row, judged
+from emmc_rig.calibrate.run import (
     CalibrateSettings,
     measured_stage,
     run_calibration,
     true_parameters,
 )
-from emmc_rig.calibration_checks.rows import Row, judged
 from emmc_rig.demo import Silent
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.whiteboard_bench import (
-    Setting,
-    StageFaults,
-    WhiteboardBench,
-)
 
 Array = NDArray[np.floating]
 FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)

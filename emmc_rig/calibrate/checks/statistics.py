@@ -23,7 +23,13 @@ from calibration.placement import (
 from calibration.planning import REFERENCE_FRAMES
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import measure_psi
-from emmc_rig.calibrate import (
+from emmc_rig.calibrate.bench import (
+    HARSH_SENSOR,
+    Setting,
+    WhiteboardBench,
+)
+from emmc_rig.calibrate.checks.rows import Row, judged
+from emmc_rig.calibrate.run import (
     CalibrateSettings,
     few_settings,
     free_route_error,
@@ -32,13 +38,7 @@ from emmc_rig.calibrate import (
     plan_light,
     soft_design,
 )
-from emmc_rig.calibration_checks.rows import Row, judged
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
-from emmc_rig.whiteboard_bench import (
-    HARSH_SENSOR,
-    Setting,
-    WhiteboardBench,
-)
 
 Array = NDArray[np.floating]
 FITS, PSI_FITS = 16, 4

@@ -31,7 +31,9 @@ from calibration.sensor import SensorSheet, characterise
 from calibration.shadow import ShadowMask, shadow_mask
 from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
-from emmc_rig.calibration_report import write_calibration_report
+from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
+from emmc_rig.calibrate.drift import CALIBRATION, PSI
+from emmc_rig.calibrate.report import write_calibration_report
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Boards,
@@ -41,14 +43,12 @@ from emmc_rig.capture.plan import (
     PlannedShot,
 )
 from emmc_rig.demo import Silent, Watcher
-from emmc_rig.drift import CALIBRATION, PSI
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.session.readings import session_outcome
 from emmc_rig.session.session import Session
-from emmc_rig.whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
 PLAN, REPORT = "plan.yaml", "report.html"
 PLAN_HEAD = """\

@@ -16,11 +16,11 @@ from calibration.frames import MeanFrame
 from calibration.parametric import coefficient_planes
 from calibration.shadow import Shadow, shadow_mask
 from calibration.whiteboard import Whiteboards, measured_planes
-from emmc_rig.calibrate import (
+from emmc_rig.calibrate.checks.rows import Row, judged
+from emmc_rig.calibrate.run import (
     CalibrateSettings,
     soft_design,
 )
-from emmc_rig.calibration_checks.rows import Row, judged
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import psi_layout
 

@@ -7,17 +7,17 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from emmc_rig.calibrate import CalibrateSettings
-from emmc_rig.calibration_checks.bench import check_psi, check_sensor, check_stage
-from emmc_rig.calibration_checks.large import check_large
-from emmc_rig.calibration_checks.rows import Row
-from emmc_rig.calibration_checks.scenes import (
+from emmc_rig.calibrate.checks.bench import check_psi, check_sensor, check_stage
+from emmc_rig.calibrate.checks.large import check_large
+from emmc_rig.calibrate.checks.rows import Row
+from emmc_rig.calibrate.checks.scenes import (
     check_alarms,
     check_cost,
     check_drift,
     check_frames,
 )
-from emmc_rig.calibration_checks.statistics import check_bound, check_plan
+from emmc_rig.calibrate.checks.statistics import check_bound, check_plan
+from emmc_rig.calibrate.run import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.output import command_line, versions, write_metrics
 

@@ -68,7 +68,7 @@ def write_calibration_report(
         sections.append(("stage", "Stage map", _stage(stage)))
     sections.append(("provenance", "Provenance", _provenance(metrics)))
     report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
-    template = resources.files("emmc_rig").joinpath("calibration_page.html").read_text("utf-8")
+    template = resources.files("emmc_rig.calibrate").joinpath("page.html").read_text("utf-8")
     style = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
     assert style is not None
     parts = {

@@ -18,7 +18,12 @@ from calibration.residuals import ResidualCheck, check_residuals
 from calibration.routes import calibrate
 from calibration.shadow import Shadow, shadow_mask
 from calibration.whiteboard import Calibration
-from emmc_rig.calibrate import (
+from emmc_rig.calibrate.bench import (
+    BenchTruth,
+    WhiteboardBench,
+)
+from emmc_rig.calibrate.checks.rows import Row, judged
+from emmc_rig.calibrate.run import (
     CalibrateSettings,
     few_settings,
     free_settings,
@@ -26,16 +31,11 @@ from emmc_rig.calibrate import (
     parametric_plan,
     plan_light,
 )
-from emmc_rig.calibration_checks.rows import Row, judged
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.scene import fine_scene
-from emmc_rig.whiteboard_bench import (
-    BenchTruth,
-    WhiteboardBench,
-)
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
