@@ -37,7 +37,7 @@ class TexturePrior:
     brightness, and that of a chrominance over that of luminance. The first is next to flat.
     """
 
-    length_px: float = 4.0
+    length_px: float = 3.0
     blur_px: float = 0.7
     kinds: tuple[tuple[float, float], ...] = (
         (3e-5, 0.1),
@@ -48,7 +48,7 @@ class TexturePrior:
         (4e-1, 0.2),
         (4e-1, 0.03),
     )
-    freedom: float = 4.0
+    freedom: float = 3.0
 
     def covariance(self, square_px: Array) -> Array:
         """Return the correlation of points at a squared distance, 1 at 0 (any shape)."""

@@ -1,9 +1,4 @@
-"""The texture of known surfaces: what explains the frames and survives removing noise.
-
-Half-quadratic splitting: with the noise that is still presumed in the texture falling from step to
-step, remove it (`shrinkage`), then fit the frames again, min 1/2 |S^-1/2 (Psi W T - I)|^2 +
-|T - Z|^2 / (2 sigma^2) by conjugate gradients, S the variance of each reading.
-"""
+"""The texture of known surfaces: its fit to the frames, and what lies behind the nearest ones."""
 
 from __future__ import annotations
 
@@ -14,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.shrinkage import denoised
 
 Array32 = NDArray[np.float32]
 
@@ -45,6 +39,9 @@ def fitted(
     surfaces: Surfaces, frames: Array32, precision: Array32, prior: Array32, sigma: float, steps: int
 ) -> Array32:
     """Return the texture (layer, c, y, x) near `prior`, deviation sigma, that explains the frames.
+
+    The minimiser of 1/2 |S^-1/2 (Psi W T - I)|^2 + |T - prior|^2 / (2 sigma^2), S the variance of
+    each reading: the mean of T given the frames, if its prior is Gaussian.
 
     precision: (shot, pixel_y, pixel_x), the inverse variance of each reading, 0 to leave it out.
     """

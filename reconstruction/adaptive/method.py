@@ -1,0 +1,130 @@
+"""The adaptive method: disparities by evidence, then the texture of the surfaces they make.
+
+1. A smooth picture is what all models start from.
+2. Patches judge disparities by the likelihood of their readings (`evidence`, `search`), and agree
+   with their neighbours (`labels`).
+3. The centre view's disparity is carried to all views (`visibility`), so that the frames are
+   linear in the surfaces' texture (`rays`).
+4. The texture is fitted to all frames at once, with what repeats in the scene as prior, and the
+   disparity is sharpened per pixel on the way (`joint`, `texture`, `shrinkage`, `refine`).
+
+Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings
+from reconstruction.adaptive import search
+from reconstruction.adaptive.joint import TextureSettings, solve
+from reconstruction.choices import smooth_guess
+from reconstruction.inputs import checked_inputs
+from reconstruction.result import Progress, Reconstruction
+
+Array = NDArray[np.floating]
+
+
+class AdaptiveSettings(Settings):
+    """Settings of the adaptive method."""
+
+    furthest_px: float = Field(
+        default=24.0, gt=0, description="largest disparity searched, to both sides"
+    )
+    step_px: float = Field(default=0.125, gt=0, description="between disparities judged")
+    stride: int = Field(default=4, ge=1, description="pixels between patches that judge")
+    slope_px: float = Field(
+        default=0.025, gt=0, description="mean change of the disparity per pixel on one surface"
+    )
+    jump: float = Field(
+        default=0.02, gt=0, lt=1, description="probability that neighbouring patches differ freely"
+    )
+    misfit: float = Field(
+        default=0.003, ge=0, description="deviation of readings that no model explains"
+    )
+    nearer: Literal["larger", "smaller"] = Field(
+        default="larger", description="disparity of what is in front; pictures may be flipped"
+    )
+    texture: TextureSettings = Field(default_factory=TextureSettings)
+
+
+def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
+    """Return the settings of `adaptive-fast`: coarser patches, fewer steps."""
+    quick = settings.texture.model_copy(update={"steps": 5, "block_step": 6, "reach": 6})
+    return settings.model_copy(update={"step_px": 0.25, "stride": 6, "texture": quick})
+
+
+def reconstruct_adaptive(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    settings: AdaptiveSettings | None = None,
+    usable: NDArray[np.bool_] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Reconstruction:
+    """Return the light field of the surfaces and textures that the frames speak for.
+
+    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
+    deviation. usable: pixels to fit (default all). Raises ReconstructionError for inputs that do
+    not fit each other.
+    """
+    settings = settings or AdaptiveSettings()
+    started = clock()
+    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    total = settings.texture.steps + 2
+
+    def tell(step: int) -> None:
+        if on_step is not None:
+            on_step(Progress(step, None, None, total))
+
+    picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
+    variance = np.full(frames.shape, noise_sigma**2 + settings.misfit**2, dtype=np.float32)
+    flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
+    k = psi.binning
+    grey = picture.mean(axis=-1)
+    brightness = grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3))
+    data = search.Data(psi, frames - psi.forward(flat), variance, usable, brightness)
+    rough = search.coarse(data, settings.furthest_px, settings.slope_px, settings.jump)
+    tell(1)
+    volume = search.fine(
+        data, rough, settings.stride, settings.step_px, settings.slope_px, settings.jump
+    )
+    centre = search.per_pixel(volume, psi.size, k)
+    searched_s = clock() - started
+    tell(2)
+    precision = np.where(usable, 1 / variance, 0).astype(np.float32)
+    found = solve(
+        psi,
+        centre,
+        1 if settings.nearer == "larger" else -1,
+        frames,
+        precision,
+        picture,
+        settings.texture,
+        on_step=lambda step: tell(2 + step),
+    )
+    return Reconstruction(
+        method="adaptive",
+        light_field=np.clip(found.surfaces.light_field(found.texture), 0, 1),
+        status="converged",
+        advice="",
+        steps=settings.texture.steps,
+        objective=(),
+        seconds=clock() - started,
+        parameters={
+            "noise_sigma": noise_sigma,
+            "lowest_px": float(found.centre.min()),
+            "highest_px": float(found.centre.max()),
+            "disparities": len(volume.disparities),
+            "search_seconds": searched_s,
+        },
+        maps={"disparity": found.centre},
+    )
