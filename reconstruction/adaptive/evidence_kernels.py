@@ -170,7 +170,9 @@ def _fill(sums, known, seen, strength, chroma, matrix):
                 a, b = seen[i], seen[j]
                 for lane in range(lanes):
                     same = np.float32(1.0) if a[lane] == b[lane] else np.float32(0.0)
-                    row[lane] = strength[lane] * grey[lane] * (third + chroma[lane] * (same - third))
+                    row[lane] = (
+                        strength[lane] * grey[lane] * (third + chroma[lane] * (same - third))
+                    )
             else:
                 tint = sums[1, first]
                 for lane in range(lanes):

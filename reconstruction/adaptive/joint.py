@@ -37,7 +37,7 @@ class TextureSettings(Settings):
     last_noise: float = Field(default=0.01, gt=0, description="and at last")
     momentum: float = Field(default=0.5, ge=0, lt=1)
     threshold: float = Field(default=2.0, gt=0, description="of coefficients, in deviations")
-    chroma: float = Field(default=2.5, gt=0, description="that of chrominance over luminance")
+    chroma: float = Field(default=1.4, gt=0, description="that of chrominance over luminance")
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
     fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
@@ -120,8 +120,9 @@ def solve(
             )
             padded = np.clip(padded, -furthest, furthest)
             surfaces = surfaces_of(psi, padded, margin, nearer)
-        before, now = now, fitted(
-            surfaces, frames, precision, clean, float(sigma), settings.fit_steps
+        before, now = (
+            now,
+            fitted(surfaces, frames, precision, clean, float(sigma), settings.fit_steps),
         )
         if on_step is not None:
             on_step(step + 1)

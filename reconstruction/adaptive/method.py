@@ -24,12 +24,19 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
+from reconstruction.adaptive.free import freed, misfit
 from reconstruction.adaptive.joint import TextureSettings, solve
+from reconstruction.adaptive.models import MODELS, model_map
+from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import smooth_guess
 from reconstruction.inputs import checked_inputs
 from reconstruction.result import Progress, Reconstruction
 
 Array = NDArray[np.floating]
+UNDECIDED = 0.25
+"""Share of deciding patches among the textured ones below which the evidence is called flat."""
+MISFIT = 4.0
+"""Times the noise by which readings may be missed before Psi is doubted."""
 
 
 class AdaptiveSettings(Settings):
@@ -47,12 +54,15 @@ class AdaptiveSettings(Settings):
         default=0.02, gt=0, lt=1, description="probability that neighbouring patches differ freely"
     )
     misfit: float = Field(
-        default=0.003, ge=0, description="deviation of readings that no model explains"
+        default=0.0015, gt=0, description="deviation of readings that no model explains"
     )
     nearer: Literal["larger", "smaller"] = Field(
         default="larger", description="disparity of what is in front; pictures may be flipped"
     )
     texture: TextureSettings = Field(default_factory=TextureSettings)
+    free: bool = Field(
+        default=True, description="let total variation decide where no surface explains the frames"
+    )
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
@@ -79,7 +89,7 @@ def reconstruct_adaptive(
     settings = settings or AdaptiveSettings()
     started = clock()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    total = settings.texture.steps + 2
+    total = settings.texture.steps + 3
 
     def tell(step: int) -> None:
         if on_step is not None:
@@ -100,23 +110,39 @@ def reconstruct_adaptive(
     centre = search.per_pixel(volume, psi.size, k)
     searched_s = clock() - started
     tell(2)
-    precision = np.where(usable, 1 / variance, 0).astype(np.float32)
+    held = held_out(usable)
     found = solve(
         psi,
         centre,
         1 if settings.nearer == "larger" else -1,
         frames,
-        precision,
+        np.where(usable & ~held, 1 / variance, 0).astype(np.float32),
         picture,
         settings.texture,
         on_step=lambda step: tell(2 + step),
     )
+    light_field = np.clip(found.surfaces.light_field(found.texture), 0, 1)
+    sure = deviation(found, frames, noise_sigma, held)
+    missed = frames - found.surfaces.forward(found.texture)
+    unexplained = misfit(psi, missed, noise_sigma, usable)
+    if settings.free:
+        light_field = freed(psi, frames, noise_sigma, usable, light_field, unexplained)
+    tell(total)
+    maps = {
+        "disparity": found.centre,
+        "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
+        "model": model_map(volume, found, unexplained, k),
+    }
+    if sure is not None:
+        maps["sigma"] = sure.sigma
+    shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
+    judged = _judgement(settings, volume, missed, usable, noise_sigma)
     return Reconstruction(
         method="adaptive",
-        light_field=np.clip(found.surfaces.light_field(found.texture), 0, 1),
-        status="converged",
-        advice="",
-        steps=settings.texture.steps,
+        light_field=light_field,
+        status="doubtful" if judged else "converged",
+        advice="; ".join(judged),
+        steps=total,
         objective=(),
         seconds=clock() - started,
         parameters={
@@ -125,6 +151,42 @@ def reconstruct_adaptive(
             "highest_px": float(found.centre.max()),
             "disparities": len(volume.disparities),
             "search_seconds": searched_s,
+            "held_readings": int(held.sum()),
+            **{
+                f"share_{name.replace(' ', '_')}": float(v)
+                for name, v in zip(MODELS, shares, strict=True)
+            },
         },
-        maps={"disparity": found.centre},
+        maps=maps,
     )
+
+
+def _judgement(
+    settings: AdaptiveSettings,
+    volume: search.Volume,
+    missed: Array,
+    usable: NDArray[np.bool_],
+    noise_sigma: float,
+) -> list[str]:
+    """Return what the user should know before trusting the result."""
+    told = []
+    textured = volume.kind > 0
+    if textured.any():
+        decided = float(volume.decisive[textured].mean())
+        if decided < UNDECIDED:
+            told.append(
+                f"the evidence is flat: {1 - decided:.0%} of the textured patches prefer no "
+                "disparity; use a mask that differs from view to view, or more shots"
+            )
+    if volume.at_end > search.WANTED:
+        told.append(
+            f"disparities reach the end of the search, {settings.furthest_px:g} px: raise "
+            "furthest_px"
+        )
+    ratio = float(np.sqrt(np.mean(np.square(missed[usable])))) / max(noise_sigma, settings.misfit)
+    if ratio > MISFIT:
+        told.append(
+            f"the frames are missed by {ratio:.1f} times their noise: Psi may not be theirs, or "
+            "the scene is hardly made of surfaces"
+        )
+    return told

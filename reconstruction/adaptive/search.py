@@ -108,9 +108,7 @@ def coarse(data: Data, furthest_px: float, slope_px: float, jump: float) -> Volu
     evidence, kind, grid = _judged(data, patches, known, prior)
     while True:
         deciding = _deciding(evidence)
-        chances = posteriors(
-            evidence, compatibility(known, slope_px * patches.stride, jump)
-        )
+        chances = posteriors(evidence, compatibility(known, slope_px * patches.stride, jump))
         best = chances.argmax(axis=-1)
         share = [
             float(np.mean(best[deciding] <= 1)) if deciding.any() else 0.0,
@@ -187,9 +185,7 @@ def fine(
     used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
     evidence, labels = evidence[..., used], labels[used]
     # Patches that overlap share readings: each brings only its own part of the evidence.
-    chances = posteriors(
-        evidence * share, compatibility(labels, slope_px * patches.stride, jump)
-    )
+    chances = posteriors(evidence * share, compatibility(labels, slope_px * patches.stride, jump))
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
     return Volume(labels, centres, chances, kind, deciding, rough.at_end)
 

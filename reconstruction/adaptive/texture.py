@@ -36,7 +36,12 @@ def conjugate_gradients(
 
 
 def fitted(
-    surfaces: Surfaces, frames: Array32, precision: Array32, prior: Array32, sigma: float, steps: int
+    surfaces: Surfaces,
+    frames: Array32,
+    precision: Array32,
+    prior: Array32,
+    sigma: float,
+    steps: int,
 ) -> Array32:
     """Return the texture (layer, c, y, x) near `prior`, deviation sigma, that explains the frames.
 

@@ -24,7 +24,10 @@ def _carry(centre, margin, nearer, disparity, hidden):
     views_v, views_u, rows, columns = disparity.shape
     for view in prange(views_v * views_u):
         dv, du = view // views_u - views_v // 2, view % views_u - views_u // 2
-        out, mark = disparity[view // views_u, view % views_u], hidden[view // views_u, view % views_u]
+        out, mark = (
+            disparity[view // views_u, view % views_u],
+            hidden[view // views_u, view % views_u],
+        )
         for y in range(rows):
             for x in range(columns):
                 out[y, x] = np.nan

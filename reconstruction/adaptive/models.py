@@ -1,0 +1,42 @@
+"""Which model each place got: the smallest that its readings speak for."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.adaptive.joint import Scene
+from reconstruction.adaptive.search import Volume
+
+MODELS = ("flat", "plane", "slanted", "two layers", "free")
+"""Even colour; texture at one disparity; at a changing one; partly hidden; no surface."""
+SLANTED_PX = 0.01
+"""Change of the disparity per pixel beyond which a surface counts as slanted."""
+NEAR_PX = 2
+"""Samples around a hidden ray that see two layers."""
+FREE = 0.03
+"""Deviation of the light field from its surfaces beyond which a place counts as free."""
+
+
+def model_map(
+    volume: Volume, scene: Scene, unexplained: NDArray[np.float32], binning: int
+) -> NDArray[np.uint8]:
+    """Return the index in MODELS of every sample of the centre view, (y, x).
+
+    unexplained: the light field's variance off its surfaces, (pixel_y, pixel_x).
+    """
+    size = scene.centre.shape
+    nearest = [
+        np.abs(((np.arange(length) + 0.5) / binning - 0.5)[:, None] - at[None]).argmin(axis=1)
+        for at, length in zip(volume.centres, size, strict=True)
+    ]
+    textured = volume.kind[np.ix_(*nearest)] > 0
+    slope = cv2.GaussianBlur(np.hypot(*np.gradient(scene.centre)).astype(np.float32), (0, 0), 3.0)
+    around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
+    layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0
+    far_off = unexplained.repeat(binning, axis=0).repeat(binning, axis=1) > FREE**2
+    chosen = np.where(textured, np.where(slope > SLANTED_PX, 2, 1), 0)
+    chosen[layered] = 3
+    chosen[far_off] = 4
+    return chosen.astype(np.uint8)
