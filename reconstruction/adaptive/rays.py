@@ -9,39 +9,18 @@ and colour.
 
 from __future__ import annotations
 
-from math import floor
+from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
+from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive.assembly import TAPS, assembled, cubic, first_tap
 
 Array32 = NDArray[np.float32]
-TAPS = 4
-
-
-@njit(inline="always")
-def cubic(fraction, taps):
-    """Set the four weights of Catmull-Rom interpolation at a fraction in [0, 1)."""
-    t = fraction
-    taps[0] = ((-0.5 * t + 1.0) * t - 0.5) * t
-    taps[1] = (1.5 * t - 2.5) * t * t + 1.0
-    taps[2] = ((-1.5 * t + 2.0) * t + 0.5) * t
-    taps[3] = (0.5 * t - 0.5) * t * t
-
-
-@njit(inline="always")
-def _place(position, margin, last):
-    """Return the first of four taps within a padded texture, and the fraction beyond the second."""
-    whole = floor(position)
-    first = int(whole) + margin - 1
-    fraction = np.float32(position - whole)
-    if first < 0:
-        return 0, np.float32(0.0)
-    if first > last:
-        return last, np.float32(1.0)
-    return first, fraction
 
 
 @njit(cache=True, fastmath=True, parallel=True)
@@ -71,8 +50,8 @@ def project(weights, colour, disparity, hidden, factors, textures, margin, binni
                             continue
                         d = disparity[v, u, y, x]
                         layer = hidden[v, u, y, x]
-                        iy, fy = _place(y - d * (v - views_v // 2), margin, last_y)
-                        ix, fx = _place(x - d * (u - views_u // 2), margin, last_x)
+                        iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
+                        ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
                         cubic(fy, wy)
                         cubic(fx, wx)
                         for s in range(shots):
@@ -117,8 +96,8 @@ def back_project(weights, colour, disparity, hidden, factors, frames, margin, bi
                             continue
                         d = disparity[v, u, y, x]
                         layer = hidden[v, u, y, x]
-                        iy, fy = _place(y - d * (v - views_v // 2), margin, last_y)
-                        ix, fx = _place(x - d * (u - views_u // 2), margin, last_x)
+                        iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
+                        ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
                         cubic(fy, wy)
                         cubic(fx, wx)
                         for s in range(shots):
@@ -152,8 +131,8 @@ def render(disparity, hidden, textures, margin, out):
                 for x in range(columns):
                     d = disparity[v, u, y, x]
                     layer = hidden[v, u, y, x]
-                    iy, fy = _place(y - d * (v - views_v // 2), margin, last_y)
-                    ix, fx = _place(x - d * (u - views_u // 2), margin, last_x)
+                    iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
+                    ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
                     cubic(fy, wy)
                     cubic(fx, wx)
                     for c in range(colours):
@@ -189,6 +168,14 @@ class Surfaces:
         steps = np.indices(views, dtype=np.float32)
         self._slopes = -np.stack([steps[0] - views[0] // 2, steps[1] - views[1] // 2])
 
+    @cached_property
+    def _matrix(self) -> sparse.csr_array | None:
+        return assembled(self.psi, self.disparity, self.hidden, self.margin)
+
+    @cached_property
+    def _transposed(self) -> sparse.csc_array | None:
+        return None if self._matrix is None else self._matrix.T
+
     def _project(self, textures: Array32, factors: Array32) -> Array32:
         frames = np.empty(self.psi.frames_shape, dtype=np.float32)
         project(
@@ -222,19 +209,40 @@ class Surfaces:
 
     def forward(self, textures: Array32) -> Array32:
         """Return the frames (shot, pixel_y, pixel_x) of textures (layer, c, y, x)."""
+        if self._matrix is not None:
+            return (self._matrix @ textures.ravel()).reshape(self.psi.frames_shape)
         return self._project(textures[None], self._even)
 
     def adjoint(self, frames: Array32) -> Array32:
         """Return the adjoint of `forward`, (layer, c, y, x)."""
+        if self._transposed is not None:
+            return (self._transposed @ frames.ravel()).reshape(self.textures_shape)
         return self._back(frames, self._even)[0]
 
-    def forward_slopes(self, slopes: Array32) -> Array32:
-        """Return the frames' change as d grows, of (y, x) slopes of textures (2, layer, c, y, x)."""
-        return self._project(slopes, self._slopes)
+    def derivative(self, slopes: Array32) -> tuple[Callable, Callable]:
+        """Return how frames change with the centre view's disparity, and the adjoint of that.
 
-    def adjoint_slopes(self, frames: Array32) -> Array32:
-        """Return the adjoint of `forward_slopes`, (2, layer, c, y, x)."""
-        return self._back(frames, self._slopes)
+        slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. The first maps
+        (y, x), padded, to (shot, pixel_y, pixel_x); layers behind keep their disparity.
+        """
+        frames, size = self.psi.frames_shape, self.textures_shape[2:]
+        matrix = assembled(self.psi, self.disparity, self.hidden, self.margin, slopes)
+        if matrix is not None:
+            transposed = matrix.T
+            return (
+                lambda change: (matrix @ change.ravel()).reshape(frames),
+                lambda missed: (transposed @ missed.ravel()).reshape(size),
+            )
+
+        def forward(change: Array32) -> Array32:
+            both = np.zeros((2, *self.textures_shape), dtype=np.float32)
+            both[:, 0] = slopes * change
+            return self._project(both, self._slopes)
+
+        def adjoint(missed: Array32) -> Array32:
+            return (slopes * self._back(missed, self._slopes)[:, 0]).sum(axis=(0, 1))
+
+        return forward, adjoint
 
     def light_field(self, textures: Array32) -> Array32:
         """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""

@@ -60,16 +60,7 @@ def refined(
     texture: (c, y, x) of the centre view, padded. residual: the frames less what the texture
     explains; precision: inverse variance of it, both (shot, pixel_y, pixel_x).
     """
-    down = slopes(texture)
-
-    def spread(change: Array32) -> Array32:
-        both = np.zeros((2, *surfaces.textures_shape), dtype=np.float32)
-        both[:, 0] = down * change
-        return surfaces.forward_slopes(both)
-
-    def gather(frames: Array32) -> Array32:
-        return (down * surfaces.adjoint_slopes(frames)[:, 0]).sum(axis=(0, 1))
-
+    spread, gather = surfaces.derivative(slopes(texture))
     weights = _smoothness(centre, slope_px)
     ridge = np.float32(1 / TRUSTED_STEP_PX**2)
 
