@@ -7,15 +7,15 @@ rays. The same walk, each tap times the texture's slope, makes the derivative by
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from math import floor
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive.bands import in_bands
 
 Array32 = NDArray[np.float32]
 TAPS = 4
@@ -38,7 +38,7 @@ def cubic(fraction, taps):
 def first_tap(position, margin, last):
     """Return the first of four taps within a padded texture, and the fraction beyond the second."""
     whole = floor(position)
-    first = int(whole) + margin - 1
+    first = whole + margin - 1
     fraction = np.float32(position - whole)
     if first < 0:
         return 0, np.float32(0.0)
@@ -57,14 +57,15 @@ def _walk(
     margin,
     binning,
     size,
-    rows,
+    first_row,
+    last_row,
     starts,
     columns,
     values,
 ):
     """Count the entries of readings into starts (reading,), or, given columns, set the entries.
 
-    size: (y, x) of the padded texture. rows: first and last + 1 row of pixels. starts: where each
+    size: (y, x) of the padded texture. Pixel rows first_row to last_row - 1. starts: where each
     reading's entries begin, (reading + 1,), when there are columns. slopes: (2, c, y, x), of which
     derivatives by the disparity are made, or of one sample: entries of Psi itself.
     """
@@ -76,7 +77,7 @@ def _walk(
     last_y, last_x = size[0] - TAPS, size[1] - TAPS
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for s in range(shots):
-        for pixel_y in range(rows[0], rows[1]):
+        for pixel_y in range(first_row, last_row):
             for pixel_x in range(pixels_x):
                 reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
                 top, left, bottom, right = last_y, last_x, 0, 0
@@ -183,11 +184,11 @@ def assembled(
     derivative = slopes is not None
     slopes = NO_SLOPES if slopes is None else np.ascontiguousarray(slopes)
     counts = np.zeros(readings, dtype=np.int64)
-    bands = max(1, 4 * get_num_threads())
-    edges = np.linspace(0, psi.frames_shape[1], bands + 1).round().astype(np.int64)
 
-    def walk(starts, places, values) -> None:
-        def band(number: int) -> None:
+    def walk(
+        starts: NDArray[np.int64], places: NDArray[np.int32], values: NDArray[np.float32]
+    ) -> None:
+        def work(_: int, first: int, last: int) -> None:
             _walk(
                 psi.weights,
                 psi.colour_map,
@@ -197,14 +198,14 @@ def assembled(
                 margin,
                 psi.binning,
                 size,
-                edges[number : number + 2],
+                first,
+                last,
                 starts,
                 places,
                 values,
             )
 
-        with ThreadPoolExecutor(get_num_threads()) as pool:
-            list(pool.map(band, range(bands)))
+        in_bands(work, psi.frames_shape[1])
 
     nothing = np.empty(0, dtype=np.int32)
     walk(counts, nothing, np.empty(0, dtype=np.float32))

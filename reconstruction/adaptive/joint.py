@@ -30,23 +30,23 @@ ROOM_PX = 0.5
 class TextureSettings(Settings):
     """Settings of the fit of texture and disparity."""
 
-    steps: int = Field(default=8, ge=1)
+    steps: int = Field(default=16, ge=1)
     first_noise: float = Field(
         default=0.15, gt=0, description="deviation of the texture presumed at first"
     )
     last_noise: float = Field(default=0.01, gt=0, description="and at last")
     momentum: float = Field(default=0.5, ge=0, lt=1)
-    threshold: float = Field(default=2.0, gt=0, description="of coefficients, in deviations")
+    threshold: float = Field(default=1.8, gt=0, description="of coefficients, in deviations")
     chroma: float = Field(default=1.4, gt=0, description="that of chrominance over luminance")
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
     fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
     refine_steps: int = Field(
-        default=4, ge=0, description="last steps that sharpen the disparity first"
+        default=8, ge=0, description="last steps that sharpen the disparity first"
     )
-    slope_px: float = Field(default=0.3, gt=0, description="see `refine`")
+    slope_px: float = Field(default=1.0, gt=0, description="see `refine`")
     doubt: float = Field(
-        default=0.05, gt=0, description="deviation of the texture when disparity is sharpened"
+        default=0.025, gt=0, description="deviation of the texture when disparity is sharpened"
     )
 
 

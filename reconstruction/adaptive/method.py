@@ -67,8 +67,8 @@ class AdaptiveSettings(Settings):
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches, fewer steps."""
-    quick = settings.texture.model_copy(update={"steps": 5, "block_step": 6, "reach": 6})
-    return settings.model_copy(update={"step_px": 0.25, "stride": 6, "texture": quick})
+    quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
+    return settings.model_copy(update={"step_px": 0.25, "stride": 8, "texture": quick})
 
 
 def reconstruct_adaptive(

@@ -3,8 +3,8 @@
 A ray is a sample (y, x) of a view (v, u); at disparity d it sees the texture at
 (y - d (v - V // 2), x - d (u - U // 2)), the place of that point in the centre view, by cubic
 interpolation (Catmull-Rom). Textures reach beyond the centre view by a margin on all sides, since
-other views see there. Operations: 2 x 16 per ray of weight not 0 (half of those of an RGBW mask)
-and colour.
+other views see there. Where memory allows, the rays are assembled to a sparse matrix (`assembly`);
+else each is followed anew: 2 x 16 operations for every weight that is not 0.
 """
 
 from __future__ import annotations
@@ -13,139 +13,99 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, njit
 from numpy.typing import NDArray
 from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, assembled, cubic, first_tap
+from reconstruction.adaptive.bands import in_bands
 
 Array32 = NDArray[np.float32]
 
 
-@njit(cache=True, fastmath=True, parallel=True)
-def project(weights, colour, disparity, hidden, factors, textures, margin, binning, frames):
-    """Set frames (shot, pixel_y, pixel_x) to what rays see of textures.
+@njit(cache=True, fastmath=True, nogil=True)
+def _follow(
+    weights,
+    colour,
+    disparity,
+    hidden,
+    factors,
+    margin,
+    binning,
+    first,
+    last,
+    back,
+    textures,
+    frames,
+):
+    """Project textures to the pixel rows first to last - 1 of frames, or, back, frames to textures.
 
     textures: (part, layer, c, y, x), padded; a ray sees the sum of the parts times factors
-    (part, v, u). hidden: (v, u, y, x) uint8, the layer of a ray. disparity: (v, u, y, x).
+    (part, v, u). frames: (shot, pixel_y, pixel_x). What is projected to is added to.
     """
-    shots, views_v, views_u, rows, stored, columns = weights.shape
+    shots, views_v, views_u, _, stored, columns = weights.shape
     parts = textures.shape[0]
     last_y, last_x = textures.shape[3] - TAPS, textures.shape[4] - TAPS
-    for pixel_row in prange(frames.shape[1]):
-        wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-        for s in range(shots):
-            for x in range(frames.shape[2]):
-                frames[s, pixel_row, x] = 0
-        for y in range(pixel_row * binning, (pixel_row + 1) * binning):
-            for v in range(views_v):
-                for u in range(views_u):
-                    for x in range(columns):
-                        seen = False
-                        for s in range(shots):
-                            for k in range(stored):
-                                seen = seen or weights[s, v, u, y, k, x] != 0
-                        if not seen:
-                            continue
-                        d = disparity[v, u, y, x]
-                        layer = hidden[v, u, y, x]
-                        iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
-                        ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
-                        cubic(fy, wy)
-                        cubic(fx, wx)
-                        for s in range(shots):
-                            total = np.float32(0)
-                            for k in range(stored):
-                                w = weights[s, v, u, y, k, x]
-                                if w == 0:
-                                    continue
-                                c = colour[s, y, x] if stored == 1 else k
-                                for part in range(parts):
-                                    t = textures[part, layer, c]
-                                    value = np.float32(0)
-                                    for j in range(TAPS):
-                                        line = t[iy + j]
-                                        value += wy[j] * (
-                                            wx[0] * line[ix]
-                                            + wx[1] * line[ix + 1]
-                                            + wx[2] * line[ix + 2]
-                                            + wx[3] * line[ix + 3]
-                                        )
-                                    total += w * factors[part, v, u] * value
-                            frames[s, pixel_row, x // binning] += total
-
-
-@njit(cache=True, fastmath=True, parallel=True)
-def back_project(weights, colour, disparity, hidden, factors, frames, margin, binning, banded):
-    """Add Psi^T frames to banded (band, part, layer, c, y, x): one buffer for each band of rows."""
-    shots, views_v, views_u, rows, stored, columns = weights.shape
-    bands, parts = banded.shape[:2]
-    last_y, last_x = banded.shape[4] - TAPS, banded.shape[5] - TAPS
-    for band in prange(bands):
-        wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-        for y in range(rows * band // bands, rows * (band + 1) // bands):
-            for v in range(views_v):
-                for u in range(views_u):
-                    for x in range(columns):
-                        seen = False
-                        for s in range(shots):
-                            for k in range(stored):
-                                seen = seen or weights[s, v, u, y, k, x] != 0
-                        if not seen:
-                            continue
-                        d = disparity[v, u, y, x]
-                        layer = hidden[v, u, y, x]
-                        iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
-                        ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
-                        cubic(fy, wy)
-                        cubic(fx, wx)
-                        for s in range(shots):
-                            reading = frames[s, y // binning, x // binning]
-                            for k in range(stored):
-                                w = weights[s, v, u, y, k, x] * reading
-                                if w == 0:
-                                    continue
-                                c = colour[s, y, x] if stored == 1 else k
-                                for part in range(parts):
-                                    share = w * factors[part, v, u]
-                                    t = banded[band, part, layer, c]
-                                    for j in range(TAPS):
-                                        line = t[iy + j]
-                                        here = share * wy[j]
-                                        line[ix] += here * wx[0]
-                                        line[ix + 1] += here * wx[1]
-                                        line[ix + 2] += here * wx[2]
-                                        line[ix + 3] += here * wx[3]
-
-
-@njit(cache=True, fastmath=True, parallel=True)
-def render(disparity, hidden, textures, margin, out):
-    """Set out (v, u, y, x, c) to the light field of textures (layer, c, y, x), padded."""
-    views_v, views_u, rows, columns, colours = out.shape
-    last_y, last_x = textures.shape[2] - TAPS, textures.shape[3] - TAPS
-    for y in prange(rows):
-        wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    for y in range(first * binning, last * binning):
         for v in range(views_v):
             for u in range(views_u):
                 for x in range(columns):
-                    d = disparity[v, u, y, x]
+                    placed = False
+                    iy, ix = 0, 0
                     layer = hidden[v, u, y, x]
+                    for s in range(shots):
+                        total = np.float32(0)
+                        for k in range(stored):
+                            w = weights[s, v, u, y, k, x]
+                            if w == 0:
+                                continue
+                            if not placed:
+                                d = disparity[v, u, y, x]
+                                iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
+                                ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
+                                cubic(fy, wy)
+                                cubic(fx, wx)
+                                placed = True
+                            c = colour[s, y, x] if stored == 1 else k
+                            if back:
+                                w *= frames[s, y // binning, x // binning]
+                            for part in range(parts):
+                                texture = textures[part, layer, c]
+                                share = w * factors[part, v, u]
+                                for i in range(TAPS):
+                                    for j in range(TAPS):
+                                        tap = share * wy[i] * wx[j]
+                                        if back:
+                                            texture[iy + i, ix + j] += tap
+                                        else:
+                                            total += tap * texture[iy + i, ix + j]
+                        if not back:
+                            frames[s, y // binning, x // binning] += total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _render(disparity, hidden, textures, margin, first, last, out):
+    """Set rows first to last - 1 of out (v, u, y, x, c) to what rays see of (layer, c, y, x)."""
+    views_v, views_u, _, columns, colours = out.shape
+    last_y, last_x = textures.shape[2] - TAPS, textures.shape[3] - TAPS
+    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    for v in range(views_v):
+        for u in range(views_u):
+            for y in range(first, last):
+                for x in range(columns):
+                    d = disparity[v, u, y, x]
+                    texture = textures[hidden[v, u, y, x]]
                     iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
                     ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
                     cubic(fy, wy)
                     cubic(fx, wx)
                     for c in range(colours):
-                        t = textures[layer, c]
                         value = np.float32(0)
-                        for j in range(TAPS):
-                            line = t[iy + j]
-                            value += wy[j] * (
-                                wx[0] * line[ix]
-                                + wx[1] * line[ix + 1]
-                                + wx[2] * line[ix + 2]
-                                + wx[3] * line[ix + 3]
-                            )
+                        for i in range(TAPS):
+                            for j in range(TAPS):
+                                value += wy[i] * wx[j] * texture[c, iy + i, ix + j]
                         out[v, u, y, x, c] = value
 
 
@@ -177,47 +137,67 @@ class Surfaces:
         return None if self._matrix is None else self._matrix.T
 
     def _project(self, textures: Array32, factors: Array32) -> Array32:
-        frames = np.empty(self.psi.frames_shape, dtype=np.float32)
-        project(
-            self.psi.weights,
-            self.psi.colour_map,
-            self.disparity,
-            self.hidden,
-            factors,
-            textures,
-            self.margin,
-            self.psi.binning,
-            frames,
-        )
+        frames = np.zeros(self.psi.frames_shape, dtype=np.float32)
+        psi, rows = self.psi, self.psi.frames_shape[1]
+
+        def work(_: int, first: int, last: int) -> None:
+            _follow(
+                psi.weights,
+                psi.colour_map,
+                self.disparity,
+                self.hidden,
+                factors,
+                self.margin,
+                psi.binning,
+                first,
+                last,
+                False,
+                textures,
+                frames,
+            )
+
+        in_bands(work, rows)
         return frames
 
     def _back(self, frames: Array32, factors: Array32) -> Array32:
-        bands = get_num_threads()
-        banded = np.zeros((bands, len(factors), *self.textures_shape), dtype=np.float32)
-        back_project(
-            self.psi.weights,
-            self.psi.colour_map,
-            self.disparity,
-            self.hidden,
-            factors,
-            np.ascontiguousarray(frames, dtype=np.float32),
-            self.margin,
-            self.psi.binning,
-            banded,
-        )
-        return banded.sum(axis=0) if bands > 1 else banded[0]
+        psi, rows = self.psi, self.psi.frames_shape[1]
+        frames = np.ascontiguousarray(frames, dtype=np.float32)
+        # Bands of rows reach the same texture: each adds to its own.
+        textures = [
+            np.zeros((len(factors), *self.textures_shape), dtype=np.float32)
+            for _ in range(min(rows, get_num_threads()))
+        ]
+
+        def work(band: int, first: int, last: int) -> None:
+            _follow(
+                psi.weights,
+                psi.colour_map,
+                self.disparity,
+                self.hidden,
+                factors,
+                self.margin,
+                psi.binning,
+                first,
+                last,
+                True,
+                textures[band],
+                frames,
+            )
+
+        in_bands(work, rows, len(textures))
+        return sum(textures[1:], start=textures[0])
 
     def forward(self, textures: Array32) -> Array32:
         """Return the frames (shot, pixel_y, pixel_x) of textures (layer, c, y, x)."""
-        if self._matrix is not None:
-            return (self._matrix @ textures.ravel()).reshape(self.psi.frames_shape)
-        return self._project(textures[None], self._even)
+        if self._matrix is None:
+            return self._project(textures[None], self._even)
+        return (self._matrix @ textures.ravel()).reshape(self.psi.frames_shape)
 
     def adjoint(self, frames: Array32) -> Array32:
         """Return the adjoint of `forward`, (layer, c, y, x)."""
-        if self._transposed is not None:
-            return (self._transposed @ frames.ravel()).reshape(self.textures_shape)
-        return self._back(frames, self._even)[0]
+        if self._transposed is None:
+            return self._back(frames, self._even)[0]
+        return (self._transposed @ frames.ravel()).reshape(self.textures_shape)
 
     def derivative(self, slopes: Array32) -> tuple[Callable, Callable]:
         """Return how frames change with the centre view's disparity, and the adjoint of that.
@@ -247,5 +227,9 @@ class Surfaces:
     def light_field(self, textures: Array32) -> Array32:
         """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""
         out = np.empty(self.psi.light_field_shape, dtype=np.float32)
-        render(self.disparity, self.hidden, textures, self.margin, out)
+
+        def work(_: int, first: int, last: int) -> None:
+            _render(self.disparity, self.hidden, textures, self.margin, first, last, out)
+
+        in_bands(work, self.psi.size[0])
         return out

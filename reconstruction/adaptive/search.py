@@ -30,6 +30,8 @@ POSSIBLE = 0.02
 """Probability above which a disparity is looked at again."""
 TILE = 16
 """Patches a side."""
+OWN_SHARE = 0.5
+"""Of a patch's evidence: patches overlap, and would count the same readings again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +158,6 @@ def fine(
     step_px: float,
     slope_px: float,
     jump: float,
-    prior: TexturePrior = TexturePrior(),
-    share: float = 0.5,
 ) -> Volume:
     """Return the search of `step_px` among what the rough one left possible."""
     side = reading_side(data.psi.shots)
@@ -168,6 +168,7 @@ def fine(
     evidence = np.full((len(rows), len(columns), len(labels)), -np.inf, dtype=np.float32)
     kind = np.zeros((len(rows), len(columns)), dtype=np.int64)
     deciding = np.zeros((len(rows), len(columns)), dtype=bool)
+    prior = TexturePrior()
     for top in range(0, len(rows), TILE):
         for left in range(0, len(columns), TILE):
             here = slice(top, top + TILE), slice(left, left + TILE)
@@ -184,8 +185,7 @@ def fine(
             deciding[here] = _deciding(values)
     used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
     evidence, labels = evidence[..., used], labels[used]
-    # Patches that overlap share readings: each brings only its own part of the evidence.
-    chances = posteriors(evidence * share, compatibility(labels, slope_px * patches.stride, jump))
+    chances = posteriors(evidence * OWN_SHARE, compatibility(labels, slope_px * patches.stride, jump))
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
     return Volume(labels, centres, chances, kind, deciding, rough.at_end)
 

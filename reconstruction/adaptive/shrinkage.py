@@ -12,10 +12,11 @@ Operations of a reference block: 64 per block searched, 2 x 3 x 1024 per block o
 from __future__ import annotations
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, njit
 from numpy.typing import NDArray
 from scipy.fft import dct
 
+from reconstruction.adaptive.bands import in_bands
 from reconstruction.problem import OPPONENT
 
 Array32 = NDArray[np.float32]
@@ -23,7 +24,10 @@ SIDE = 8
 STACK = 16
 REACH = 9
 """Blocks are searched within so many samples along each axis."""
+ALIKE = 4.0
+"""Mean square difference of blocks that are stacked, at most, over the noise's variance."""
 _COSINES = np.ascontiguousarray(dct(np.eye(SIDE), axis=0, norm="ortho").astype(np.float32))
+_TRANSPOSED = np.ascontiguousarray(_COSINES.T)
 _OPPONENT = OPPONENT.astype(np.float32)
 
 
@@ -100,47 +104,45 @@ def _alike(guide, y, x, reach, unlike, distances, places):
     return count
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _shrink(
     picture, guide, cosines, transposed, cuts, unlike, reach, starts_y, starts_x, total, weight
 ):
-    """Add the blocks' estimates to total (band, c, y, x) and their weights to weight, alike."""
-    bands = total.shape[0]
-    for band in prange(bands):
-        half = np.empty((SIDE, SIDE), np.float32)
-        stack = np.empty((STACK, SIDE, SIDE), np.float32)
-        distances = np.empty(STACK, np.float32)
-        places = np.empty((STACK, 2), np.int64)
-        for row in range(starts_y.size * band // bands, starts_y.size * (band + 1) // bands):
-            for x in starts_x:
-                count = _alike(guide, starts_y[row], x, reach, unlike, distances, places)
-                for c in range(picture.shape[0]):
-                    for k in range(count):
-                        top, left = places[k]
-                        for i in range(SIDE):
-                            for j in range(SIDE):
-                                stack[k, i, j] = picture[c, top + i, left + j]
-                        _transform(cosines, stack[k], transposed, half)
-                    _hadamard(stack, count)
-                    kept = 1
-                    mean = stack[0, 0, 0]
-                    for k in range(count):
-                        for i in range(SIDE):
-                            for j in range(SIDE):
-                                if abs(stack[k, i, j]) < cuts[c]:
-                                    stack[k, i, j] = 0
-                                else:
-                                    kept += 1
-                    stack[0, 0, 0] = mean
-                    _hadamard(stack, count)
-                    share = np.float32(1.0) / kept
-                    for k in range(count):
-                        _transform(transposed, stack[k], cosines, half)
-                        top, left = places[k]
-                        for i in range(SIDE):
-                            for j in range(SIDE):
-                                total[band, c, top + i, left + j] += share * stack[k, i, j]
-                                weight[band, c, top + i, left + j] += share
+    """Add the blocks' estimates to total (c, y, x) and their weights to weight, alike."""
+    half = np.empty((SIDE, SIDE), np.float32)
+    stack = np.empty((STACK, SIDE, SIDE), np.float32)
+    distances = np.empty(STACK, np.float32)
+    places = np.empty((STACK, 2), np.int64)
+    for row in range(starts_y.size):
+        for x in starts_x:
+            count = _alike(guide, starts_y[row], x, reach, unlike, distances, places)
+            for c in range(picture.shape[0]):
+                for k in range(count):
+                    top, left = places[k]
+                    for i in range(SIDE):
+                        for j in range(SIDE):
+                            stack[k, i, j] = picture[c, top + i, left + j]
+                    _transform(cosines, stack[k], transposed, half)
+                _hadamard(stack, count)
+                kept = 1
+                mean = stack[0, 0, 0]
+                for k in range(count):
+                    for i in range(SIDE):
+                        for j in range(SIDE):
+                            if abs(stack[k, i, j]) < cuts[c]:
+                                stack[k, i, j] = 0
+                            else:
+                                kept += 1
+                stack[0, 0, 0] = mean
+                _hadamard(stack, count)
+                share = np.float32(1.0) / kept
+                for k in range(count):
+                    _transform(transposed, stack[k], cosines, half)
+                    top, left = places[k]
+                    for i in range(SIDE):
+                        for j in range(SIDE):
+                            total[c, top + i, left + j] += share * stack[k, i, j]
+                            weight[c, top + i, left + j] += share
 
 
 def _starts(length: int, step: int, first: int) -> NDArray[np.int64]:
@@ -167,22 +169,28 @@ def denoised(
     """
     opponent = np.ascontiguousarray(np.einsum("oc,cyx->oyx", _OPPONENT, picture, optimize=True))
     luminance = np.ascontiguousarray(np.einsum("c,cyx->yx", _OPPONENT[0], guide, optimize=True))
-    bands = get_num_threads()
-    total = np.zeros((bands, *picture.shape), dtype=np.float32)
-    weight = np.zeros_like(total)
+    # Blocks of two bands overlap: each adds to its own sums.
+    sums = np.zeros((get_num_threads(), 2, *picture.shape), dtype=np.float32)
+    rows = _starts(picture.shape[1], step, first)
+    columns = _starts(picture.shape[2], step, first)
     cuts = np.array([1, chroma, chroma], dtype=np.float32) * np.float32(threshold * sigma)
-    _shrink(
-        opponent,
-        luminance,
-        _COSINES,
-        np.ascontiguousarray(_COSINES.T),
-        cuts,
-        np.float32(4 * sigma**2),
-        reach,
-        _starts(picture.shape[1], step, first),
-        _starts(picture.shape[2], step, first),
-        total,
-        weight,
-    )
-    mean = total.sum(axis=0) / weight.sum(axis=0)
+
+    def work(band: int, begin: int, end: int) -> None:
+        _shrink(
+            opponent,
+            luminance,
+            _COSINES,
+            _TRANSPOSED,
+            cuts,
+            np.float32(ALIKE * sigma**2),
+            reach,
+            rows[begin:end],
+            columns,
+            sums[band, 0],
+            sums[band, 1],
+        )
+
+    in_bands(work, len(rows), len(sums))
+    total, weight = sums.sum(axis=0)
+    mean = total / weight
     return np.ascontiguousarray(np.einsum("oc,oyx->cyx", _OPPONENT, mean, optimize=True))

@@ -1,11 +1,10 @@
-"""How far off a reconstruction is: a standard deviation per sample, calibrated on held-out readings.
+"""How far off a reconstruction is: a deviation per sample, calibrated on held-out readings.
 
 Some readings are kept from the fit. What a texture may be wrong by is the noise that its last fit
 let in, and more where it is steep: by a blur that is the same for all views, and by a wrong
 disparity, which counts more in views further from the centre. How much of the last two the
 held-out readings tell: their misses are Gaussian with the variance of the noise and of these parts
-(maximum likelihood); then all is scaled so that 68 % of the held-out readings that show more than
-noise lie within one deviation.
+(maximum likelihood, with heavy tails for what is wild).
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class Deviation:
 
 
 def _parts(scene: Scene) -> Array32:
-    """Return the parts of the variance, (3, v, u, y, x): noise let in, slopes, those by parallax."""
+    """Return the variance's parts, (3, v, u, y, x): noise let in, slopes, those by parallax."""
     let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
     steep = np.square(slopes(scene.clean[0])).mean(axis=1)
     smooth = [cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, *steep)]
