@@ -14,13 +14,13 @@ Array = NDArray[np.floating]
 
 
 def compatibility(disparities: NDArray[np.floating], slope_px: float, jump: float) -> Array:
-    """Return the joint prior of two neighbours' disparities, (L, L), each row of sum 1.
+    """Return the joint prior of two neighbours' disparities, (L, L), symmetric, not normalised.
 
     slope_px: mean difference of neighbours on one object. jump: probability of another object.
     """
     apart = np.abs(disparities[:, None] - disparities[None])
     same = np.exp(-apart / slope_px)
-    same /= same.sum(axis=1, keepdims=True)
+    same /= same.sum(axis=1).max()
     return (1 - jump) * same + jump / len(disparities)
 
 

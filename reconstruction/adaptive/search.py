@@ -185,7 +185,9 @@ def fine(
             deciding[here] = _deciding(values)
     used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
     evidence, labels = evidence[..., used], labels[used]
-    chances = posteriors(evidence * OWN_SHARE, compatibility(labels, slope_px * patches.stride, jump))
+    chances = posteriors(
+        evidence * OWN_SHARE, compatibility(labels, slope_px * patches.stride, jump)
+    )
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
     return Volume(labels, centres, chances, kind, deciding, rough.at_end)
 

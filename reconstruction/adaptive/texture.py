@@ -14,7 +14,7 @@ Array32 = NDArray[np.float32]
 
 
 def conjugate_gradients(
-    apply: Callable[[Array32], Array32], rhs: Array32, steps: int, rtol: float = 1e-3
+    apply: Callable[[Array32], Array32], rhs: Array32, steps: int, rtol: float = 1e-5
 ) -> Array32:
     """Return the solution of apply(x) = rhs from x = 0, apply symmetric and positive definite."""
     x = np.zeros_like(rhs)
