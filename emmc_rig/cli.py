@@ -360,9 +360,14 @@ def chart(
     peers: Annotated[
         bool, typer.Option("--peers", help="time the primal-dual step, and pyproximal's beside")
     ] = False,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="what each piece of the adaptive method buys")
+    ] = False,
     dictionary: DictionaryOption = None,
     camera: CameraOption = "rgbw-bayer-1shot",
-    size: SizeOption = "593x840",
+    scene: SceneOption = DEFAULT_SCENE,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
     out: OutOption = Path("emmc-kernels"),
 ) -> None:
@@ -374,13 +379,15 @@ def chart(
     if solvers:
         _chart_solvers(camera, dictionary, out)
         return
-    if not kernels and not peers:
-        raise typer.BadParameter("say what to chart: --kernels, --solvers or --peers")
-    if peers:
-        _chart_peers(camera, size, repeats, out)
+    if ablation:
+        _chart_ablation(scene, camera, _size(size) or (128, 160), seed, out)
         return
-    described, shape = find_camera(camera), _size(size)
-    assert shape is not None
+    if not kernels and not peers:
+        raise typer.BadParameter("say what to chart: --kernels, --solvers, --peers or --ablation")
+    described, shape = find_camera(camera), _size(size) or (593, 840)
+    if peers:
+        _chart_peers(camera, shape, repeats, out)
+        return
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
     rows = []
     with result_folder(out) as folder:
@@ -504,13 +511,34 @@ def tables(
         typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
 
 
-def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
+def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:
+    from emmc_rig.ablation import ablations
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    table = Table("adaptive", "dB", "s", "buys dB", "costs s")
+    rows = []
+    with result_folder(out) as folder:
+        for row in ablations(scene, camera, find_camera(camera), size, seed, folder):
+            rows.append(row.as_dict())
+            table.add_row(
+                row.name,
+                f"{row.psnr_db:.2f}",
+                f"{row.seconds:.1f}",
+                f"{row.buys_db:+.2f}",
+                f"{row.costs_s:+.1f}",
+            )
+        metrics = {"scene": scene, "camera": camera, "size": list(size), "rows": rows}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
+
+
+def _chart_peers(camera: str, shape: tuple[int, int], repeats: int, out: Path) -> None:
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
     from emmc_rig.variational_benchmark import variational_timings
 
-    described, shape = find_camera(camera), _size(size)
-    assert shape is not None
+    described = find_camera(camera)
     table = Table("primal-dual step", "ms", "times ours")
     rows = []
     with result_folder(out) as folder:

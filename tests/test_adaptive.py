@@ -1,4 +1,4 @@
-"""Adaptive reconstruction: its parts against dense algebra and SciPy, the whole on planted scenes."""
+"""Adaptive reconstruction: its parts against dense algebra and SciPy, the whole when planted."""
 
 import numpy as np
 import pytest

@@ -75,13 +75,15 @@ def solve(
     precision: Array32,
     picture: Array32,
     settings: TextureSettings,
+    layers: bool = True,
     on_step: Callable[[int], None] | None = None,
 ) -> Scene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
-    not usable. picture: (y, x, c) to begin with.
+    not usable. picture: (y, x, c) to begin with. layers: whether hidden surfaces continue those
+    beside them, else they look like what hides them.
     """
     furthest = float(np.abs(centre).max()) + ROOM_PX
     half = max(psi.light_field_shape[:2]) // 2
@@ -110,7 +112,9 @@ def solve(
                 settings.chroma,
                 settings.reach,
             )
-            if surfaces.hidden.any():
+            if not layers:
+                clean[1] = clean[0]
+            elif surfaces.hidden.any():
                 clean[1] = background(clean[0], padded, nearer, reach)
         if step >= max(2, settings.steps - settings.refine_steps):
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)

@@ -24,6 +24,7 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
+from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.free import freed, misfit
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.models import MODELS, model_map
@@ -35,6 +36,7 @@ from reconstruction.result import Progress, Reconstruction
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
+COARSE_LENGTH_PX = 8.0
 MISFIT = 4.0
 """Times the noise by which readings may be missed before Psi is doubted."""
 
@@ -52,6 +54,12 @@ class AdaptiveSettings(Settings):
     )
     jump: float = Field(
         default=0.02, gt=0, lt=1, description="probability that neighbouring patches differ freely"
+    )
+    freedom: float = Field(
+        default=3.0, gt=0, description="of the Student t of the readings; large: Gaussian"
+    )
+    layers: bool = Field(
+        default=True, description="give what the centre view does not see a texture of its own"
     )
     misfit: float = Field(
         default=0.0015, gt=0, description="deviation of readings that no model explains"
@@ -102,10 +110,22 @@ def reconstruct_adaptive(
     grey = picture.mean(axis=-1)
     brightness = grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3))
     data = search.Data(psi, frames - psi.forward(flat), variance, usable, brightness)
-    rough = search.coarse(data, settings.furthest_px, settings.slope_px, settings.jump)
+    rough = search.coarse(
+        data,
+        TexturePrior(length_px=COARSE_LENGTH_PX, freedom=settings.freedom),
+        settings.furthest_px,
+        settings.slope_px,
+        settings.jump,
+    )
     tell(1)
     volume = search.fine(
-        data, rough, settings.stride, settings.step_px, settings.slope_px, settings.jump
+        data,
+        TexturePrior(freedom=settings.freedom),
+        rough,
+        settings.stride,
+        settings.step_px,
+        settings.slope_px,
+        settings.jump,
     )
     centre = search.per_pixel(volume, psi.size, k)
     searched_s = clock() - started
@@ -119,6 +139,7 @@ def reconstruct_adaptive(
         np.where(usable & ~held, 1 / variance, 0).astype(np.float32),
         picture,
         settings.texture,
+        settings.layers,
         on_step=lambda step: tell(2 + step),
     )
     light_field = np.clip(found.surfaces.light_field(found.texture), 0, 1)

@@ -99,13 +99,14 @@ def _deciding(evidence: Array) -> NDArray[np.bool_]:
     return evidence.max(axis=-1) - evidence.mean(axis=-1) > DECISIVE
 
 
-def coarse(data: Data, furthest_px: float, slope_px: float, jump: float) -> Volume:
+def coarse(
+    data: Data, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
+) -> Volume:
     """Return the coarse search over disparities up to `furthest_px` to both sides."""
     side = reading_side(data.psi.shots)
     room = (min(data.psi.frames_shape[1:]) - 1) // (side - 1)
     patches = EvidencePatches(side, 3 * side // 2, min(COARSE_SPACING, max(room, 1)))
-    prior = TexturePrior(length_px=8.0)
-    reach = min(START_PX, furthest_px)
+    reach = COARSE_STEP_PX * np.floor(min(START_PX, furthest_px) / COARSE_STEP_PX)
     known = np.arange(-reach, reach + 1e-9, COARSE_STEP_PX)
     evidence, kind, grid = _judged(data, patches, known, prior)
     while True:
@@ -153,6 +154,7 @@ def _candidates(
 
 def fine(
     data: Data,
+    prior: TexturePrior,
     rough: Volume,
     stride: int,
     step_px: float,
@@ -168,7 +170,6 @@ def fine(
     evidence = np.full((len(rows), len(columns), len(labels)), -np.inf, dtype=np.float32)
     kind = np.zeros((len(rows), len(columns)), dtype=np.int64)
     deciding = np.zeros((len(rows), len(columns)), dtype=bool)
-    prior = TexturePrior()
     for top in range(0, len(rows), TILE):
         for left in range(0, len(columns), TILE):
             here = slice(top, top + TILE), slice(left, left + TILE)
