@@ -23,8 +23,6 @@ from reconstruction.adaptive.texture import background, fitted
 from reconstruction.adaptive.visibility import carried
 
 Array32 = NDArray[np.float32]
-ROOM_PX = 0.5
-"""How far beyond the disparities found by the search refinement may go."""
 
 
 class TextureSettings(Settings):
@@ -44,7 +42,10 @@ class TextureSettings(Settings):
     refine_steps: int = Field(
         default=8, ge=0, description="last steps that sharpen the disparity first"
     )
-    slope_px: float = Field(default=1.0, gt=0, description="see `refine`")
+    slope_px: float = Field(default=0.3, gt=0, description="see `refine`")
+    room_px: float = Field(
+        default=0.5, ge=0, description="by which sharpening may leave the disparity searched"
+    )
     doubt: float = Field(
         default=0.025, gt=0, description="deviation of the texture when disparity is sharpened"
     )
@@ -85,11 +86,11 @@ def solve(
     not usable. picture: (y, x, c) to begin with. layers: whether hidden surfaces continue those
     beside them, else they look like what hides them.
     """
-    furthest = float(np.abs(centre).max()) + ROOM_PX
+    furthest = float(np.abs(centre).max()) + settings.room_px
     half = max(psi.light_field_shape[:2]) // 2
     margin = int(np.ceil(furthest * half)) + 4
     around = ((margin, margin), (margin, margin))
-    padded = np.pad(centre, around, mode="edge")
+    padded = searched = np.pad(centre, around, mode="edge")
     begun = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge")
     reach = max(1, int(np.ceil(np.ptp(centre) * half)))
     surfaces = surfaces_of(psi, padded, margin, nearer)
@@ -122,7 +123,7 @@ def solve(
             padded = refined(
                 surfaces, padded, now[0], missed, doubted.astype(np.float32), settings.slope_px
             )
-            padded = np.clip(padded, -furthest, furthest)
+            padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer)
         before, now = (
             now,
