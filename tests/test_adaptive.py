@@ -1,5 +1,6 @@
 """Adaptive reconstruction: its parts against dense algebra and SciPy, the whole when planted."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import multivariate_t
@@ -14,6 +15,7 @@ from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
+from reconstruction.adaptive.planning import expected_errors, patch_error
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.shrinkage import denoised
@@ -26,8 +28,6 @@ from reconstruction.tv import reconstruct_tv
 
 def textured(size, seed=0, detail=1.5):
     """A picture (c, y, x) of smooth blobs in related colours, in [0, 1]."""
-    import cv2
-
     rng = np.random.default_rng(seed)
     grey = cv2.GaussianBlur(rng.normal(size=size), (0, 0), detail)
     tint = cv2.GaussianBlur(rng.normal(size=(*size, 3)), (0, 0), 2 * detail)
@@ -267,3 +267,45 @@ def test_bad_inputs_are_refused_in_one_line(bayer):
         reconstruct_adaptive(
             bayer, np.zeros(bayer.frames_shape), 0.01, usable=np.zeros(bayer.frames_shape, bool)
         )
+
+
+def planned(psi, variance=1e-5):
+    return patch_error(psi, (0, 0), 0.6, 0.02, 0.1, variance, TexturePrior())
+
+
+def test_expected_error_is_the_prior_without_readings_and_falls_with_every_shot(coded_psi):
+    psi = coded_psi(shots=2, size=(8, 8), views=(3, 3))
+    dark = ImagingMatrix(np.zeros_like(psi.weights), psi.colour)
+    assert planned(dark) == pytest.approx(0.02 * (1 + 2 * 0.1) / 3)
+    one = ImagingMatrix(psi.weights[:1].copy(), psi.colour[:1].copy())
+    again = ImagingMatrix(psi.weights[[0, 0]].copy(), psi.colour[[0, 0]].copy())
+    assert planned(dark) > planned(one) > planned(again) > planned(psi)
+    # The same shot twice is one of half the noise variance.
+    assert planned(again) == pytest.approx(planned(one, 0.5e-5), rel=1e-6)
+
+
+def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi):
+    psi = coded_psi(size=(8, 8), views=(3, 3))
+    prior, variance = TexturePrior(), 1e-4
+    v, u, y, x, c = np.indices(psi.light_field_shape).reshape(5, -1)
+    at = np.stack([y - 0.6 * (v - 1), x - 0.6 * (u - 1)], axis=1)
+    colours = OPPONENT.T @ np.diag([1, 0.1, 0.1]) @ OPPONENT
+    texture = 0.02 * prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
+    texture *= colours[c[:, None], c[None]]
+    matrix = psi.to_scipy().toarray()
+    seen = matrix @ texture
+    posterior = texture - seen.T @ np.linalg.solve(seen @ matrix.T + variance * np.eye(64), seen)
+    inner = (np.minimum(y, x) >= 2) & (np.maximum(y, x) < 6)
+    assert planned(psi, variance) == pytest.approx(np.diag(posterior)[inner].mean(), rel=1e-3)
+
+
+def test_the_mask_position_that_tells_more_is_expected_to_err_less(bayer, planted):
+    maps = planted[3].maps
+    same = ImagingMatrix(bayer.weights[[0, 0]].copy(), bayer.colour[[0, 0]].copy())
+    moved = np.concatenate([bayer.weights, np.roll(bayer.weights, 9, axis=5)])
+    other = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
+    grey = planted[3].light_field[2, 2].mean(axis=-1)
+    errors = expected_errors(
+        [same, other], maps["disparity"], maps["texture"], grey, 0.004**2, patches=4
+    )
+    assert errors[1] < errors[0]

@@ -27,7 +27,7 @@ from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.free import freed, misfit
 from reconstruction.adaptive.joint import TextureSettings, solve
-from reconstruction.adaptive.models import MODELS, model_map
+from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import smooth_guess
 from reconstruction.inputs import checked_inputs
@@ -143,19 +143,25 @@ def reconstruct_adaptive(
         on_step=lambda step: tell(2 + step),
     )
     light_field = np.clip(found.surfaces.light_field(found.texture), 0, 1)
-    sure = deviation(found, frames, noise_sigma, held)
+    doubt = search.variance_per_pixel(volume, psi.size, k)
+    sure = deviation(found, doubt, frames, noise_sigma, held)
     missed = frames - found.surfaces.forward(found.texture)
     unexplained = misfit(psi, missed, noise_sigma, usable)
+    surface = light_field
     if settings.free:
-        light_field = freed(psi, frames, noise_sigma, usable, light_field, unexplained)
+        light_field = freed(psi, frames, noise_sigma, usable, surface, unexplained)
     tell(total)
+    kinds = texture_map(volume, psi.size, k)
     maps = {
         "disparity": found.centre,
+        "texture": kinds,
         "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
-        "model": model_map(volume, found, unexplained, k),
+        "model": model_map(kinds, found, unexplained, k),
     }
     if sure is not None:
-        maps["sigma"] = sure.sigma
+        # What total variation moved is in doubt by as much.
+        moved = np.square(light_field - surface).mean(axis=-1)
+        maps["sigma"] = np.sqrt(np.square(sure.sigma) + moved)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     judged = _judgement(settings, volume, missed, usable, noise_sigma)
     return Reconstruction(

@@ -19,19 +19,24 @@ FREE = 0.03
 """Deviation of the light field from its surfaces beyond which a place counts as free."""
 
 
-def model_map(
-    volume: Volume, scene: Scene, unexplained: NDArray[np.float32], binning: int
-) -> NDArray[np.uint8]:
-    """Return the index in MODELS of every sample of the centre view, (y, x).
-
-    unexplained: the light field's variance off its surfaces, (pixel_y, pixel_x).
-    """
-    size = scene.centre.shape
+def texture_map(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.uint8]:
+    """Return the kind of texture, as TexturePrior counts them, of the patch next to each sample."""
     nearest = [
         np.abs(((np.arange(length) + 0.5) / binning - 0.5)[:, None] - at[None]).argmin(axis=1)
         for at, length in zip(volume.centres, size, strict=True)
     ]
-    textured = volume.kind[np.ix_(*nearest)] > 0
+    return volume.kind[np.ix_(*nearest)].astype(np.uint8)
+
+
+def model_map(
+    texture: NDArray[np.uint8], scene: Scene, unexplained: NDArray[np.float32], binning: int
+) -> NDArray[np.uint8]:
+    """Return the index in MODELS of every sample of the centre view, (y, x).
+
+    texture: see `texture_map`. unexplained: the light field's variance off its surfaces, (pixel_y,
+    pixel_x).
+    """
+    textured = texture > 0
     slope = cv2.GaussianBlur(np.hypot(*np.gradient(scene.centre)).astype(np.float32), (0, 0), 3.0)
     around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
     layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0

@@ -193,16 +193,33 @@ def fine(
     return Volume(labels, centres, chances, kind, deciding, rough.at_end)
 
 
+def _pixel_maps(
+    volume: Volume, size: tuple[int, int], binning: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where in the grid of patches every sample (y, x) lies: columns and rows, (y, x)."""
+    along = []
+    for at, length in zip(volume.centres, size, strict=True):
+        pixel = (np.arange(length) + 0.5) / binning - 0.5
+        along.append(np.interp(pixel, at, np.arange(len(at))).astype(np.float32))
+    columns, rows = np.meshgrid(along[1], along[0])
+    return columns, rows
+
+
+def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
+    """Return the variance of the disparity of every sample (y, x) over what the patches believe."""
+    mean = volume.probability @ volume.disparities
+    square = volume.probability @ np.square(volume.disparities)
+    spread = np.maximum(square - np.square(mean), 0).astype(np.float32)
+    columns, rows = _pixel_maps(volume, size, binning)
+    return cv2.remap(spread, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
 def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
     """Return the disparity of every sample (y, x): the mean about the likeliest label.
 
     Probabilities are interpolated between the patches' centres.
     """
-    maps = []
-    for at, length in zip(volume.centres, size, strict=True):
-        pixel = (np.arange(length) + 0.5) / binning - 0.5
-        maps.append(np.interp(pixel, at, np.arange(len(at))).astype(np.float32))
-    columns, rows = np.meshgrid(maps[1], maps[0])
+    columns, rows = _pixel_maps(volume, size, binning)
     best = np.full(size, -1.0, dtype=np.float32)
     which = np.zeros(size, dtype=np.int64)
 

@@ -22,11 +22,13 @@ from reconstruction.adaptive.refine import slopes
 Array32 = NDArray[np.float32]
 HELD_SHARE = 0.02
 SMOOTH_PX = 2.0
-CORRELATED_PX = 0.25
+CORRELATED_PX = 0.2
 """Errors of a texture are alike over about so far, exp(-r / it). With LET_IN fitted on crops of
 four real scenes, so that 68 % of the errors lie within one deviation on average."""
-LET_IN = 5.0
+LET_IN = 10.0
 """Variance of the texture over that of the noise which its last step let in."""
+SURE_PX = 0.05
+"""Deviation of a disparity that the patches agree on."""
 FEWEST = 50
 """Held-out readings below which nothing is fitted."""
 
@@ -42,7 +44,8 @@ def held_out(
 class Deviation:
     """sigma: (v, u, y, x), of a value of any colour there. held: how many readings were kept from
     the fit. blur, slip: the fitted weights of squared slopes, alike in all views, and of those
-    along the parallax: squares of lengths in pixels, and of errors of the disparity."""
+    along the parallax: the square of a length in pixels, and a factor on the disparity's variance.
+    """
 
     sigma: Array32
     held: int
@@ -50,7 +53,7 @@ class Deviation:
     slip: float
 
 
-def _parts(scene: Scene) -> Array32:
+def _parts(scene: Scene, doubt: Array32) -> Array32:
     """Return the variance's parts, (3, v, u, y, x): noise let in, slopes, those by parallax."""
     let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
     steep = np.square(slopes(scene.clean[0])).mean(axis=1)
@@ -61,9 +64,8 @@ def _parts(scene: Scene) -> Array32:
     v = (np.arange(views_v) - views_v // 2)[:, None, None, None]
     u = (np.arange(views_u) - views_u // 2)[None, :, None, None]
     noise, along_y, along_x = (seen[..., i] for i in range(3))
-    return np.stack([LET_IN * noise, along_y + along_x, v**2 * along_y + u**2 * along_x]).astype(
-        np.float32
-    )
+    slip = (v**2 * along_y + u**2 * along_x) * (doubt + SURE_PX**2)
+    return np.stack([LET_IN * noise, along_y + along_x, slip]).astype(np.float32)
 
 
 def _gathered(scene: Scene, parts: Array32, held: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -91,16 +93,20 @@ def _gathered(scene: Scene, parts: Array32, held: NDArray[np.bool_]) -> NDArray[
 
 
 def deviation(
-    scene: Scene, frames: Array32, noise_sigma: float, held: NDArray[np.bool_]
+    scene: Scene,
+    doubt: Array32,
+    frames: Array32,
+    noise_sigma: float,
+    held: NDArray[np.bool_],
 ) -> Deviation | None:
     """Return the standard deviation of the scene's light field; None with too few readings held.
 
-    frames, held: (shot, pixel_y, pixel_x).
+    doubt: (y, x), variance of the disparity. frames, held: (shot, pixel_y, pixel_x).
     """
     count = int(held.sum())
     if count < FEWEST:
         return None
-    parts = _parts(scene)
+    parts = _parts(scene, doubt)
     missed = (frames - scene.surfaces.forward(scene.texture))[held].astype(np.float64)
     noise, blur, slip = _gathered(scene, parts, held)
     base = noise_sigma**2 + noise + 1e-12
@@ -110,7 +116,7 @@ def deviation(
         # Student's t of 4 degrees: a few wild readings (occlusions) must not set the scale.
         return float(np.sum(np.log(variance) + 5 * np.log1p(missed**2 / (4 * variance))))
 
-    found = minimize(surprise, np.log([0.1, 0.01]), method="Nelder-Mead").x
+    found = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
     weights = np.exp(found)
     variance = parts[0] + weights[0] * parts[1] + weights[1] * parts[2]
     return Deviation(np.sqrt(variance).astype(np.float32), count, *map(float, weights))
