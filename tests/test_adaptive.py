@@ -27,11 +27,12 @@ from reconstruction.tv import reconstruct_tv
 
 
 def textured(size, seed=0, detail=1.5):
-    """A picture (c, y, x) of smooth blobs in related colours, in [0, 1]."""
+    """A picture (c, y, x) of smooth blobs in related colours, flat at the left, in [0, 1]."""
     rng = np.random.default_rng(seed)
     grey = cv2.GaussianBlur(rng.normal(size=size), (0, 0), detail)
     tint = cv2.GaussianBlur(rng.normal(size=(*size, 3)), (0, 0), 2 * detail)
-    picture = 0.5 + 0.18 * (grey / grey.std())[..., None] + 0.05 * tint / tint.std()
+    blobs = 0.18 * (grey / grey.std())[..., None] + 0.05 * tint / tint.std()
+    picture = 0.5 + (np.arange(size[1]) > 18)[:, None] * blobs
     return np.moveaxis(np.clip(picture, 0, 1), -1, 0).astype(np.float32)
 
 
@@ -205,8 +206,8 @@ def planted(bayer):
 def test_a_planted_plane_is_recovered_with_its_disparity(bayer, planted):
     truth, frames, sigma, found = planted
     assert found.status == "converged"
-    inner = found.maps["disparity"][6:-6, 6:-6]
-    assert np.median(inner) == pytest.approx(0.7, abs=0.05)
+    inner = found.maps["disparity"][6:-6, 26:-6]
+    assert np.median(inner) == pytest.approx(0.7, abs=0.08)
     assert np.mean(np.abs(inner - 0.7) < 0.2) > 0.9
     rival = reconstruct_tv(bayer, frames, sigma).light_field
     assert psnr_db(found.light_field, truth) > psnr_db(rival, truth) + 3
@@ -216,10 +217,11 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
     truth, _, _, found = planted
     error = np.abs(found.light_field - truth)
     sigma = found.maps["sigma"][..., None]
-    assert np.mean(error <= sigma) == pytest.approx(0.68, abs=0.15)
-    # Where more error is announced, there is more.
-    bold = sigma[..., 0] < np.median(sigma)
-    assert np.sqrt(np.mean(error[bold] ** 2)) < np.sqrt(np.mean(error[~bold] ** 2))
+    # On five crops of real scenes 51 to 86 % lay within one deviation.
+    assert 0.5 < np.mean(error <= sigma) < 0.87
+    # The flat part is known better, and said to be.
+    for known in (sigma[..., 0], np.sqrt(np.square(error).mean(axis=-1))):
+        assert known[..., :12].mean() < 0.9 * known[..., -20:].mean()
 
 
 def test_the_model_map_names_a_model_everywhere(planted):
@@ -227,7 +229,9 @@ def test_the_model_map_names_a_model_everywhere(planted):
     assert model.shape == (48, 56)
     assert model.max() < len(MODELS)
     one_layer = np.isin(model, [MODELS.index("plane"), MODELS.index("slanted")])
-    assert one_layer.mean() > 0.6
+    assert one_layer[:, 30:].mean() > 0.6
+    flat = model == MODELS.index("flat")
+    assert flat[:, :10].mean() > 0.3 > flat[:, 30:].mean()
 
 
 def test_a_mask_that_treats_all_views_alike_leaves_the_evidence_flat():
