@@ -75,7 +75,7 @@ def test_the_evidence_is_the_log_likelihood_of_a_dense_student_t(coded_psi, cfa,
         texture = 0.04 * 0.25 * prior.covariance(square) * colours[c[:, None], c[None]]
         scale = matrix @ texture @ matrix.T + np.diag(variance[rows])
         m, freedom = rows.sum(), prior.freedom
-        dense = multivariate_t(np.zeros(m), scale, df=freedom)
+        dense = multivariate_t(np.zeros(m), scale, df=int(freedom))
         at_zero = dense.logpdf(np.zeros(m)) + 0.5 * np.linalg.slogdet(scale)[1]
         assert value == pytest.approx(dense.logpdf(data[rows]) - at_zero, abs=2e-2)
 
@@ -141,7 +141,7 @@ def test_the_fit_is_the_posterior_mean_of_dense_algebra(random_psi):
     prior = rng.random(shape).astype(np.float32)
     frames = rng.random(psi.frames_shape).astype(np.float32)
     precision = rng.uniform(1, 20, psi.frames_shape).astype(np.float32)
-    columns = np.eye(np.prod(shape), dtype=np.float32)
+    columns = np.eye(int(np.prod(shape)), dtype=np.float32)
     matrix = np.stack([surfaces.forward(c.reshape(shape)).ravel() for c in columns], axis=1)
     weighted = matrix.T * precision.ravel()
     dense = np.linalg.solve(

@@ -17,7 +17,7 @@ from scipy import sparse
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.bands import in_bands
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 TAPS = 4
 MOST_ENTRIES = 120_000_000
 """Beyond which rays are followed instead: 8 bytes each."""
@@ -168,10 +168,10 @@ def _walk(
 
 def assembled(
     psi: ImagingMatrix,
-    disparity: Array32,
+    disparity: Array,
     hidden: NDArray[np.uint8],
     margin: int,
-    slopes: Array32 | None = None,
+    slopes: Array | None = None,
 ) -> sparse.csr_array | None:
     """Return Psi of surfaces, (readings, 2 x 3 x texture); None where it would grow too large.
 

@@ -15,7 +15,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.patch_term import PatchTerm
 from reconstruction.tv import TVSettings, reconstruct_tv
 
-Array32 = NDArray[np.floating]
+Array = NDArray[np.floating]
 WINDOW_PX = 3.0
 """Deviation of the window within which misfit is averaged."""
 ACCEPTED = 1.5
@@ -31,7 +31,7 @@ LEAST_NOISE = 1e-3
 
 
 def misfit(
-    psi: ImagingMatrix, missed: Array32, noise_sigma: float, usable: NDArray[np.bool_]
+    psi: ImagingMatrix, missed: Array, noise_sigma: float, usable: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Return the variance of the light field that the missed part of the readings speaks for.
 
@@ -52,7 +52,7 @@ def misfit(
 
 def freed(
     psi: ImagingMatrix,
-    frames: Array32,
+    frames: Array,
     noise_sigma: float,
     usable: NDArray[np.bool_],
     light_field: NDArray[np.float32],

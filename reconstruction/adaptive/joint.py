@@ -22,7 +22,7 @@ from reconstruction.adaptive.shrinkage import denoised
 from reconstruction.adaptive.texture import background, fitted
 from reconstruction.adaptive.visibility import carried
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 
 class TextureSettings(Settings):
@@ -57,12 +57,12 @@ class Scene:
     view's disparity (y, x), without the margin that the textures have."""
 
     surfaces: Surfaces
-    texture: Array32
-    clean: Array32
-    centre: Array32
+    texture: Array
+    clean: Array
+    centre: Array
 
 
-def surfaces_of(psi: ImagingMatrix, padded: Array32, margin: int, nearer: int) -> Surfaces:
+def surfaces_of(psi: ImagingMatrix, padded: Array, margin: int, nearer: int) -> Surfaces:
     """Return Psi of the surfaces of the centre view's disparity, padded by a margin (y, x)."""
     disparity, hidden = carried(padded, margin, nearer, psi.light_field_shape[:4])
     return Surfaces(psi, disparity, hidden, margin)
@@ -70,11 +70,11 @@ def surfaces_of(psi: ImagingMatrix, padded: Array32, margin: int, nearer: int) -
 
 def solve(
     psi: ImagingMatrix,
-    centre: Array32,
+    centre: Array,
     nearer: int,
-    frames: Array32,
-    precision: Array32,
-    picture: Array32,
+    frames: Array,
+    precision: Array,
+    picture: Array,
     settings: TextureSettings,
     layers: bool = True,
     on_step: Callable[[int], None] | None = None,

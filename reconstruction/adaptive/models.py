@@ -37,7 +37,8 @@ def model_map(
     pixel_x).
     """
     textured = texture > 0
-    slope = cv2.GaussianBlur(np.hypot(*np.gradient(scene.centre)).astype(np.float32), (0, 0), 3.0)
+    down, right = np.gradient(scene.centre)
+    slope = cv2.GaussianBlur(np.hypot(down, right).astype(np.float32), (0, 0), 3.0)
     around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
     layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0
     far_off = unexplained.repeat(binning, axis=0).repeat(binning, axis=1) > FREE**2

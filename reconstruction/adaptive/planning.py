@@ -48,13 +48,13 @@ def patch_error(
     first = (SIDE - TARGETS) // 2
     inner = (np.minimum(y, x) >= first) & (np.maximum(y, x) < first + TARGETS)
     alike = prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
-    rays = np.zeros((psi.shots, SIDE // k, SIDE // k, 3, len(at)))
+    rays = np.zeros((psi.shots, SIDE // k, SIDE // k, 3, at.shape[0]))
     for shot in range(psi.shots):
         for kind in range(part.weights.shape[4]):
             weights = part.weights[shot, v, u, y, kind, x]
             colour = kind if part.colour is None else part.colour[shot, y, x]
-            rays[shot, y // k, x // k, colour, np.arange(len(at))] = weights
-    opponent = np.einsum("oc,mcr->omr", OPPONENT, rays.reshape(-1, 3, len(at)))
+            rays[shot, y // k, x // k, colour, np.arange(at.shape[0])] = weights
+    opponent = np.einsum("oc,mcr->omr", OPPONENT, rays.reshape(-1, 3, at.shape[0]))
     variances = amplitude * np.array([1, chroma, chroma])
     seen = [axis @ alike for axis in opponent]
     covariance = sum(

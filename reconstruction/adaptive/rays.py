@@ -21,7 +21,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, assembled, cubic, first_tap
 from reconstruction.adaptive.bands import in_bands
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -118,7 +118,7 @@ class Surfaces:
     """
 
     def __init__(
-        self, psi: ImagingMatrix, disparity: Array32, hidden: NDArray[np.uint8], margin: int
+        self, psi: ImagingMatrix, disparity: Array, hidden: NDArray[np.uint8], margin: int
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
@@ -136,7 +136,7 @@ class Surfaces:
     def _transposed(self) -> sparse.csc_array | None:
         return None if self._matrix is None else self._matrix.T
 
-    def _project(self, textures: Array32, factors: Array32) -> Array32:
+    def _project(self, textures: Array, factors: Array) -> Array:
         frames = np.zeros(self.psi.frames_shape, dtype=np.float32)
         psi, rows = self.psi, self.psi.frames_shape[1]
 
@@ -159,7 +159,7 @@ class Surfaces:
         in_bands(work, rows)
         return frames
 
-    def _back(self, frames: Array32, factors: Array32) -> Array32:
+    def _back(self, frames: Array, factors: Array) -> Array:
         psi, rows = self.psi, self.psi.frames_shape[1]
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         # Bands of rows reach the same texture: each adds to its own.
@@ -187,19 +187,19 @@ class Surfaces:
         in_bands(work, rows, len(textures))
         return sum(textures[1:], start=textures[0])
 
-    def forward(self, textures: Array32) -> Array32:
+    def forward(self, textures: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of textures (layer, c, y, x)."""
         if self._matrix is None:
             return self._project(textures[None], self._even)
         return (self._matrix @ textures.ravel()).reshape(self.psi.frames_shape)
 
-    def adjoint(self, frames: Array32) -> Array32:
+    def adjoint(self, frames: Array) -> Array:
         """Return the adjoint of `forward`, (layer, c, y, x)."""
         if self._transposed is None:
             return self._back(frames, self._even)[0]
         return (self._transposed @ frames.ravel()).reshape(self.textures_shape)
 
-    def derivative(self, slopes: Array32) -> tuple[Callable, Callable]:
+    def derivative(self, slopes: Array) -> tuple[Callable, Callable]:
         """Return how frames change with the centre view's disparity, and the adjoint of that.
 
         slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. The first maps
@@ -214,17 +214,17 @@ class Surfaces:
                 lambda missed: (transposed @ missed.ravel()).reshape(size),
             )
 
-        def forward(change: Array32) -> Array32:
+        def forward(change: Array) -> Array:
             both = np.zeros((2, *self.textures_shape), dtype=np.float32)
             both[:, 0] = slopes * change
             return self._project(both, self._slopes)
 
-        def adjoint(missed: Array32) -> Array32:
+        def adjoint(missed: Array) -> Array:
             return (slopes * self._back(missed, self._slopes)[:, 0]).sum(axis=(0, 1))
 
         return forward, adjoint
 
-    def light_field(self, textures: Array32) -> Array32:
+    def light_field(self, textures: Array) -> Array:
         """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""
         out = np.empty(self.psi.light_field_shape, dtype=np.float32)
 

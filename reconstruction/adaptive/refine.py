@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.texture import conjugate_gradients
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 EVEN_PX = 0.02
 """Differences below count as none, when the squares are reweighted."""
 TRUSTED_STEP_PX = 0.25
 
 
-def slopes(texture: Array32) -> Array32:
+def slopes(texture: Array) -> Array:
     """Return the derivatives (2, c, y, x) along y and x of a texture (c, y, x)."""
     return np.stack([np.gradient(texture, axis=1), np.gradient(texture, axis=2)])
 
 
-def _smoothness(centre: Array32, slope_px: float) -> tuple[Array32, Array32]:
+def _smoothness(centre: Array, slope_px: float) -> tuple[Array, Array]:
     """Return the weights of squared differences along y and x, for the Laplace prior."""
     return tuple(
         (1 / (slope_px * np.sqrt(np.square(np.diff(centre, axis=axis)) + EVEN_PX**2))).astype(
@@ -34,7 +34,7 @@ def _smoothness(centre: Array32, slope_px: float) -> tuple[Array32, Array32]:
     )  # type: ignore[return-value]
 
 
-def _roughness(weights: tuple[Array32, Array32], field: Array32) -> Array32:
+def _roughness(weights: tuple[Array, Array], field: Array) -> Array:
     """Return the gradient of half the weighted squared differences of a field (y, x)."""
     out = np.zeros_like(field)
     down = weights[0] * np.diff(field, axis=0)
@@ -48,13 +48,13 @@ def _roughness(weights: tuple[Array32, Array32], field: Array32) -> Array32:
 
 def refined(
     surfaces: Surfaces,
-    centre: Array32,
-    texture: Array32,
-    residual: Array32,
-    precision: Array32,
+    centre: Array,
+    texture: Array,
+    residual: Array,
+    precision: Array,
     slope_px: float = 0.1,
     steps: int = 8,
-) -> Array32:
+) -> Array:
     """Return the padded disparity (y, x) of the centre view after one step.
 
     texture: (c, y, x) of the centre view, padded. residual: the frames less what the texture
@@ -64,7 +64,7 @@ def refined(
     weights = _smoothness(centre, slope_px)
     ridge = np.float32(1 / TRUSTED_STEP_PX**2)
 
-    def normal(change: Array32) -> Array32:
+    def normal(change: Array) -> Array:
         return gather(precision * spread(change)) + _roughness(weights, change) + ridge * change
 
     rhs = gather(precision * residual) - _roughness(weights, centre)

@@ -56,7 +56,7 @@ class Volume:
     """
 
     disparities: NDArray[np.float64]
-    centres: tuple[NDArray[np.float64], NDArray[np.float64]]
+    centres: tuple[Array, Array]
     probability: NDArray[np.float32]
     kind: NDArray[np.int64]
     decisive: NDArray[np.bool_]
@@ -205,13 +205,18 @@ def _pixel_maps(
     return columns, rows
 
 
+def _interpolated(grid: Array, columns: Array, rows: Array) -> NDArray[np.float32]:
+    found = cv2.remap(grid, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found, dtype=np.float32)
+
+
 def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
     """Return the variance of the disparity of every sample (y, x) over what the patches believe."""
     mean = volume.probability @ volume.disparities
     square = volume.probability @ np.square(volume.disparities)
     spread = np.maximum(square - np.square(mean), 0).astype(np.float32)
     columns, rows = _pixel_maps(volume, size, binning)
-    return cv2.remap(spread, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return _interpolated(spread, columns, rows)
 
 
 def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
@@ -225,7 +230,7 @@ def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np
 
     def spread(label: int) -> NDArray[np.float32]:
         layer = np.ascontiguousarray(volume.probability[..., label])
-        return cv2.remap(layer, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return _interpolated(layer, columns, rows)
 
     for label in range(len(volume.disparities)):
         chance = spread(label)

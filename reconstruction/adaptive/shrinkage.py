@@ -19,14 +19,14 @@ from scipy.fft import dct
 from reconstruction.adaptive.bands import in_bands
 from reconstruction.problem import OPPONENT
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 SIDE = 8
 STACK = 16
 REACH = 9
 """Blocks are searched within so many samples along each axis."""
 ALIKE = 4.0
 """Mean square difference of blocks that are stacked, at most, over the noise's variance."""
-_COSINES = np.ascontiguousarray(dct(np.eye(SIDE), axis=0, norm="ortho").astype(np.float32))
+_COSINES = np.asarray(dct(np.eye(SIDE), axis=0, norm="ortho"), dtype=np.float32)
 _TRANSPOSED = np.ascontiguousarray(_COSINES.T)
 _OPPONENT = OPPONENT.astype(np.float32)
 
@@ -152,15 +152,15 @@ def _starts(length: int, step: int, first: int) -> NDArray[np.int64]:
 
 
 def denoised(
-    picture: Array32,
-    guide: Array32,
+    picture: Array,
+    guide: Array,
     sigma: float,
     step: int = 4,
     first: int = 0,
     threshold: float = 2.7,
     chroma: float = 2.5,
     reach: int = REACH,
-) -> Array32:
+) -> Array:
     """Return a picture (c, y, x) in RGB without white noise of deviation sigma in every colour.
 
     guide: (c, y, x), a cleaner picture, in which like blocks are found. step: between reference

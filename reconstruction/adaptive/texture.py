@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from reconstruction.adaptive.rays import Surfaces
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 
 def conjugate_gradients(
-    apply: Callable[[Array32], Array32], rhs: Array32, steps: int, rtol: float = 1e-5
-) -> Array32:
+    apply: Callable[[Array], Array], rhs: Array, steps: int, rtol: float = 1e-5
+) -> Array:
     """Return the solution of apply(x) = rhs from x = 0, apply symmetric and positive definite."""
     x = np.zeros_like(rhs)
     residual = rhs.copy()
@@ -37,12 +37,12 @@ def conjugate_gradients(
 
 def fitted(
     surfaces: Surfaces,
-    frames: Array32,
-    precision: Array32,
-    prior: Array32,
+    frames: Array,
+    precision: Array,
+    prior: Array,
     sigma: float,
     steps: int,
-) -> Array32:
+) -> Array:
     """Return the texture (layer, c, y, x) near `prior`, deviation sigma, that explains the frames.
 
     The minimiser of 1/2 |S^-1/2 (Psi W T - I)|^2 + |T - prior|^2 / (2 sigma^2), S the variance of
@@ -53,13 +53,13 @@ def fitted(
     ridge = np.float32(1 / sigma**2)
     rhs = surfaces.adjoint(precision * (frames - surfaces.forward(prior)))
 
-    def normal(textures: Array32) -> Array32:
+    def normal(textures: Array) -> Array:
         return surfaces.adjoint(precision * surfaces.forward(textures)) + ridge * textures
 
     return prior + conjugate_gradients(normal, rhs, steps)
 
 
-def background(front: Array32, centre: Array32, nearer: int, reach: int) -> Array32:
+def background(front: Array, centre: Array, nearer: int, reach: int) -> Array:
     """Return the texture (c, y, x) behind the nearest surfaces: the further ones', continued.
 
     front: texture of the centre view. centre: its disparity (y, x). reach: samples that surfaces

@@ -19,8 +19,8 @@ from scipy.optimize import minimize
 from reconstruction.adaptive.joint import Scene
 from reconstruction.adaptive.refine import slopes
 
-Array32 = NDArray[np.float32]
-HELD_SHARE = 0.02
+Array = NDArray[np.floating]
+HELD_SHARE, MOST_SHARE = 0.02, 0.06
 SMOOTH_PX = 2.0
 CORRELATED_PX = 0.5
 """Errors of a texture are alike over about so far, exp(-r / it). With LET_IN fitted on five crops
@@ -38,7 +38,11 @@ FEWEST = 50
 def held_out(
     usable: NDArray[np.bool_], share: float = HELD_SHARE, seed: int = 0
 ) -> NDArray[np.bool_]:
-    """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit."""
+    """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit.
+
+    More than the share where there are few, so that a deviation can be fitted to them.
+    """
+    share = min(max(share, 2 * FEWEST / max(int(usable.sum()), 1)), MOST_SHARE)
     return usable & (np.random.default_rng(seed).random(usable.shape) < share)
 
 
@@ -49,13 +53,13 @@ class Deviation:
     along the parallax: the square of a length in pixels, and a factor on the disparity's variance.
     """
 
-    sigma: Array32
+    sigma: Array
     held: int
     blur: float
     slip: float
 
 
-def _parts(scene: Scene, doubt: Array32) -> Array32:
+def _parts(scene: Scene, doubt: Array) -> Array:
     """Return the variance's parts, (3, v, u, y, x): noise let in, slopes, those by parallax."""
     let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
     steep = np.square(slopes(scene.clean[0])).mean(axis=1)
@@ -70,12 +74,12 @@ def _parts(scene: Scene, doubt: Array32) -> Array32:
     return np.stack([LET_IN * noise, along_y + along_x, slip]).astype(np.float32)
 
 
-def _gathered(scene: Scene, parts: Array32, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _gathered(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return what the parts add to the variance of the held-out readings, (part, reading)."""
     psi = scene.surfaces.psi
     k = psi.binning
     shot, pixel_y, pixel_x = np.nonzero(held)
-    steps = np.stack(np.indices(parts.shape[1:3]), axis=-1).reshape(-1, 2)
+    steps = np.indices(parts.shape[1:3]).reshape(2, -1).T
     apart = np.linalg.norm((steps[:, None] - steps[None]).astype(np.float64), axis=-1)
     out = np.zeros((len(parts), len(shot)))
     for sub_y in range(k):
@@ -96,8 +100,8 @@ def _gathered(scene: Scene, parts: Array32, held: NDArray[np.bool_]) -> NDArray[
 
 def deviation(
     scene: Scene,
-    doubt: Array32,
-    frames: Array32,
+    doubt: Array,
+    frames: Array,
     noise_sigma: float,
     held: NDArray[np.bool_],
 ) -> Deviation | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from reconstruction.adaptive.bands import in_bands
 
-Array32 = NDArray[np.float32]
+Array = NDArray[np.floating]
 REACH = 0.75
 """A point covers the samples within this distance along each axis."""
 SAME_SURFACE = 0.35
@@ -93,8 +93,8 @@ def _settled(centre, margin, d, y, x, dv, du):
 
 
 def carried(
-    centre: Array32, margin: int, nearer: int, shape: tuple[int, int, int, int]
-) -> tuple[Array32, NDArray[np.uint8]]:
+    centre: Array, margin: int, nearer: int, shape: tuple[int, int, int, int]
+) -> tuple[Array, NDArray[np.uint8]]:
     """Return every ray's disparity and whether the centre view cannot see it, both (v, u, y, x).
 
     centre: the centre view's disparity, padded by `margin` samples. nearer: 1 when points of
