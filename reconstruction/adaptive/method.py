@@ -181,7 +181,7 @@ def reconstruct_adaptive(
             "disparities": len(volume.disparities),
             "search_seconds": searched_s,
             "held_readings": int(held.sum()),
-            "explained": np.nan if explained is None else explained,
+            **({} if explained is None else {"explained": explained}),
             **{
                 f"share_{name.replace(' ', '_')}": float(v)
                 for name, v in zip(MODELS, shares, strict=True)

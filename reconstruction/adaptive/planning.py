@@ -60,7 +60,7 @@ def patch_error(
     covariance = sum(
         size * near @ axis.T for size, near, axis in zip(variances, seen, opponent, strict=True)
     )
-    factor = cho_factor(covariance + variance * np.eye(len(covariance)))
+    factor = cho_factor(covariance + variance * np.eye(opponent.shape[1]))
     error = 0.0
     for size, near in zip(variances, seen, strict=True):
         cross = size * near[:, inner]
