@@ -51,7 +51,8 @@ def test_the_stated_psnr_is_that_of_the_deviation():
         next_shot.stated_psnr_db(dataclasses.replace(result, maps={}))
 
 
-def test_shots_are_planned_until_the_target_or_the_most():
+def test_shots_are_planned_until_the_target_or_the_most(monkeypatch):
+    monkeypatch.setattr(next_shot, "POSITIONS", 2)
     camera = find_camera(CAMERA)
     rows = list(next_shot.shot_plan("deep-occlusions", camera, SIZE, 60.0, 2, 0))
     assert [row.shots for row in rows] == [1, 2]
