@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
+MOST_SHOTS = 5
+"""Simulated when the target is not reached."""
 DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 
@@ -367,9 +369,20 @@ def chart(
     peers: Annotated[
         bool, typer.Option("--peers", help="time the primal-dual step, and pyproximal's beside")
     ] = False,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="what each piece of the adaptive method buys")
+    ] = False,
+    next_shot: Annotated[
+        bool, typer.Option("--next-shot", help="how many shots a scene needs, and which")
+    ] = False,
+    until: Annotated[
+        float, typer.Option("--until", help="PSNR, dB, at which --next-shot stops")
+    ] = 30.0,
     dictionary: DictionaryOption = None,
     camera: CameraOption = "rgbw-bayer-1shot",
-    size: SizeOption = "593x840",
+    scene: SceneOption = DEFAULT_SCENE,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
     out: OutOption = Path("emmc-kernels"),
 ) -> None:
@@ -381,13 +394,20 @@ def chart(
     if solvers:
         _chart_solvers(camera, dictionary, out)
         return
-    if not kernels and not peers:
-        raise typer.BadParameter("say what to chart: --kernels, --solvers or --peers")
-    if peers:
-        _chart_peers(camera, size, repeats, out)
+    if ablation:
+        _chart_ablation(scene, camera, _size(size) or (128, 160), seed, out)
         return
-    described, shape = find_camera(camera), _size(size)
-    assert shape is not None
+    if next_shot:
+        _chart_next_shot(scene, camera, _size(size) or (128, 160), until, seed, out)
+        return
+    if not kernels and not peers:
+        raise typer.BadParameter(
+            "say what to chart: --kernels, --solvers, --peers, --ablation or --next-shot"
+        )
+    described, shape = find_camera(camera), _size(size) or (593, 840)
+    if peers:
+        _chart_peers(camera, shape, repeats, out)
+        return
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
     rows = []
     with result_folder(out) as folder:
@@ -511,13 +531,63 @@ def tables(
         typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
 
 
-def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
+def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:
+    from emmc_rig.ablation import ablations
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    table = Table("adaptive", "dB", "s", "buys dB", "costs s")
+    rows = []
+    with result_folder(out) as folder:
+        for row in ablations(scene, camera, find_camera(camera), size, seed, folder):
+            rows.append(row.as_dict())
+            table.add_row(
+                row.name,
+                f"{row.psnr_db:.2f}",
+                f"{row.seconds:.1f}",
+                f"{row.buys_db:+.2f}",
+                f"{row.costs_s:+.1f}",
+            )
+        metrics = {"scene": scene, "camera": camera, "size": list(size), "rows": rows}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
+
+
+def _chart_next_shot(
+    scene: str, camera: str, size: tuple[int, int], until: float, seed: int, out: Path
+) -> None:
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.next_shot import shot_plan
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    table = Table("shots", "mask positions", "stated dB", "dB", "positions in order, dB")
+    rows = []
+    with result_folder(out) as folder:
+        for row in shot_plan(scene, find_camera(camera), size, until, MOST_SHOTS, seed):
+            rows.append(row.as_dict())
+            table.add_row(
+                str(row.shots),
+                " ".join(map(str, row.positions)),
+                f"{row.stated_db:.2f}",
+                f"{row.psnr_db:.2f}",
+                f"{row.fixed_db:.2f}",
+            )
+        metrics = {"scene": scene, "camera": camera, "size": list(size), "rows": rows}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
+    reached = rows[-1]["stated_db"] >= until
+    typer.echo(
+        f"{rows[-1]['shots']} shot(s): the stated PSNR "
+        + (f"reaches {until:g} dB" if reached else f"stays below {until:g} dB")
+    )
+
+
+def _chart_peers(camera: str, shape: tuple[int, int], repeats: int, out: Path) -> None:
     from emmc_rig.benchmarks.variational import variational_timings
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
-    described, shape = find_camera(camera), _size(size)
-    assert shape is not None
+    described = find_camera(camera)
     table = Table("primal-dual step", "ms", "times ours")
     rows = []
     with result_folder(out) as folder:

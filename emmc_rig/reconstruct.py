@@ -8,7 +8,7 @@ then the imaging matrix is measured from its whiteboards, and brackets are fused
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress
 from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
 
-FRAMES, PSI, LIGHT_FIELD = "frames.h5", "psi.h5", "light_field.h5"
+FRAMES, PSI, LIGHT_FIELD, MAPS = "frames.h5", "psi.h5", "light_field.h5", "maps.h5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +170,17 @@ def run_reconstruct(
         metrics["replicate_psnr_db"] = psnr_db(replicate_centre(true), true)
     save_hdf5(out / LIGHT_FIELD, result.light_field, {"method": result.method})
     export_pictures(out / "pictures", result.light_field, focus_disparities(result.light_field))
+    if result.maps:
+        save_maps(out / MAPS, result.maps)
     write_metrics(out, metrics)
     return metrics
+
+
+def save_maps(path: Path, maps: Mapping[str, NDArray]) -> None:
+    """Write what a method found beside the light field, one HDF5 data set for each name."""
+    with h5py.File(path, "w") as file:
+        for name, values in maps.items():
+            file.create_dataset(name, data=values, compression="lzf")
 
 
 def run_in_tiles(

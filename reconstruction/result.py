@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,8 @@ class Progress:
 class Reconstruction:
     """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when `status` is converged.
 
-    objective: (step, value) pairs. parameters: what the solver chose or was given.
+    objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
+    it found, by name: `disparity` (y, x) in pixels per view step, ...
     """
 
     method: str
@@ -36,8 +38,9 @@ class Reconstruction:
     objective: tuple[tuple[int, float], ...]
     seconds: float
     parameters: dict[str, float]
+    maps: Mapping[str, NDArray] = field(default_factory=dict)
 
     def without_light_field(self) -> Reconstruction:
-        """Return the result with an empty light field, to keep many."""
+        """Return the result with an empty light field and no maps, to keep many."""
         empty = np.empty((0, 0, 0, 0, 3), dtype=np.float32)
-        return replace(self, light_field=empty)
+        return replace(self, light_field=empty, maps={})

@@ -17,6 +17,8 @@ from emmc_rig.reconstruct import (
     run_reconstruct,
 )
 from emmc_rig.simulate import simulate
+from reconstruction.adaptive.joint import TextureSettings
+from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError, ReconstructionError
 
@@ -114,3 +116,20 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
 def test_a_misspelt_method_is_told_first(tmp_path):
     with pytest.raises(ReconstructionError, match="did you mean 'tv'"):
         run_reconstruct(tmp_path, tmp_path, "tvv")
+
+
+def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames, tmp_path):
+    settings = load_settings(None).model_copy(
+        update={"adaptive": AdaptiveSettings(texture=TextureSettings(steps=3, refine_steps=1))}
+    )
+    metrics = run_reconstruct(frames, tmp_path, "adaptive", settings=settings, truth=SCENE)
+    assert metrics["psnr_db"] > 12
+    with h5py.File(tmp_path / "maps.h5") as file:
+        shapes = {name: values.shape for name, values in file.items()}
+    assert shapes == {
+        "disparity": SIZE,
+        "hidden": SIZE,
+        "model": SIZE,
+        "texture": SIZE,
+        "sigma": (5, 5, *SIZE),
+    }

@@ -1,0 +1,1 @@
+"""Adaptive reconstruction: the measurements choose, per place, how much model they support."""

@@ -1,0 +1,186 @@
+"""How well a Gaussian texture on a plane explains a patch's readings, for every disparity.
+
+Within a patch the scene is a texture T on a plane at disparity d, seen by the ray through sample x
+of view u as T(x - d u). T less a smooth picture is Gaussian with covariance a k(|x - x'|) in
+luminance and a b k in each chrominance, k(r) = exp((e - sqrt(r^2 + e^2)) / l): power laws like a
+natural picture's up to the optics' blur e. The patch's m readings are then Gaussian too, with
+covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evidence) judges d, the
+amplitude a and the colourfulness b alike, and pays for what a model could have explained but
+did not see (Occam's factor, log det).
+
+Operations of a patch: m^2 / 2 (R^2 + S D) + D H m^3 / 6 with R rays a pixel (25, or 25 k^2), S
+distinct separations of them (81), D disparities, H pairs of amplitude and colourfulness.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive.evidence_kernels import LANES, TERMS, evidence
+from reconstruction.errors import ReconstructionError
+
+Array = NDArray[np.floating]
+PROBES = 4
+
+
+@dataclass(frozen=True)
+class TexturePrior:
+    """Covariances of textures: correlation length and blur in samples, and the kinds to judge.
+
+    kinds: (a, b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared
+    brightness, and that of a chrominance over that of luminance. The first is next to flat.
+    """
+
+    length_px: float = 3.0
+    blur_px: float = 0.7
+    kinds: tuple[tuple[float, float], ...] = (
+        (3e-5, 0.1),
+        (1e-3, 0.2),
+        (1e-3, 0.03),
+        (2e-2, 0.2),
+        (2e-2, 0.03),
+        (4e-1, 0.2),
+        (4e-1, 0.03),
+    )
+    freedom: float = 3.0
+
+    def covariance(self, square_px: Array) -> Array:
+        """Return the correlation of points at a squared distance, 1 at 0 (any shape)."""
+        blur = self.blur_px
+        return np.exp((blur - np.sqrt(square_px + blur**2)) / self.length_px)
+
+
+@dataclass(frozen=True)
+class EvidencePatches:
+    """Patches of pixels: corners (y, x) every `stride` pixels, `side` x `side` pixels, `spacing`
+    apart."""
+
+    side: int
+    stride: int
+    spacing: int = 1
+
+    def grid(self, pixels: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows and the columns of corners that cover a sensor of `pixels`."""
+        span = (self.side - 1) * self.spacing + 1
+        if min(pixels) < span:
+            raise ReconstructionError(
+                f"patches of {span} pixels do not fit a sensor of {pixels[0]}x{pixels[1]}: "
+                "use a larger window"
+            )
+        along = [
+            np.unique(np.append(np.arange(0, whole - span + 1, self.stride), whole - span))
+            for whole in pixels
+        ]
+        return along[0], along[1]
+
+    def places(self, shots: int) -> NDArray[np.int64]:
+        """Return the patch's readings: shot, row and column from the corner, (reading, 3)."""
+        steps = np.arange(self.side) * self.spacing
+        parts = np.meshgrid(np.arange(shots), steps, steps, indexing="ij")
+        return np.stack([part.ravel() for part in parts], axis=1).astype(np.int64)
+
+
+def _separations(
+    views: tuple[int, int], binning: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs of rays of two pixels by how far they lie apart, and these separations.
+
+    Pairs (separation, pair, 2), padded to a multiple of TERMS with pairs of a ray that is dark;
+    separations (separation, 2), in samples and in views.
+    """
+    v, u, y, x = (axis.ravel() for axis in np.indices((*views, binning, binning)))
+    rays = np.stack([y, x, v, u], axis=1)
+    apart = (rays[:, None] - rays[None]).reshape(-1, 4)
+    kinds, index = np.unique(apart, axis=0, return_inverse=True)
+    index = index.ravel()
+    width = -(-int(np.bincount(index).max()) // TERMS) * TERMS
+    count = -(-len(kinds) // TERMS) * TERMS
+    members = np.full((count, width, 2), len(rays), dtype=np.int64)
+    for k in range(len(kinds)):
+        pairs = np.flatnonzero(index == k)
+        members[k, : len(pairs)] = np.stack(np.divmod(pairs, len(rays)), axis=1)
+    kinds = np.concatenate([kinds, np.zeros((count - len(kinds), 4), dtype=kinds.dtype)])
+    return members, kinds[:, :2], kinds[:, 2:]
+
+
+@dataclass(frozen=True, eq=False)
+class PatchEvidence:
+    """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kind of
+    texture that explains the patch best; kind: (patch,), which of the prior's it is."""
+
+    log_likelihood: NDArray[np.float32]
+    kind: NDArray[np.int64]
+
+
+def patch_evidence(
+    psi: ImagingMatrix,
+    data: Array,
+    variance: Array,
+    usable: NDArray[np.bool_],
+    brightness: Array,
+    corners: NDArray[np.int64],
+    places: NDArray[np.int64],
+    disparities: NDArray[np.floating],
+    prior: TexturePrior,
+    probes: int = PROBES,
+) -> PatchEvidence:
+    """Return how well textures at these disparities explain each patch.
+
+    data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
+    pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
+    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. probes: at how many of the
+    disparities the kinds of texture are judged.
+    """
+    count = len(corners)
+    short = -count % LANES
+    filled = np.concatenate([corners, np.repeat(corners[-1:], short, axis=0)])
+    scales = np.square(np.concatenate([brightness, np.repeat(brightness[-1:], short)]))
+    members, samples_apart, views_apart = _separations(psi.light_field_shape[:2], psi.binning)
+    pixels_apart = places[:, None, 1:] - places[None, :, 1:]
+    kinds, offsets = np.unique(pixels_apart.reshape(-1, 2), axis=0, return_inverse=True)
+    disparities = np.asarray(disparities, dtype=np.float64)
+    apart = (
+        kinds[:, None, None] * psi.binning
+        + samples_apart[None, None]
+        - disparities[None, :, None, None] * views_apart[None, None]
+    )
+    tables = prior.covariance(np.square(apart).sum(axis=-1)).astype(np.float32)
+    probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])
+    out = np.empty((len(filled), len(disparities)), dtype=np.float32)
+    chosen = np.zeros(len(filled), dtype=np.int64)
+    noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)
+    amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
+    index = offsets.reshape(len(places), len(places)).astype(np.int64)
+
+    def judge(first: int) -> None:
+        lanes = slice(first, first + LANES)
+        evidence(
+            psi.weights,
+            psi.colour_map,
+            usable,
+            noise,
+            readings,
+            filled[lanes],
+            places,
+            psi.binning,
+            members,
+            index,
+            tables,
+            probed.astype(np.int64),
+            amplitudes,
+            chromas,
+            scales[lanes].astype(np.float32),
+            np.float32(prior.freedom),
+            out[lanes],
+            chosen[lanes],
+        )
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        list(pool.map(judge, range(0, len(filled), LANES)))
+    return PatchEvidence(out[:count], chosen[:count])

@@ -1,0 +1,135 @@
+"""The texture of surfaces, and their disparity per pixel, from all frames at once.
+
+Half-quadratic splitting with momentum: with the noise that is still presumed in the texture falling
+from step to step, remove it (`shrinkage`), then fit the frames again (`texture.fitted`). Once the
+texture is nearly known, what it misses in the frames sharpens the disparity (`refine`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings
+from reconstruction.adaptive.rays import Surfaces
+from reconstruction.adaptive.refine import refined
+from reconstruction.adaptive.shrinkage import denoised
+from reconstruction.adaptive.texture import background, fitted
+from reconstruction.adaptive.visibility import carried
+
+Array = NDArray[np.floating]
+
+
+class TextureSettings(Settings):
+    """Settings of the fit of texture and disparity."""
+
+    steps: int = Field(default=16, ge=1)
+    first_noise: float = Field(
+        default=0.15, gt=0, description="deviation of the texture presumed at first"
+    )
+    last_noise: float = Field(default=0.01, gt=0, description="and at last")
+    momentum: float = Field(default=0.5, ge=0, lt=1)
+    threshold: float = Field(default=1.8, gt=0, description="of coefficients, in deviations")
+    chroma: float = Field(default=1.4, gt=0, description="that of chrominance over luminance")
+    block_step: int = Field(default=4, ge=1, le=8)
+    reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
+    fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
+    refine_steps: int = Field(
+        default=8, ge=0, description="last steps that sharpen the disparity first"
+    )
+    slope_px: float = Field(default=0.3, gt=0, description="see `refine`")
+    room_px: float = Field(
+        default=0.5, ge=0, description="by which sharpening may leave the disparity searched"
+    )
+    doubt: float = Field(
+        default=0.025, gt=0, description="deviation of the texture when disparity is sharpened"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Surfaces, their texture (layer, c, y, x), the same less its noise (`clean`), and the centre
+    view's disparity (y, x), without the margin that the textures have."""
+
+    surfaces: Surfaces
+    texture: Array
+    clean: Array
+    centre: Array
+
+
+def surfaces_of(psi: ImagingMatrix, padded: Array, margin: int, nearer: int) -> Surfaces:
+    """Return Psi of the surfaces of the centre view's disparity, padded by a margin (y, x)."""
+    disparity, hidden = carried(padded, margin, nearer, psi.light_field_shape[:4])
+    return Surfaces(psi, disparity, hidden, margin)
+
+
+def solve(
+    psi: ImagingMatrix,
+    centre: Array,
+    nearer: int,
+    frames: Array,
+    precision: Array,
+    picture: Array,
+    settings: TextureSettings,
+    layers: bool = True,
+    on_step: Callable[[int], None] | None = None,
+) -> Scene:
+    """Return the scene that explains the frames (shot, pixel_y, pixel_x).
+
+    centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
+    disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
+    not usable. picture: (y, x, c) to begin with. layers: whether hidden surfaces continue those
+    beside them, else they look like what hides them.
+    """
+    furthest = float(np.abs(centre).max()) + settings.room_px
+    half = max(psi.light_field_shape[:2]) // 2
+    margin = int(np.ceil(furthest * half)) + 4
+    around = ((margin, margin), (margin, margin))
+    padded = searched = np.pad(centre, around, mode="edge")
+    begun = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge")
+    reach = max(1, int(np.ceil(np.ptp(centre) * half)))
+    surfaces = surfaces_of(psi, padded, margin, nearer)
+    rows_squared = np.einsum("ssyx->syx", psi.gram)
+    now = np.stack([begun, begun]).astype(np.float32)
+    before, clean = now, now
+    sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
+    for step, sigma in enumerate(sigmas):
+        if step:
+            ahead = now + np.float32(settings.momentum) * (now - before)
+            guide = clean[0] if step > 1 else ahead[0]
+            clean = ahead
+            clean[0] = denoised(
+                ahead[0],
+                guide,
+                float(sigma),
+                settings.block_step,
+                step,
+                settings.threshold,
+                settings.chroma,
+                settings.reach,
+            )
+            if not layers:
+                clean[1] = clean[0]
+            elif surfaces.hidden.any():
+                clean[1] = background(clean[0], padded, nearer, reach)
+        if step >= max(2, settings.steps - settings.refine_steps):
+            doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
+            missed = frames - surfaces.forward(now)
+            padded = refined(
+                surfaces, padded, now[0], missed, doubted.astype(np.float32), settings.slope_px
+            )
+            padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
+            surfaces = surfaces_of(psi, padded, margin, nearer)
+        before, now = (
+            now,
+            fitted(surfaces, frames, precision, clean, float(sigma), settings.fit_steps),
+        )
+        if on_step is not None:
+            on_step(step + 1)
+    inner = np.s_[margin : margin + centre.shape[0], margin : margin + centre.shape[1]]
+    return Scene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))
