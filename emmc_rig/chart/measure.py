@@ -25,7 +25,7 @@ from drivers.errors import DriverError
 from emmc_rig.benchmarks.memory import peak_memory_mib
 from emmc_rig.chart.captures import Frames, read_frames, read_truth
 from emmc_rig.chart.peers import PEERS, Given
-from emmc_rig.chart.reference import reference_s
+from emmc_rig.chart.reference import reference
 from emmc_rig.chart.scores import scored
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
@@ -57,7 +57,7 @@ def measured(job: dict) -> dict:
         dictionary = open_dictionary(job["dictionary"], psi.light_field_shape[:2], psi.binning)
         dictionary_s = time.perf_counter() - started
     _solved(job["method"], _window(frames), dictionary, settings)
-    load, reference = os.getloadavg()[0], reference_s()
+    load, before = os.getloadavg()[0], reference()
     wall, cpu = [], []
     result = None
     while len(wall) < job["repeats"] and (not wall or sum(wall) < job["enough_s"]):
@@ -68,7 +68,7 @@ def measured(job: dict) -> dict:
         cpu.append(time.process_time() - cpu_started)
     assert result is not None
     peak_mib = peak_memory_mib()
-    reference = statistics.mean((reference, reference_s()))
+    after = reference()
     truth, disparity = read_truth(Path(job["capture"]))
     own = getattr(result, "maps", {}).get("disparity")
     scores = scored(result.light_field, truth, disparity, own)
@@ -80,7 +80,8 @@ def measured(job: dict) -> dict:
         "slowest_s": max(wall),
         "cpu_seconds": statistics.median(cpu),
         "repeats": len(wall),
-        "reference_s": reference,
+        "reference_s": (before.seconds + after.seconds) / 2,
+        "reference_cpu_s": (before.cpu_seconds + after.cpu_seconds) / 2,
         "dictionary_s": dictionary_s,
         "peak_mib": peak_mib,
         "base_mib": base_mib,

@@ -84,7 +84,8 @@ def pyproximal_tv(given: Given, _: Dictionary | None = None) -> Reconstruction:
 def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
     """Return the light field from patches coded by scikit-learn's OMP in our dictionary.
 
-    Patches, sensed dictionaries and averaging are ours, with the settings of `dict-omp`.
+    Patches, sensed dictionaries and averaging are ours. It takes 20 atoms a patch, always, as it
+    stops at a number or at a residual, and ours at whichever comes first.
     """
     if dictionary is None:
         raise ReconstructionError("sklearn-omp needs a dictionary")
@@ -115,12 +116,7 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
                 sense_atoms(selections[key], weights, pixel, pixels, shot, sensed)
             columns = np.asfortranarray(sensed[0].T)
             size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-            floor = given.noise_sigma**2 * int(sensing.measured[0])
-            code = pursuit(columns / size, sensing.data[0], tol=max(floor, 1e-12)) / size
-            if np.count_nonzero(code) > ATOMS:
-                code = (
-                    pursuit(columns / size, sensing.data[0], n_nonzero_coefs=ATOMS, tol=None) / size
-                )
+            code = pursuit(columns / size, sensing.data[0], n_nonzero_coefs=ATOMS) / size
             patch = (code.astype(np.float32) @ dictionary.matrix).reshape(
                 1, *dictionary.patch_shape
             )

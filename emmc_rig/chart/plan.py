@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pydantic import Field
@@ -56,7 +56,7 @@ class Configuration:
 
     method: str
     level: str = DEFAULT
-    settings: MethodSettings = MethodSettings()
+    settings: MethodSettings = field(default_factory=MethodSettings)
 
     @property
     def label(self) -> str:

@@ -1,4 +1,4 @@
-"""How right the views are, how right their differences are, and how right the depth they show is."""
+"""How right an estimate's views are, the differences between them, and the depth they show."""
 
 from __future__ import annotations
 

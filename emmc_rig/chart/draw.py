@@ -1,0 +1,131 @@
+"""The charts as SVG and PNG: speed against accuracy with its front, and growth with size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from emmc_rig.chart.front import Chart, Mark
+from emmc_rig.chart.scaling import Growth
+from emmc_rig.drawing import FAINT, INK, LINE, save_svg, sheet, titled
+
+COLOURS = (
+    "#1d5a9e", "#c2410c", "#18794e", "#7c3aed", "#b45309", "#0e7490", "#be185d", "#4d7c0f",
+    "#475569", "#9f1239",
+)  # fmt: skip
+PNG_DPI = 200
+
+
+def colours_of(charts: Sequence[Chart]) -> dict[str, str]:
+    """Return a colour for each method of any chart, the same in all of them."""
+    methods = dict.fromkeys(mark.configuration.method for c in charts for mark in c.marks)
+    return {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(methods)}
+
+
+def draw_chart(chart: Chart, colours: dict[str, str], folder: Path) -> Path:
+    """Write one chart as SVG and PNG; return the SVG. Every mark has the gid of `gid_of`."""
+    figure, (axes,) = sheet(1, 7.6, 4.6)
+    axes.set_xscale("log")
+    axes.grid(axis="x", color=LINE, linewidth=0.7)
+    front = chart.front()
+    shown = {}
+    for mark in chart.marks:
+        one = mark.configuration
+        (dot,) = axes.plot(
+            mark.seconds, mark.psnr_db,
+            "D" if one.is_peer else "o",
+            markersize=8 if mark in front else 7,
+            markerfacecolor="white" if one.is_peer else colours[one.method],
+            markeredgecolor=colours[one.method],
+            markeredgewidth=1.6,
+            alpha=1 if mark in front or one.is_peer else 0.55,
+            zorder=3,
+        )  # fmt: skip
+        dot.set_gid(gid_of(chart, mark))
+        shown.setdefault(one.method, dot)
+    axes.step(
+        [mark.seconds for mark in front], [mark.psnr_db for mark in front],
+        where="post", color=INK, linewidth=1.1, alpha=0.55, zorder=2, label="_front",
+    )  # fmt: skip
+    axes.axhline(chart.replicate_db, color=FAINT, linestyle=":", linewidth=1)
+    axes.text(
+        0.995, chart.replicate_db, "copied true centre view", fontsize=8, color=FAINT,
+        ha="right", va="bottom", transform=axes.get_yaxis_transform(),
+    )  # fmt: skip
+    for mark in front:
+        # Above and to the left of the front is nothing: the place for names.
+        axes.annotate(
+            mark.configuration.label, (mark.seconds, mark.psnr_db), (-3, 7),
+            textcoords="offset points", fontsize=8, color=INK, ha="left",
+        )  # fmt: skip
+    axes.margins(x=0.12, y=0.14)
+    _plain_seconds(axes)
+    axes.set_xlabel("seconds", color=FAINT, fontsize=9)
+    titled(axes, chart.title)
+    axes.legend(
+        list(shown.values()), list(shown), fontsize=8.5, frameon=False, labelcolor=INK,
+        loc="center left", bbox_to_anchor=(1.0, 0.5),
+    )  # fmt: skip
+    return _saved(figure, folder / f"chart-{chart.key}.svg")
+
+
+def gid_of(chart: Chart, mark: Mark) -> str:
+    """Return the name of a mark in the SVG, unique on the page."""
+    return f"mark-{chart.key}-{mark.key}"
+
+
+def _plain_seconds(axes: Axes) -> None:
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
+    """Write a chart for each axis that was swept, time beside memory; return them by axis."""
+    written = {}
+    for axis in dict.fromkeys(growth.axis for growth in growths):
+        some = [growth for growth in growths if growth.axis == axis]
+        figure, panels = sheet(2, 4.4, 3.3, "seconds")
+        for place, growth in enumerate(some):
+            colour = COLOURS[place % len(COLOURS)]
+            for axes, values, exponent, expected in (
+                (panels[0], growth.seconds, growth.exponent, growth.expected),
+                (panels[1], growth.own_mib, growth.memory_exponent, growth.expected_memory),
+            ):
+                told = f"{growth.label}: {exponent:.2f}"
+                told += "" if expected is None else f" ({expected:.2f} expected)"
+                axes.plot(growth.at, values, "-o", color=colour, markersize=5, label=told)
+                if expected is not None:
+                    first = values[0]
+                    line = [first * (at / growth.at[0]) ** expected for at in growth.at]
+                    axes.plot(growth.at, line, "--", color=colour, alpha=0.45, linewidth=1)
+        for axes, title in zip(panels, ("Time", "Memory beyond the program's"), strict=True):
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlabel(axis, color=FAINT, fontsize=9)
+            axes.set_xticks(some[0].at, [f"{at:g}" for at in some[0].at])
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            _plain_minor(axes)
+            axes.legend(fontsize=8, frameon=False, labelcolor=INK)
+            titled(axes, title)
+        panels[1].set_ylabel("MiB", color=FAINT, fontsize=9)
+        written[axis] = _saved(figure, folder / f"growth-{axis.replace(' ', '-')}.svg")
+    return written
+
+
+def _plain_minor(axes: Axes) -> None:
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    low, high = axes.get_ylim()
+    # A curve that hardly moves should look as if it hardly moved.
+    if high / low < 4:
+        middle = (low * high) ** 0.5
+        axes.set_ylim(middle / 2, middle * 2)
+
+
+def _saved(figure: Figure, path: Path) -> Path:
+    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
+    return save_svg(figure, path)
