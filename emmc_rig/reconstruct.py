@@ -15,6 +15,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.chart.recommend import (
+    Advice,
+    Problem,
+    advised,
+    parse_budget,
+    parse_wanted,
+    read_rows,
+)
+from emmc_rig.chart.reference import reference
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import (
     export_pictures,
@@ -87,6 +96,27 @@ def load_settings(path: Path | None) -> MethodSettings:
     if path is None:
         return MethodSettings()
     return validated(MethodSettings, read_yaml(path, AppError), str(path), AppError)
+
+
+def advice_for(
+    folder: Path,
+    psi_path: Path | None,
+    budget: str | None,
+    want: str | None,
+    chart: Path | None,
+) -> Advice:
+    """Return the method to take for a folder's frames, by a chart and this machine's yardstick.
+
+    budget, want: as typed, such as "30s" and "28dB". chart: the folder of one; None takes the
+    shipped one. Raises AppError for what cannot be read.
+    """
+    budget_s = None if budget is None else parse_budget(budget)
+    wanted_db = None if want is None else parse_wanted(want)
+    rows = read_rows(chart)
+    psi = ImagingMatrix.load(psi_path or folder / PSI)
+    values = int(np.prod(psi.light_field_shape))
+    problem = Problem(values, psi.shots, psi.colour is not None)
+    return advised(rows, problem, reference().seconds, budget_s, wanted_db)
 
 
 def run_reconstruct(

@@ -91,11 +91,16 @@ class Point:
 
 
 class ChartSettings(Settings):
-    """How a chart measures. repeats: at most; they end early when `enough_s` are spent."""
+    """How a chart measures.
+
+    zoom: built-in scenes are rendered so many times larger than `size`, and cut. repeats: at most;
+    they end early when `enough_s` are spent.
+    """
 
     scenes: tuple[str, ...]
     cameras: tuple[str, ...]
     size: tuple[int, int] | None = None
+    zoom: int = Field(default=1, ge=1)
     fast: bool = False
     methods: tuple[str, ...] = ()
     scaling: bool = True
@@ -137,7 +142,7 @@ def configurations(settings: ChartSettings) -> list[Configuration]:
 def charted_points(settings: ChartSettings) -> list[Point]:
     """Return the points of speed against accuracy."""
     return [
-        Point(Capture(scene, camera, settings.size), configuration)
+        Point(Capture(scene, camera, settings.size, settings.zoom), configuration)
         for scene in settings.scenes
         for camera in settings.cameras
         for configuration in configurations(settings)

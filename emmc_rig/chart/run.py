@@ -57,6 +57,17 @@ class ChartRun:
         """Return where the picture of a capture's truth is kept."""
         return self.folder / PICTURES / f"{self.capture(capture)[1]}-truth.webp"
 
+    def prepare(self, points: Sequence[Point], watcher: Watcher) -> None:
+        """Make the frames of all points, so that wrong input is told before hours are spent.
+
+        Raises what the layers below do.
+        """
+        captures = dict.fromkeys(point.capture for point in points)
+        watcher.begin("make the frames", len(captures))
+        for capture in captures:
+            self.capture(capture)
+            watcher.step(f"{capture.scene_name}, {capture.camera_name}")
+
     def measure_all(self, points: Sequence[Point], watcher: Watcher) -> None:
         """Measure every point that the folder does not hold, and fill `results`.
 
