@@ -324,13 +324,13 @@ def reconstruct(
         return
     if frames is None:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
-    chosen = load_settings(settings)
+    chosen, why = load_settings(settings), None
     if budget is not None or want is not None:
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget and --want choose the method and its settings")
         advice = advice_for(frames, psi, budget, want, chart_folder)
-        method, chosen = advice.method, advice.settings
-        console.print(advice.why, highlight=False)
+        method, chosen, why = advice.method, advice.settings, advice.why
+        console.print(why, highlight=False, soft_wrap=True)
     elif chart_folder is not None:
         raise typer.BadParameter("--chart serves --budget and --want")
     method = method or "tv"
@@ -352,8 +352,9 @@ def reconstruct(
         bars = Bars(progress)
         bars.begin(method, None)
         metrics = run_reconstruct(
-            frames, folder, method, psi, dictionary, chosen, truth, lambda step: bars.advance(step)
-        )
+            frames, folder, method, psi, dictionary, chosen, truth,
+            lambda step: bars.advance(step), why,
+        )  # fmt: skip
         bars.finish()
     compared = ""
     if "psnr_db" in metrics:

@@ -128,11 +128,12 @@ def run_reconstruct(
     settings: MethodSettings | None = None,
     truth: str | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    chosen: str | None = None,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
     dictionary_spec: see `open_dictionary`. truth: the scene that was captured, when known, to
-    compare with.
+    compare with. chosen: why this method, for the metrics.
     """
     needs_dictionary = find_method(method).needs_dictionary
     capture = read_capture(folder)
@@ -151,6 +152,7 @@ def run_reconstruct(
     )
     metrics = {
         "method": result.method,
+        "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
         "steps": result.steps,

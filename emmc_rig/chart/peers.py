@@ -99,6 +99,7 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
     total = np.zeros(psi.light_field_shape, dtype=np.float32)
     weight = np.zeros(psi.size, dtype=np.float32)
     share = np.ones((1, *shape), dtype=np.float32)
+    count = min(ATOMS, dictionary.size)
     selections: dict[bytes, NDArray[np.float32]] = {}
     with warnings.catch_warnings():
         # Its warnings about degenerate regressors are about duplicate atoms, which do no harm.
@@ -116,7 +117,7 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
                 sense_atoms(selections[key], weights, pixel, pixels, shot, sensed)
             columns = np.asfortranarray(sensed[0].T)
             size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-            code = pursuit(columns / size, sensing.data[0], n_nonzero_coefs=ATOMS) / size
+            code = pursuit(columns / size, sensing.data[0], n_nonzero_coefs=count) / size
             patch = (code.astype(np.float32) @ dictionary.matrix).reshape(
                 1, *dictionary.patch_shape
             )

@@ -11,7 +11,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +26,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of
 
 POINTS, CAPTURES, PICTURES = "points.jsonl", "captures", "pictures"
+STAGE = "measure the points"
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -91,15 +92,19 @@ class ChartRun:
             ) from fault
 
     def _measure(self, points: Sequence[Point], journal: Journal, watcher: Watcher) -> None:
-        watcher.begin("measure the points", len(points))
-        for point in points:
+        watcher.begin(STAGE, len(points))
+        for done, point in enumerate(points):
+
+            def wait(who: str, left: int = len(points) - done) -> None:
+                watcher.begin(f"{STAGE} (after {who})", left)
+
             path, capture_digest = self.capture(point.capture)
             inputs = self._inputs(point, capture_digest)
             digest = digest_of(inputs)
             picture = self.folder / PICTURES / f"{capture_digest}-{digest}.webp"
             result = journal.get(digest)
             if result is None or ("failed" not in result and not picture.is_file()):
-                result = self._measured(point, path, picture, watcher)
+                result = self._measured(point, path, picture, wait)
                 if result.get("keep", True):
                     journal.add(digest, inputs, result)
             self.results[point] = result
@@ -122,7 +127,9 @@ class ChartRun:
             "limit_s": settings.limit_s,
         }
 
-    def _measured(self, point: Point, capture: Path, picture: Path, watcher: Watcher) -> dict:
+    def _measured(
+        self, point: Point, capture: Path, picture: Path, on_wait: Callable[[str], None]
+    ) -> dict:
         job = {
             "capture": str(capture),
             "picture": str(picture),
@@ -135,7 +142,7 @@ class ChartRun:
         }
         cores = str(point.cores or available_cores())
         purpose = f"emmc-rig chart in {self.folder}"
-        with timing_lock(purpose, on_wait=lambda who: watcher.step(f"waits for {who}")) as lock:
+        with timing_lock(purpose, on_wait=on_wait) as lock:
             return run_job(job, dict.fromkeys(THREADS, cores), self.settings.limit_s, lock)
 
 
