@@ -205,8 +205,8 @@ def test_nonsense_is_one_line():
 
 def row(method, psnr, work, shots=1, filtered=True, preparing=0.0):
     return Row(
-        f"cam-{shots}-{filtered}", shots, filtered, method, "default", {}, psnr, psnr - 20, work,
-        preparing, 1000,
+        f"cam-{shots}-{filtered}", shots, filtered, method, "default", {}, psnr, psnr - 20,
+        preparing, 0.0, 1000 * work,
     )  # fmt: skip
 
 
@@ -238,6 +238,16 @@ def test_a_wanted_psnr_takes_the_quickest_that_reaches_it():
     assert advised(ROWS, ONE_SHOT, 0.1, 10, 22).method == "tv"
 
 
+def test_the_work_of_a_chart_is_a_line_in_the_size_of_the_light_field():
+    # A window of a tenth: 2 of the yardstick's that stay, 3 for what grows.
+    whole = figures(0.5, 25.0, window_cpu_s=0.23, window_values=38_400)
+    points = {Point(Capture("dark", "cam"), Configuration("tv")): whole}
+    (found,) = recommend.rows_of(points)
+    assert (found.fixed, found.per_million) == (pytest.approx(2), pytest.approx(3e6 / 384_000))
+    assert found.seconds(768_000, 0.2) == pytest.approx(0.2 * (2 + 6))
+    assert found.gain_db == 7
+
+
 def test_advice_is_of_the_camera_most_like_yours():
     assert advised(ROWS, Problem(1000, 4, True), 0.1, 10).psnr_db == 29
     assert advised(ROWS, Problem(1000, 1, False), 0.1, 10).psnr_db == 18
@@ -267,7 +277,7 @@ def test_the_shipped_chart_knows_this_versions_methods_and_says_how_it_was_measu
     assert {one.shots for one in rows} >= {1, 3}
     for one in rows:
         MethodSettings.model_validate(one.settings)
-        assert one.work > 0
+        assert one.per_million > 0
     path = recommend.resources.files("emmc_rig.chart").joinpath(recommend.SHIPPED)
     assert {"Machine", "Load", "Command line"} <= set(json.loads(path.read_text())["measured"])
 

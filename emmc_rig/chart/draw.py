@@ -56,13 +56,7 @@ def draw_chart(chart: Chart, colours: dict[str, str], folder: Path) -> Path:
         0.995, chart.replicate_db, "copied true centre view", fontsize=8, color=FAINT,
         ha="right", va="bottom", transform=axes.get_yaxis_transform(),
     )  # fmt: skip
-    for mark in front:
-        # Above and to the left of the front is nothing: the place for names.
-        axes.annotate(
-            mark.configuration.label, (mark.seconds, mark.psnr_db), (-3, 7),
-            textcoords="offset points", fontsize=8, color=INK, ha="left",
-        )  # fmt: skip
-    axes.margins(x=0.12, y=0.14)
+    axes.margins(x=0.14, y=0.16)
     _plain_seconds(axes)
     axes.set_xlabel("seconds", color=FAINT, fontsize=9)
     titled(axes, chart.title)
@@ -70,7 +64,30 @@ def draw_chart(chart: Chart, colours: dict[str, str], folder: Path) -> Path:
         list(shown.values()), list(shown), fontsize=8.5, frameon=False, labelcolor=INK,
         loc="center left", bbox_to_anchor=(1.0, 0.5),
     )  # fmt: skip
+    # Places on the paper are known only when everything else has taken its own.
+    figure.draw_without_rendering()
+    _name(axes, front, colours)
     return _saved(figure, folder / f"chart-{chart.key}.svg")
+
+
+def _name(axes: Axes, front: Sequence[Mark], colours: dict[str, str]) -> None:
+    """Write the names of the front above and left of it, where nothing is, clear of each other."""
+    points_per_inch, line, letter = 72, 10.0, 4.6
+    assert axes.figure is not None
+    placed: list[tuple[float, float, float]] = []
+    for mark in front:
+        label = mark.configuration.label
+        x, y = axes.transData.transform((mark.seconds, mark.psnr_db)) / axes.figure.dpi
+        right, above = x * points_per_inch + 3, y * points_per_inch + 7
+        left = right - letter * len(label)
+        below = [top for start, end, top in placed if left < end and start < right]
+        height = max([above, *below])
+        placed.append((left, right, height + line))
+        axes.annotate(
+            label, (mark.seconds, mark.psnr_db), (3, 7 + height - above),
+            textcoords="offset points", fontsize=8, ha="right",
+            color=colours[mark.configuration.method],
+        )  # fmt: skip
 
 
 def gid_of(chart: Chart, mark: Mark) -> str:

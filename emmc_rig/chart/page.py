@@ -157,8 +157,9 @@ def _growth_section(growths: Sequence[Growth], drawn: Mapping[str, Path]) -> Sec
         for axis, path in drawn.items()
     )
     body = (
-        '<p class="lead">Time and memory against one size of the problem, all else equal; dashed: '
-        "the operations, or for total variation the bytes, that the method counts.</p>"
+        '<p class="lead">Time and memory against one size of the problem, all else equal; time is '
+        "that of all cores together, against cores by the clock. Dashed: the operations, or for "
+        "total variation the bytes, that the method counts.</p>"
         f'<div class="charts">{figures}</div>'
         f'<div class="scroll"><table class="points">{table_head(heads)}<tbody>{rows}</tbody>'
         "</table></div>"

@@ -1,9 +1,9 @@
 """Which method and settings to take for a time budget or a wanted PSNR, learnt from a chart.
 
 A chart keeps its advice as JSON beside its page; a default measured by this very command comes
-with the program. What a method takes is carried over by the yardstick of `reference` and in
-proportion to the values of the light field; its PSNR is the mean over the chart's scenes, which
-yours may not resemble.
+with the program. What a method takes is carried over by the yardstick of `reference`, and along a
+line in the number of values of the light field; its PSNR is the mean over the chart's scenes,
+which yours may not resemble.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _SECONDS = {"": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 class Row:
     """A configuration through one camera, over all scenes of the chart.
 
-    settings: what differs from the defaults. work: computing time over the yardstick's, for
-    `values` values of a light field; preparing: likewise, making the dictionary.
+    settings: what differs from the defaults. The rest is computing time over the yardstick's:
+    making the dictionary, what does not grow with the light field, and what a million values take.
     """
 
     camera: str
@@ -43,13 +43,13 @@ class Row:
     settings: dict
     psnr_db: float
     gain_db: float
-    work: float
     preparing: float
-    values: int
+    fixed: float
+    per_million: float
 
     def seconds(self, values: int, reference_s: float) -> float:
         """Return the seconds expected for a light field of so many values."""
-        return reference_s * (self.preparing + self.work * values / self.values)
+        return reference_s * (self.preparing + self.fixed + self.per_million * values / 1e6)
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,7 @@ def rows_of(results: Mapping[Point, dict]) -> list[Row]:
     for (camera, one), some in groups.items():
         if len(some) < len(scenes[camera]):
             continue
-        values = [int(np.prod(r["views"]) * np.prod(r["size"]) * 3) for r in some]
-        middle = int(np.median(values))
-        work = [
-            r["cpu_seconds"] / r["reference_cpu_s"] * middle / v
-            for r, v in zip(some, values, strict=True)
-        ]
+        works = np.mean([_fixed_and_growing(result) for result in some], axis=0)
         found.append(
             Row(
                 camera,
@@ -102,12 +97,24 @@ def rows_of(results: Mapping[Point, dict]) -> list[Row]:
                 one.settings.model_dump(mode="json", exclude_defaults=True),
                 float(np.mean([r["psnr_db"] for r in some])),
                 float(np.mean([r["psnr_db"] - r["replicate_psnr_db"] for r in some])),
-                float(np.mean(work)),
                 float(np.mean([r["dictionary_s"] / r["reference_s"] for r in some])),
-                middle,
+                float(works[0]),
+                float(works[1]),
             )
         )
     return found
+
+
+def _fixed_and_growing(result: Mapping) -> tuple[float, float]:
+    """Return the line through the window's and the whole picture's work: at 0, per million."""
+    values = float(np.prod(result["views"]) * np.prod(result["size"]) * 3)
+    whole, part = (
+        result[key] / result["reference_cpu_s"] for key in ("cpu_seconds", "window_cpu_s")
+    )
+    wider = values - result["window_values"]
+    growing = max(whole - part, 0.0) / wider if wider > 0 else whole / values
+    fixed = max(whole - growing * values, 0.0)
+    return fixed, (whole - fixed) / values * 1e6
 
 
 def saved(rows: Sequence[Row], measured: Mapping[str, object]) -> str:

@@ -26,6 +26,8 @@ from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of
 
 POINTS, CAPTURES, PICTURES = "points.jsonl", "captures", "pictures"
+REVISION = 1
+"""Of what a point's figures are; raised with them, so that older points are measured again."""
 STAGE = "measure the points"
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -116,6 +118,7 @@ class ChartRun:
         one, settings = point.configuration, self.settings
         return {
             "version": __version__,
+            "revision": REVISION,
             "machine": machine(),
             "capture": capture,
             "method": one.method,

@@ -16,6 +16,8 @@ PATCH_VALUES = 81 * 3
 class Growth:
     """A sweep measured. seconds, own_mib: at each value of `at`; own: beyond the bare program.
 
+    Seconds are those of all cores together, the work, as this is what methods count; against cores
+    by the clock.
     exponent: of seconds ~ at^exponent, by least squares of logarithms; expected_exponent: of the
     operations or bytes that the method counts, between the ends; None where nobody counted them.
     """
@@ -48,7 +50,8 @@ def growths(sweeps: Sequence[Sweep], results: Mapping[Point, dict]) -> list[Grow
             continue
         at = tuple(at for at, _ in done)
         rows = [row for _, row in done]
-        seconds = tuple(row["seconds"] for row in rows)
+        clock = "seconds" if sweep.axis == "cores" else "cpu_seconds"
+        seconds = tuple(row[clock] for row in rows)
         own = tuple(max(row["peak_mib"] - row["base_mib"], 1e-3) for row in rows)
         found.append(
             Growth(
