@@ -126,6 +126,8 @@ def test_growth_is_fitted_and_compared_with_what_the_method_counts():
     growth, of_shots = growths([pixels, shots], results)
     assert growth.exponent == pytest.approx(1.3)
     assert growth.expected == pytest.approx(1)
+    # 1 byte in a thousand, so that the smallest picture adds too little to be told from noise.
+    assert growth.at[0] * 1e-3 < 8 < growth.at[1] * 1e-3
     assert growth.memory_exponent == pytest.approx(1)
     assert growth.expected_memory == pytest.approx(1)
     # 40 + 4/3 s bytes a value and step, two and three shots.

@@ -109,18 +109,15 @@ def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
         figure, panels = sheet(2, 4.4, 3.3, "seconds")
         for place, growth in enumerate(some):
             colour = COLOURS[place % len(COLOURS)]
-            for axes, values, exponent, expected in (
-                (panels[0], growth.seconds, growth.exponent, growth.expected),
-                (panels[1], growth.own_mib, growth.memory_exponent, growth.expected_memory),
-            ):
-                told = f"{growth.label}: {exponent:.2f}"
-                told += "" if expected is None else f" ({expected:.2f} expected)"
-                axes.plot(growth.at, values, "-o", color=colour, markersize=5, label=told)
-                if expected is not None:
-                    first = values[0]
-                    line = [first * (at / growth.at[0]) ** expected for at in growth.at]
-                    axes.plot(growth.at, line, "--", color=colour, alpha=0.45, linewidth=1)
-        for axes, title in zip(panels, ("Time", "Memory beyond the program's"), strict=True):
+            told = f"{growth.label}: {growth.exponent:.2f}"
+            if growth.expected is not None:
+                told += f" ({growth.expected:.2f} expected)"
+                first, start = growth.seconds[0], growth.at[0]
+                line = [first * (at / start) ** growth.expected for at in growth.at]
+                panels[0].plot(growth.at, line, "--", color=colour, alpha=0.45, linewidth=1)
+            panels[0].plot(growth.at, growth.seconds, "-o", color=colour, markersize=5, label=told)
+            panels[1].plot(growth.at, growth.peak_mib, "-o", color=colour, markersize=5)
+        for axes, title in zip(panels, ("Time", "Peak memory"), strict=True):
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_xlabel(axis, color=FAINT, fontsize=9)
@@ -128,8 +125,8 @@ def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
             _plain_minor(axes)
-            axes.legend(fontsize=8, frameon=False, labelcolor=INK)
             titled(axes, title)
+        panels[0].legend(fontsize=8, frameon=False, labelcolor=INK)
         panels[1].set_ylabel("MiB", color=FAINT, fontsize=9)
         written[axis] = _saved(figure, folder / f"growth-{axis.replace(' ', '-')}.svg")
     return written

@@ -47,9 +47,8 @@ def measured(job: dict) -> dict:
 
     seconds: median of the repeats. cpu_seconds: likewise, of all cores together. window_cpu_s: of
     the warm-up's window once it is warm, which tells what does not grow with the picture.
-    peak_mib: resident memory of the process; base_mib: after the imports alone.
+    peak_mib: resident memory of the process; base_mib: before the timed runs, with Psi and frames.
     """
-    base_mib = peak_memory_mib()
     frames = read_frames(Path(job["capture"]))
     settings = MethodSettings.model_validate(job["settings"])
     psi, dictionary, dictionary_s = frames.psi, None, 0.0
@@ -63,6 +62,7 @@ def measured(job: dict) -> dict:
     _solved(job["method"], window, dictionary, settings)
     window_cpu_s = time.process_time() - cpu_started
     load, before = os.getloadavg()[0], reference()
+    base_mib = peak_memory_mib()
     wall, cpu = [], []
     result = None
     while len(wall) < job["repeats"] and (not wall or sum(wall) < job["enough_s"]):

@@ -146,7 +146,7 @@ def _growth_section(growths: Sequence[Growth], drawn: Mapping[str, Path]) -> Sec
         f"<td>{', '.join(f'{at:g}' for at in growth.at)}</td>"
         f"<td>{', '.join(f'{s:.3g}' for s in growth.seconds)}</td>"
         f"<td>{growth.exponent:.2f}</td><td>{_maybe(growth.expected)}</td>"
-        f"<td>{growth.memory_exponent:.2f}</td><td>{_maybe(growth.expected_memory)}</td></tr>"
+        f"<td>{_maybe(growth.memory_exponent)}</td><td>{_maybe(growth.expected_memory)}</td></tr>"
         for growth in growths
     )
     heads = (
@@ -159,7 +159,8 @@ def _growth_section(growths: Sequence[Growth], drawn: Mapping[str, Path]) -> Sec
     body = (
         '<p class="lead">Time and memory against one size of the problem, all else equal; time is '
         "that of all cores together, against cores by the clock. Dashed: the operations, or for "
-        "total variation the bytes, that the method counts.</p>"
+        "total variation the bytes, that the method counts. The exponent of memory is "
+        "that of what a run adds, and missing where that is too little to tell.</p>"
         f'<div class="charts">{figures}</div>'
         f'<div class="scroll"><table class="points">{table_head(heads)}<tbody>{rows}</tbody>'
         "</table></div>"

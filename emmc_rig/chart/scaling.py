@@ -10,14 +10,16 @@ import numpy as np
 from emmc_rig.chart.plan import Point, Sweep
 
 PATCH_VALUES = 81 * 3
+NOISE_MIB = 8
 
 
 @dataclass(frozen=True)
 class Growth:
-    """A sweep measured. seconds, own_mib: at each value of `at`; own: beyond the bare program.
+    """A sweep measured. seconds, peak_mib: at each value of `at`.
 
     Seconds are those of all cores together, the work, as this is what methods count; against cores
-    by the clock.
+    by the clock. Memory is that of the whole process; its exponent is fitted to what the runs
+    added to what was there before, where that is enough to be told from noise.
     exponent: of seconds ~ at^exponent, by least squares of logarithms; expected_exponent: of the
     operations or bytes that the method counts, between the ends; None where nobody counted them.
     """
@@ -26,10 +28,10 @@ class Growth:
     label: str
     at: tuple[float, ...]
     seconds: tuple[float, ...]
-    own_mib: tuple[float, ...]
+    peak_mib: tuple[float, ...]
     exponent: float
     expected: float | None
-    memory_exponent: float
+    memory_exponent: float | None
     expected_memory: float | None
 
     def as_dict(self) -> dict[str, object]:
@@ -52,17 +54,16 @@ def growths(sweeps: Sequence[Sweep], results: Mapping[Point, dict]) -> list[Grow
         rows = [row for _, row in done]
         clock = "seconds" if sweep.axis == "cores" else "cpu_seconds"
         seconds = tuple(row[clock] for row in rows)
-        own = tuple(max(row["peak_mib"] - row["base_mib"], 1e-3) for row in rows)
         found.append(
             Growth(
                 sweep.axis,
                 sweep.configuration.label,
                 at,
                 seconds,
-                own,
+                tuple(row["peak_mib"] for row in rows),
                 fitted_exponent(at, seconds),
                 expected_exponent(sweep, at, rows),
-                fitted_exponent(at, own),
+                _memory_exponent(at, rows),
                 expected_memory_exponent(sweep, at, rows),
             )
         )
@@ -72,6 +73,12 @@ def growths(sweeps: Sequence[Sweep], results: Mapping[Point, dict]) -> list[Grow
 def fitted_exponent(at: Sequence[float], values: Sequence[float]) -> float:
     """Return the slope of log values against log at."""
     return float(np.polyfit(np.log(at), np.log(values), 1)[0])
+
+
+def _memory_exponent(at: Sequence[float], rows: Sequence[dict]) -> float | None:
+    added = [(x, row["peak_mib"] - row["base_mib"]) for x, row in zip(at, rows, strict=True)]
+    told = [(x, mib) for x, mib in added if mib > NOISE_MIB]
+    return fitted_exponent(*zip(*told, strict=True)) if len(told) > 1 else None
 
 
 def expected_exponent(sweep: Sweep, at: Sequence[float], rows: Sequence[dict]) -> float | None:
@@ -107,9 +114,8 @@ def _tv_bytes(row: dict) -> float:
 
 
 def _tv_memory(row: dict) -> float:
-    """Return the bytes that total variation holds: two light fields, the dual variable, Psi."""
-    weights = row["shots"] * 4 / 3 * row["colours_stored"]
-    return _values(row) * (2 * 4 + 16 + weights)
+    """Return the bytes that total variation adds to Psi: light fields and the dual variable."""
+    return _values(row) * (2 * 4 + 16)
 
 
 def _building(row: dict) -> float:
