@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from emmc_rig import cli
-from emmc_rig.chart import lock, plan
+from emmc_rig.chart import lock, measure, plan
 from emmc_rig.chart import run as chart_run
 from emmc_rig.chart.captures import Capture, kept_capture
 from emmc_rig.chart.command import chart_settings, run_chart
@@ -20,6 +20,7 @@ from emmc_rig.chart.lock import timing_lock
 from emmc_rig.chart.measure import measured
 from emmc_rig.chart.peers import Peer
 from emmc_rig.chart.recommend import ADVICE, read_rows
+from emmc_rig.chart.reference import Reference
 from emmc_rig.chart.rows import COLUMNS
 from emmc_rig.chart.run import POINTS, ChartStopped, run_job
 from emmc_rig.demo import Silent
@@ -46,7 +47,8 @@ def lock_of_its_own(monkeypatch, tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Few settings of total variation alone, measured in this process."""
+    """Few settings of total variation alone, measured in this process, by a known yardstick."""
+    monkeypatch.setattr(measure, "reference", lambda: Reference(0.01, 0.01))
     monkeypatch.setattr(plan, "VARIATIONS", LEVELS)
     monkeypatch.setattr(chart_run, "run_job", at_once)
 
@@ -162,7 +164,8 @@ def test_growth_is_charted(quick, monkeypatch, tmp_path):
         figures, shown = first[0]
         picture.write_bytes(shown.read_bytes())
         size = point.capture.size
-        return {**figures, "seconds": 1e-4 * size[0] * size[1], "size": list(size)}
+        seconds = 1e-4 * size[0] * size[1]
+        return {**figures, "cpu_seconds": seconds, "size": list(size)}
 
     monkeypatch.setattr(chart_run.ChartRun, "_measured", as_quick_as_small)
 
@@ -211,6 +214,13 @@ def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
     assert {mark.configuration.method for c in outcome.charts for mark in c.marks} == {"tv"}
     with pytest.raises(AppError, match="nothing to chart: absent: no_such_library"):
         run_chart(settings(methods=("absent",)), tmp_path / "out", Silent())
+
+
+def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
+    monkeypatch.setattr(chart_run, "run_job", lambda *_: {"failed": "no room", "keep": False})
+    with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
+        run_chart(settings(), tmp_path / "out", Silent())
+    assert not (tmp_path / "out" / POINTS).read_text()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.camera_sheet import find_camera
+from emmc_rig.errors import AppError
 from emmc_rig.journal import digest_of
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
@@ -23,6 +24,7 @@ from emmc_rig.simulate import exposed
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
+SMALLEST_PX = 16
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,14 @@ class Capture:
         return camera if self.views is None else camera.model_copy(update={"views": self.views})
 
     def light_field(self, seed: int) -> tuple[Array, Array | None]:
-        """Return the scene (v, u, y, x, c), and its disparity (y, x) where that is known."""
+        """Return the scene (v, u, y, x, c), and its disparity (y, x) where that is known.
+
+        Raises AppError for a picture too small to be judged, and what `open_scene` does.
+        """
+        if self.size is not None and min(self.size) < SMALLEST_PX:
+            raise AppError(
+                f"--size {self.size[0]}x{self.size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more"
+            )
         views, size = self.described().views, self.size
         if self.scene not in SCENES or self.zoom == 1 or size is None:
             scene = open_scene(self.scene, size, views, seed)

@@ -98,6 +98,8 @@ def run_chart(
             for point, result in run.results.items()
             if "failed" in result
         ]
+        if all("failed" in result for result in results.values()):
+            raise AppError(f"nothing could be measured: {left_out[0]}")
         found, grown = charts(results), growths(swept, run.results)
         (folder / DRAWN).mkdir(exist_ok=True)
         colours = colours_of(found)
