@@ -195,7 +195,7 @@ def test_a_point_is_measured_in_a_process_of_its_own(tmp_path):
         assert found["repeats"] == 2
         assert found["steps"] == 3
         assert 0 < found["fastest_s"] <= found["seconds"] <= found["slowest_s"]
-        assert 50 < found["base_mib"] < found["peak_mib"]
+        assert 50 < found["base_mib"] <= found["peak_mib"]
         assert (tmp_path / f"{digest}-truth.webp").is_file()
         late = run_job(job, {}, 0.01, held)
         assert late == {"failed": "not done after 0 s"}
