@@ -119,23 +119,25 @@ def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
             panels[1].plot(growth.at, growth.peak_mib, "-o", color=colour, markersize=5)
         for axes, title in zip(panels, ("Time", "Peak memory"), strict=True):
             axes.set_xscale("log")
-            axes.set_yscale("log")
             axes.set_xlabel(axis, color=FAINT, fontsize=9)
             axes.set_xticks(some[0].at, [f"{at:g}" for at in some[0].at])
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
-            _plain_minor(axes)
+            axes.xaxis.set_minor_formatter(NullFormatter())
             titled(axes, title)
+        panels[0].set_yscale("log")
+        panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panels[0].yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        panels[0].yaxis.set_minor_formatter(NullFormatter())
+        _no_narrower(panels[0])
+        panels[1].set_ylim(0, 1.15 * max(max(growth.peak_mib) for growth in some))
         panels[0].legend(fontsize=8, frameon=False, labelcolor=INK)
         panels[1].set_ylabel("MiB", color=FAINT, fontsize=9)
         written[axis] = _saved(figure, folder / f"growth-{axis.replace(' ', '-')}.svg")
     return written
 
 
-def _plain_minor(axes: Axes) -> None:
-    axes.xaxis.set_minor_formatter(NullFormatter())
+def _no_narrower(axes: Axes) -> None:
+    """Widen a log axis to a factor of 4: what hardly moves should look as if it hardly moved."""
     low, high = axes.get_ylim()
-    # A curve that hardly moves should look as if it hardly moved.
     if high / low < 4:
         middle = (low * high) ** 0.5
         axes.set_ylim(middle / 2, middle * 2)

@@ -160,7 +160,8 @@ def _growth_section(growths: Sequence[Growth], drawn: Mapping[str, Path]) -> Sec
         '<p class="lead">Time and memory against one size of the problem, all else equal; time is '
         "that of all cores together, against cores by the clock. Dashed: the operations, or for "
         "total variation the bytes, that the method counts. The exponent of memory is "
-        "that of what a run adds, and missing where that is too little to tell.</p>"
+        "that of what a run adds, and missing where that is too little to tell. In small pictures "
+        "what does not grow weighs most: --fast shows it, the full chart goes further.</p>"
         f'<div class="charts">{figures}</div>'
         f'<div class="scroll"><table class="points">{table_head(heads)}<tbody>{rows}</tbody>'
         "</table></div>"
