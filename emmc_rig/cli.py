@@ -42,6 +42,7 @@ MOST_SHOTS = 5
 """Simulated when the target is not reached."""
 DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
+TIMED_SIZE, TIMED_CALLS = "593x840", 7
 
 app = typer.Typer(
     name="emmc-rig",
@@ -287,7 +288,7 @@ def reconstruct(
         Path | None,
         typer.Argument(help="a session of `capture`, or a folder that `demo` or `simulate` wrote"),
     ] = None,
-    method: MethodOption = "tv",
+    method: Annotated[str | None, typer.Option("--method", help="see --list (default: tv)")] = None,
     list_methods: Annotated[
         bool, typer.Option("--list", help="the methods: what each assumes, costs, is for")
     ] = False,
@@ -305,11 +306,21 @@ def reconstruct(
     tile: Annotated[
         int | None, typer.Option("--tile", min=1, help="in tiles of so many samples: less memory")
     ] = None,
+    budget: Annotated[
+        str | None, typer.Option("--budget", help="choose the best method for a time, as 30s")
+    ] = None,
+    want: Annotated[
+        str | None, typer.Option("--want", help="choose the quickest method for a PSNR, as 28dB")
+    ] = None,
+    chart_folder: Annotated[
+        Path | None,
+        typer.Option("--chart", help="of `emmc-rig chart`, to choose by (default: the shipped)"),
+    ] = None,
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.output import result_folder
-    from emmc_rig.reconstruct import load_settings, run_in_tiles, run_reconstruct
+    from emmc_rig.reconstruct import advice_for, load_settings, run_in_tiles, run_reconstruct
     from reconstruction.methods import COSTS, METHODS
 
     if list_methods:
@@ -322,7 +333,16 @@ def reconstruct(
         return
     if frames is None:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
-    chosen = load_settings(settings)
+    chosen, why = load_settings(settings), None
+    if budget is not None or want is not None:
+        if method is not None or settings is not None:
+            raise typer.BadParameter("--budget and --want choose the method and its settings")
+        advice = advice_for(frames, psi, budget, want, chart_folder)
+        method, chosen, why = advice.method, advice.settings, advice.why
+        console.print(why, highlight=False, soft_wrap=True)
+    elif chart_folder is not None:
+        raise typer.BadParameter("--chart serves --budget and --want")
+    method = method or "tv"
     if tile is not None:
         if truth is not None:
             raise typer.BadParameter(
@@ -341,8 +361,9 @@ def reconstruct(
         bars = Bars(progress)
         bars.begin(method, None)
         metrics = run_reconstruct(
-            frames, folder, method, psi, dictionary, chosen, truth, lambda step: bars.advance(step)
-        )
+            frames, folder, method, psi, dictionary, chosen, truth,
+            lambda step: bars.advance(step), why,
+        )  # fmt: skip
         bars.finish()
     compared = ""
     if "psnr_db" in metrics:
@@ -360,79 +381,103 @@ def reconstruct(
 
 @app.command()
 def chart(
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option("--camera", help="a shipped camera or a YAML file; may repeat"),
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="small crops, few points: minutes, not hours")
+    ] = False,
+    method: Annotated[
+        list[str] | None, typer.Option("--method", help="only this one; may repeat")
+    ] = None,
+    scaling: Annotated[
+        bool, typer.Option("--scaling/--no-scaling", help="growth with the problem's size")
+    ] = True,
     kernels: Annotated[
-        bool, typer.Option("--kernels", help="time the kernels against a memory triad")
+        bool, typer.Option("--kernels", help="instead: the kernels against a memory triad")
     ] = False,
     solvers: Annotated[
-        bool, typer.Option("--solvers", help="time the sparse solvers, and scikit-learn's beside")
+        bool, typer.Option("--solvers", help="instead: the sparse solvers, and scikit-learn's")
     ] = False,
     peers: Annotated[
-        bool, typer.Option("--peers", help="time the primal-dual step, and pyproximal's beside")
+        bool, typer.Option("--peers", help="instead: the primal-dual step, and pyproximal's")
     ] = False,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="what each piece of the adaptive method buys")
+        bool, typer.Option("--ablation", help="instead: what each piece of `adaptive` buys")
     ] = False,
     next_shot: Annotated[
-        bool, typer.Option("--next-shot", help="how many shots a scene needs, and which")
+        bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
     until: Annotated[
         float, typer.Option("--until", help="PSNR, dB, at which --next-shot stops")
     ] = 30.0,
     dictionary: DictionaryOption = None,
-    camera: CameraOption = "rgbw-bayer-1shot",
-    scene: SceneOption = DEFAULT_SCENE,
     size: SizeOption = None,
+    repeats: Annotated[
+        int | None, typer.Option("--repeats", min=1, help="timed calls of each, at most")
+    ] = None,
     seed: SeedOption = 0,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 7,
-    out: OutOption = Path("emmc-kernels"),
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder to write (default: emmc-chart)")
+    ] = None,
 ) -> None:
-    """Measure speed: kernels against their memory bound, sparse solvers against theirs."""
-    from emmc_rig.benchmarks.kernels import kernel_timings, reconstruction_memory
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    """Chart speed against accuracy of every method; run it again to go on where it stopped."""
+    if kernels or solvers or peers:
+        named, place = (camera or ["rgbw-bayer-1shot"])[0], out or Path("emmc-kernels")
+        if solvers:
+            _chart_solvers(named, dictionary, place)
+        elif peers:
+            _chart_peers(named, size or TIMED_SIZE, repeats or TIMED_CALLS, place)
+        else:
+            _chart_kernels(named, size or TIMED_SIZE, repeats or TIMED_CALLS, place)
+        return
+    if ablation or next_shot:
+        seen, through = (scene or [DEFAULT_SCENE])[0], (camera or ["rgbw-bayer-1shot"])[0]
+        cut = _size(size) or (128, 160)
+        if ablation:
+            _chart_ablation(seen, through, cut, seed, out or Path("emmc-ablation"))
+        else:
+            _chart_next_shot(seen, through, cut, until, seed, out or Path("emmc-next-shot"))
+        return
+    from emmc_rig.chart.command import chart_settings, run_chart, shown_charts
+    from emmc_rig.chart.run import ChartStopped
 
-    if solvers:
-        _chart_solvers(camera, dictionary, out)
-        return
-    if ablation:
-        _chart_ablation(scene, camera, _size(size) or (128, 160), seed, out)
-        return
-    if next_shot:
-        _chart_next_shot(scene, camera, _size(size) or (128, 160), until, seed, out)
-        return
-    if not kernels and not peers:
-        raise typer.BadParameter(
-            "say what to chart: --kernels, --solvers, --peers, --ablation or --next-shot"
-        )
-    described, shape = find_camera(camera), _size(size) or (593, 840)
-    if peers:
-        _chart_peers(camera, shape, repeats, out)
-        return
-    table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
-    rows = []
-    with result_folder(out) as folder:
-        seconds, peak_gib = reconstruction_memory(camera, shape)
-        for timing in kernel_timings(described, shape, repeats):
-            rows.append(timing.as_dict())
-            table.add_row(
-                timing.name,
-                f"{timing.gigabytes:.3f}",
-                f"{timing.seconds * 1e3:.1f}",
-                f"{timing.gigabytes / timing.seconds:.1f}",
-                f"{timing.ratio:.2f}",
-            )
-        metrics = {
-            "camera": camera,
-            "size": list(shape),
-            "kernels": rows,
-            "reconstruction_seconds": seconds,
-            "reconstruction_peak_gib": peak_gib,
-            "command": command_line(),
-            "versions": versions(),
-        }
-        write_metrics(folder, metrics)
-    Console().print(table)
-    typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+    place = out or Path("emmc-chart")
+    settings = chart_settings(
+        fast, scene or [], camera or [], _size(size), repeats,
+        methods=tuple(method or []), scaling=scaling, dictionary=dictionary, seed=seed,
+    )  # fmt: skip
+    try:
+        with shown_progress() as progress:
+            bars = Bars(progress)
+            outcome = run_chart(settings, place, bars)
+            bars.finish()
+    except ChartStopped as stop:
+        _fail(str(stop), INTERRUPTED)
+    else:
+        for one in shown_charts(outcome.charts):
+            table = Table("the front", "s", "dB", title=one.title, box=SIMPLE)
+            for mark in one.front():
+                table.add_row(
+                    mark.configuration.label, f"{mark.seconds:.3g}", f"{mark.psnr_db:.2f}"
+                )
+            Console().print(table)
+        if outcome.growths:
+            table = Table("growth", "against", "exponent", "expected", box=SIMPLE)
+            for growth in outcome.growths:
+                expected = "-" if growth.expected is None else f"{growth.expected:.2f}"
+                table.add_row(growth.label, growth.axis, f"{growth.exponent:.2f}", expected)
+            Console().print(table)
+        for line in outcome.left_out:
+            console.print(f"[yellow]left out:[/] {line}", highlight=False)
+        typer.echo(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")
 
 
 @app.command()
@@ -582,12 +627,47 @@ def _chart_next_shot(
     )
 
 
-def _chart_peers(camera: str, shape: tuple[int, int], repeats: int, out: Path) -> None:
+def _chart_kernels(camera: str, size: str | None, repeats: int, out: Path) -> None:
+    from emmc_rig.benchmarks.kernels import kernel_timings, reconstruction_memory
+    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+
+    described, shape = find_camera(camera), _size(size)
+    assert shape is not None
+    table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
+    rows = []
+    with result_folder(out) as folder:
+        seconds, peak_gib = reconstruction_memory(camera, shape)
+        for timing in kernel_timings(described, shape, repeats):
+            rows.append(timing.as_dict())
+            table.add_row(
+                timing.name,
+                f"{timing.gigabytes:.3f}",
+                f"{timing.seconds * 1e3:.1f}",
+                f"{timing.gigabytes / timing.seconds:.1f}",
+                f"{timing.ratio:.2f}",
+            )
+        metrics = {
+            "camera": camera,
+            "size": list(shape),
+            "kernels": rows,
+            "reconstruction_seconds": seconds,
+            "reconstruction_peak_gib": peak_gib,
+            "command": command_line(),
+            "versions": versions(),
+        }
+        write_metrics(folder, metrics)
+    Console().print(table)
+    typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+
+
+def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
     from emmc_rig.benchmarks.variational import variational_timings
     from emmc_rig.camera_sheet import find_camera
     from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
-    described = find_camera(camera)
+    described, shape = find_camera(camera), _size(size)
+    assert shape is not None
     table = Table("primal-dual step", "ms", "times ours")
     rows = []
     with result_folder(out) as folder:

@@ -16,6 +16,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.chart.recommend import (
+    Advice,
+    Problem,
+    advised,
+    parse_budget,
+    parse_wanted,
+    read_rows,
+)
+from emmc_rig.chart.reference import reference
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import (
     export_pictures,
@@ -116,6 +125,27 @@ def load_settings(path: Path | None) -> MethodSettings:
     return validated(MethodSettings, read_yaml(path, AppError), str(path), AppError)
 
 
+def advice_for(
+    folder: Path,
+    psi_path: Path | None,
+    budget: str | None,
+    want: str | None,
+    chart: Path | None,
+) -> Advice:
+    """Return the method to take for a folder's frames, by a chart and this machine's yardstick.
+
+    budget, want: as typed, such as "30s" and "28dB". chart: the folder of one; None takes the
+    shipped one. Raises AppError for what cannot be read.
+    """
+    budget_s = None if budget is None else parse_budget(budget)
+    wanted_db = None if want is None else parse_wanted(want)
+    rows = read_rows(chart)
+    psi = ImagingMatrix.load(psi_path or folder / PSI)
+    values = int(np.prod(psi.light_field_shape))
+    problem = Problem(values, psi.shots, psi.colour is not None)
+    return advised(rows, problem, reference().seconds, budget_s, wanted_db)
+
+
 def run_reconstruct(
     folder: Path,
     out: Path,
@@ -125,11 +155,12 @@ def run_reconstruct(
     settings: MethodSettings | None = None,
     truth: str | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    chosen: str | None = None,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
     dictionary_spec: see `open_dictionary`. truth: the scene that was captured, when known, to
-    compare with.
+    compare with. chosen: why this method, for the metrics.
     """
     needs_dictionary = find_method(method).needs_dictionary
     capture, psi_path = _read(folder, out, psi_path)
@@ -148,6 +179,7 @@ def run_reconstruct(
     )
     metrics = {
         "method": result.method,
+        "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
         "steps": result.steps,

@@ -5,14 +5,52 @@ Quick, and an inverse crime when the same Psi reconstructs them; the demo traces
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, save_frames, versions, write_metrics
 from emmc_rig.scene import open_scene
+
+
+@dataclass(frozen=True, eq=False)
+class Exposed:
+    """Frames, (shot, pixel_y, pixel_x) each: raw values, normalised readings, their deviation."""
+
+    frames_dn: NDArray[np.uint16]
+    readings: NDArray[np.floating]
+    deviation: NDArray[np.floating]
+    usable: NDArray[np.bool_]
+    noise_free: NDArray[np.floating]
+
+    @property
+    def noise_sigma(self) -> float:
+        """Root mean variance of the usable readings, which solvers take as their typical noise."""
+        judged = self.deviation[self.usable]
+        return float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
+
+
+def exposed(
+    camera: Camera,
+    psi: ImagingMatrix,
+    light_field: NDArray[np.floating],
+    rng: np.random.Generator,
+) -> Exposed:
+    """Return the frames of a light field (v, u, y, x, c), with the sensor's noise."""
+    noise = camera.sensor.noise
+    light = pixel_light(camera, psi.size)
+    exposures_s = camera.exposures_s()[:, None, None]
+    clean = psi.forward(light_field)
+    frames_dn = noise.expose_dn(clean, exposures_s, light, rng)
+    readings = noise.normalise(frames_dn, exposures_s, light)
+    deviation = np.sqrt(noise.variance(readings, exposures_s, light))
+    usable = ~noise.saturated(frames_dn) & (light > 0)
+    return Exposed(frames_dn, readings, deviation, usable, clean)
 
 
 def simulate(
@@ -31,21 +69,15 @@ def simulate(
     """
     scene = open_scene(scene_spec, size=size, views=camera.views, seed=seed)
     psi = build_imaging_matrix(camera, (scene.light_field.shape[2], scene.light_field.shape[3]))
-    noise = camera.sensor.noise
-    light = pixel_light(camera, psi.size)
-    exposures_s = camera.exposures_s()[:, None, None]
-    clean = psi.forward(scene.light_field)
-    frames_dn = noise.expose_dn(clean, exposures_s, light, np.random.default_rng(seed))
-    readings = noise.normalise(frames_dn, exposures_s, light)
-    usable = ~noise.saturated(frames_dn) & (light > 0)
+    shots = exposed(camera, psi, scene.light_field, np.random.default_rng(seed))
     save_frames(
         folder / "frames.h5",
-        frames_dn,
-        readings,
+        shots.frames_dn,
+        shots.readings,
         camera.exposures_s(),
-        deviation=np.sqrt(noise.variance(readings, exposures_s, light)),
-        usable=usable,
-        noise_free=clean,
+        deviation=shots.deviation,
+        usable=shots.usable,
+        noise_free=shots.noise_free,
     )
     psi.save(folder / "psi.h5")
     metrics = {
@@ -54,9 +86,9 @@ def simulate(
         "camera": camera_name,
         "shots": psi.shots,
         "size": list(psi.size),
-        "sensor_psnr_db": psnr_db(readings, clean),
-        "electrons_per_s": noise.electrons_per_s,
-        "saturated_share": float(1 - usable.mean()),
+        "sensor_psnr_db": psnr_db(shots.readings, shots.noise_free),
+        "electrons_per_s": camera.sensor.noise.electrons_per_s,
+        "saturated_share": float(1 - shots.usable.mean()),
         "light_efficiency": psi.light_efficiency(),
         "seed": seed,
         "warnings": camera.warnings(),

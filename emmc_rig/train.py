@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.benchmarks.memory import peak_memory_mib
 from emmc_rig.errors import AppError
 from emmc_rig.model.settings import validated
 from emmc_rig.output import command_line, versions
@@ -264,7 +264,7 @@ def train(
         "history": [asdict(done) for done in final.history],
         "reading_seconds": read_s,
         "learning_seconds": clock() - started - read_s,
-        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "peak_memory_gib": peak_memory_mib() / 2**10,
         "command": command_line(),
         "versions": versions(),
     }

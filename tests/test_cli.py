@@ -214,7 +214,7 @@ def test_wrong_usage_is_exit_code_2(run):
     for arguments in (
         ["demo", "--sceen", "x"],
         ["no-such-command"],
-        ["chart"],
+        ["chart", "--repeats", 0],
         ["demo", "--shots", 0],
     ):
         code, _, err = run(*arguments)

@@ -8,7 +8,7 @@ import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
 
-from emmc_rig import session_benchmark
+from emmc_rig.benchmarks import session as session_benchmark
 from emmc_rig.capture.checks import figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.display import CaptureDisplay

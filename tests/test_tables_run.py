@@ -11,7 +11,9 @@ import pytest
 
 from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
+from emmc_rig.journal import Journal, digest_of, open_folder
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
+from emmc_rig.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.demosaic import demosaiced_rggb
 from emmc_rig.tables.dictionaries import (
     Given,
@@ -20,12 +22,10 @@ from emmc_rig.tables.dictionaries import (
     check_not_trained_on,
     trained_on,
 )
-from emmc_rig.tables.journal import NAME, Journal, digest_of, open_folder
 from emmc_rig.tables.library import Cut, Library, middle, scene_specs
-from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part
 from emmc_rig.tables.rows import csv_text
-from emmc_rig.tables.run import FAST, Forecast, Run, TablesSettings, TablesStopped, do_cells
+from emmc_rig.tables.run import CELLS, FAST, Forecast, Run, TablesSettings, TablesStopped, do_cells
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors
 from reconstruction.bpdn import BPDNSettings
@@ -79,7 +79,7 @@ def scenes(tmp_path_factory):
 
 def a_run(scenes, out, parts=(PART,), settings=TINY, source=None):
     library = Library(scene_specs(scenes), settings.cuts, settings.seed)
-    folder = open_folder(out)
+    folder = open_folder(out, CELLS, "earlier tables")
     source = source or LeaveOneOut(library, settings.training, folder / "dictionaries")
     return Run(tuple(parts), library, source, settings, folder)
 
@@ -112,7 +112,7 @@ def test_a_run_that_was_interrupted_ends_as_one_that_was_not(scenes, tmp_path):
     torn = a_run(scenes, tmp_path / "torn")
     with pytest.raises(TablesStopped, match="4 of 27 cells are kept"):
         do_cells(torn, Impatient(4), ticking())
-    path = tmp_path / "torn" / NAME
+    path = tmp_path / "torn" / CELLS
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(TablesStopped, match=r"8 of 27 cells .*run the same command again"):
         do_cells(a_run(scenes, tmp_path / "torn"), Impatient(5), ticking())
@@ -131,10 +131,10 @@ def test_ctrl_c_in_the_middle_of_a_cell_keeps_those_before(scenes, tmp_path):
 
     with pytest.raises(TablesStopped, match="cells are kept"):
         do_cells(run, Silent(), clock)
-    kept = len(Journal(run.folder))
+    kept = len(Journal(run.folder / CELLS))
     assert 0 < kept < 27
     do_cells(run, Silent())
-    assert len(Journal(run.folder)) == 27
+    assert len(Journal(run.folder / CELLS)) == 27
 
 
 def test_sharing_the_first_stage_changes_no_result(scenes, tmp_path):
@@ -316,24 +316,24 @@ def test_binned_pixels_take_the_dictionary_whose_patches_they_divide(tmp_path):
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     (tmp_path / "cat.jpg").write_text("meow")
     with pytest.raises(AppError, match="holds something else"):
-        open_folder(tmp_path)
+        open_folder(tmp_path, CELLS, "earlier tables")
     with pytest.raises(AppError, match="a file of that name"):
-        open_folder(tmp_path / "cat.jpg")
+        open_folder(tmp_path / "cat.jpg", CELLS, "earlier tables")
     assert [path.name for path in tmp_path.iterdir()] == ["cat.jpg"]
 
 
 def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
-    folder = open_folder(tmp_path / "out")
-    journal = Journal(folder)
+    folder = open_folder(tmp_path / "out", CELLS, "earlier tables")
+    journal = Journal(folder / CELLS)
     journal.add("a", {}, {"psnr_db": 1.0})
     journal.add("b", {}, {"psnr_db": 2.0})
-    path = folder / NAME
+    path = folder / CELLS
     path.write_bytes(path.read_bytes()[:-9])
-    torn = Journal(folder)
+    torn = Journal(folder / CELLS)
     assert (torn.get("a"), torn.get("b")) == ({"psnr_db": 1.0}, None)
     torn.add("c", {}, {"psnr_db": 3.0})
-    assert Journal(folder).get("c") == {"psnr_db": 3.0}
-    assert Journal(folder).get("a") == {"psnr_db": 1.0}
+    assert Journal(folder / CELLS).get("c") == {"psnr_db": 3.0}
+    assert Journal(folder / CELLS).get("a") == {"psnr_db": 1.0}
 
 
 def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
@@ -349,7 +349,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
         patch.setattr(Journal, "add", filling)
         with pytest.raises(AppError, match=r"No space left.*run the same command again"):
             do_cells(run, Silent())
-    assert len(Journal(run.folder)) == 3
+    assert len(Journal(run.folder / CELLS)) == 3
     assert len(do_cells(run, Silent())) == 27
 
 
@@ -459,4 +459,4 @@ def test_two_runs_may_share_a_folder(scenes, tmp_path):
     one, other = (a_run(scenes, tmp_path / "out") for _ in range(2))
     first, second = do_cells(one, Silent(), time.perf_counter), do_cells(other, Silent())
     assert first == second
-    assert Path(one.folder, NAME).read_text().count("\n") == 27
+    assert Path(one.folder, CELLS).read_text().count("\n") == 27

@@ -6,7 +6,6 @@ allocation. The bound of a kernel is its bytes over the triad's bandwidth.
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numba import get_num_threads, njit, prange
 
+from emmc_rig.benchmarks.memory import peak_memory_mib
 from emmc_rig.benchmarks.timing import median_s
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
@@ -138,4 +138,4 @@ def _reconstruct_once(camera_name: str, size: tuple[int, int]) -> None:
     started = time.perf_counter()
     reconstruct_tv(psi, frames, 0.005)
     seconds = time.perf_counter() - started
-    print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+    print(seconds, peak_memory_mib() / 2**10)

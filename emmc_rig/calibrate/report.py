@@ -19,7 +19,7 @@ from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
 from calibration.stage_map import StageMap
 from emmc_rig import __version__
-from emmc_rig.chart_style import ACCENT, FAINT, INK, sheet, title_of
+from emmc_rig.drawing import ACCENT, FAINT, INK, sheet, titled
 from emmc_rig.report import card, png_of, psi_panels, text_of
 
 Array = NDArray[np.floating]
@@ -180,12 +180,12 @@ def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float])
             for one in metrics["fit"]["boards"]
         ],
     )  # fmt: skip
-    figure, (axes,) = sheet(1, 5.2)
+    figure, (axes,) = sheet(1, 5.2, label="")
     axes.plot(np.arange(1, len(history) + 1), history, "o-", color=ACCENT, markersize=3)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("step, over widening windows", color=FAINT, fontsize=9)
     axes.set_ylabel("typical residual / noise", color=FAINT, fontsize=9)
-    title_of(axes, "Convergence")
+    titled(axes, "Convergence")
     fit = metrics["fit"]
     told = (
         f"{fit['status']} after {fit['steps']} steps; correlation with the design's shadow "
@@ -236,7 +236,7 @@ def _sensor(sheet_: SensorSheet) -> str:
         (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
         for name, value, deviation, unit in sheet_.rows()
     ]
-    figure, (transfer, linearity) = sheet(2, 5.0)
+    figure, (transfer, linearity) = sheet(2, 5.0, label="")
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
     grid = np.linspace(0, max(curve.mean_dn), 50)
@@ -244,12 +244,12 @@ def _sensor(sheet_: SensorSheet) -> str:
     transfer.plot(grid, line, color=INK, linewidth=1)
     transfer.set_xlabel("signal above the dark, DN", color=FAINT, fontsize=9)
     transfer.set_ylabel("temporal variance, DN²", color=FAINT, fontsize=9)
-    title_of(transfer, "Photon transfer")
+    titled(transfer, "Photon transfer")
     linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
     linearity.axhline(0, color=INK, linewidth=0.8)
     linearity.set_xlabel("exposure, s", color=FAINT, fontsize=9)
     linearity.set_ylabel("deviation from the line, %", color=FAINT, fontsize=9)
-    title_of(linearity, "Linearity")
+    titled(linearity, "Linearity")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
     drawn = _drawn(figure, "Photon transfer curve and linearity")
     return f"{_table(heads, rows)}{drawn}"

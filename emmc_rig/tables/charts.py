@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emmc_rig.chart_style import FAINT, INK, sheet, title_of
+from emmc_rig.drawing import FAINT, INK, save_svg, sheet, titled
 from emmc_rig.tables import paper
 from emmc_rig.tables.findings import CHROMA, Measured, SceneFigures, printed_figures
 from emmc_rig.tables.plan import (
@@ -25,7 +23,6 @@ from emmc_rig.tables.plan import (
 
 COLOURS = {"i": "#1d5a9e", "ii": "#18794e", "iii": "#b45309"}
 METHOD_COLOURS = {"dict-admm": "#7a869a", "tv-dict": "#1d5a9e", "tv": "#18794e"}
-SALT = "emmc-rig"
 
 
 def mean_db(
@@ -56,16 +53,8 @@ def draw_charts(folder: Path, measured: Measured, scenes: Sequence[str]) -> dict
     ):
         figure = draw(measured, scenes)
         if figure is not None:
-            written[title] = folder / f"{name}.svg"
-            with matplotlib.rc_context({"svg.hashsalt": SALT}):
-                figure.savefig(written[title], format="svg", metadata={"Date": None})
+            written[title] = save_svg(figure, folder / f"{name}.svg")
     return written
-
-
-def _sheet(panels: int, wide: float = 4.6) -> tuple[Figure, list[Axes]]:
-    figure, axes = sheet(panels, wide)
-    axes[0].set_ylabel("PSNR, dB", color=FAINT, fontsize=9)
-    return figure, axes
 
 
 def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
@@ -79,7 +68,7 @@ def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     ]
     if not shown:
         return None
-    figure, panels = _sheet(len(shown))
+    figure, panels = sheet(len(shown))
     printed = printed_figures()
     for axes, (name, title) in zip(panels, shown, strict=True):
         part = PARTS[name]
@@ -105,7 +94,7 @@ def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
                     )
         axes.set_xticks(range(1, 5 if name == "table4" else 4))
         axes.set_xlabel("images: shots, or full-colour images of (i)", color=FAINT, fontsize=9)
-        title_of(axes, f"TV-Dict, {title}, noise-free")
+        titled(axes, f"TV-Dict, {title}, noise-free")
     panels[-1].plot([], [], "--", color=FAINT, alpha=0.6, label="the paper's 7 scenes")
     panels[-1].legend(fontsize=8.5, frameon=False, labelcolor=INK)
     return figure
@@ -119,7 +108,7 @@ def _noise(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     captures = part.captures
     if all(mean_db(measured, shown, c, "tv-dict") is None for c in captures):
         return None
-    figure, panels = _sheet(2, 4.2)
+    figure, panels = sheet(2, 4.2)
     for axes, source, names, title in (
         (panels[0], measured, shown, "Ours, TV-Dict"),
         (panels[1], printed, theirs, "The paper, TV-Dict"),
@@ -140,7 +129,7 @@ def _noise(measured: Measured, scenes: Sequence[str]) -> Figure | None:
             range(3), [f"({scenario}) {sensor}" for scenario, sensor in SCENARIOS.items()]
         )
         axes.set_ylim(np.floor(min(low)) - 2, np.ceil(max(low)) + 1)
-        title_of(axes, title)
+        titled(axes, title)
     panels[0].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
     panels[1].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
     return figure
@@ -155,7 +144,7 @@ def _colour(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     }
     if any(value is None for column in values.values() for value in column):
         return None
-    figure, (axes,) = _sheet(1, 6.4)
+    figure, (axes,) = sheet(1, 6.4)
     at = np.arange(len(captures))
     levels = [[v for v in column if v is not None] for column in values.values()]
     for shift, level, colour, label in (
@@ -168,7 +157,7 @@ def _colour(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     axes.set_xticks(at, [f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures])
     axes.set_ylim(np.floor(min(map(min, levels))) - 2, np.ceil(max(map(max, levels))) + 3)
     axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc="upper left", ncols=2)
-    title_of(axes, "TV-Dict, Table III's scenes, noise-free")
+    titled(axes, "TV-Dict, Table III's scenes, noise-free")
     return figure
 
 
@@ -182,7 +171,7 @@ def _masks(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     found = {m: values for m, values in found.items() if len(values) == len(part.captures)}
     if not found:
         return None
-    figure, (axes,) = _sheet(1, 6.4)
+    figure, (axes,) = sheet(1, 6.4)
     at = np.arange(len(part.captures))
     width = 0.8 / len(found)
     for i, (method, values) in enumerate(found.items()):
@@ -194,5 +183,5 @@ def _masks(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     levels = [value for values in found.values() for value in values]
     axes.set_ylim(np.floor(min(levels)) - 2, np.ceil(max(levels)) + 2)
     axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, ncols=3, loc="upper left")
-    title_of(axes, "One noisy CFA shot, Table II's scenes")
+    titled(axes, "One noisy CFA shot, Table II's scenes")
     return figure

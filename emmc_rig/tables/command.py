@@ -10,18 +10,18 @@ from pathlib import Path
 
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
+from emmc_rig.journal import open_folder
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.tables.charts import draw_charts
 from emmc_rig.tables.dictionaries import Given, LeaveOneOut, Source
 from emmc_rig.tables.figures import draw_figures
 from emmc_rig.tables.findings import Finding, judge
 from emmc_rig.tables.grids import Grid, grids
-from emmc_rig.tables.journal import open_folder
 from emmc_rig.tables.library import Library, scene_specs
 from emmc_rig.tables.page import page
 from emmc_rig.tables.plan import Part, cells_of, chosen_parts
 from emmc_rig.tables.rows import csv_text
-from emmc_rig.tables.run import Run, TablesSettings, TablesStopped, do_cells
+from emmc_rig.tables.run import CELLS, Run, TablesSettings, TablesStopped, do_cells
 
 CSV, PAGE, DRAWN, DICTIONARIES = "tables.csv", "tables.html", "figures", "dictionaries"
 
@@ -55,7 +55,7 @@ def run_tables(
     started = clock()
     parts = chosen_parts(only)
     library = Library(scene_specs(scenes), settings.cuts, settings.seed)
-    folder = open_folder(out)
+    folder = open_folder(out, CELLS, "earlier tables")
     source = _source(parts, library, dictionaries, settings, folder)
     run = Run(parts, library, source, settings, folder)
     try:

@@ -17,9 +17,9 @@ from pydantic import Field
 
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
+from emmc_rig.journal import digest_of
 from emmc_rig.model.settings import Settings
 from emmc_rig.tables import paper
-from emmc_rig.tables.journal import digest_of
 from emmc_rig.tables.library import VIEWS, Cut, Library
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
 from reconstruction.learning import LearningSettings, learn_ksvd

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.journal import digest_of
 from emmc_rig.model.masks import cfa_tile
+from emmc_rig.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.report import DisplayCurve
 from emmc_rig.tables import paper
 from emmc_rig.tables.demosaic import demosaiced_rggb
-from emmc_rig.tables.journal import digest_of
 from emmc_rig.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
-from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import (
     MASK_TITLES,
     MASKS,

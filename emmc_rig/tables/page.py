@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
-from emmc_rig import __version__
+from emmc_rig.page import Section, embedded, framed, provenance_table, table_head, text
 from emmc_rig.tables.findings import Finding
 from emmc_rig.tables.grids import Grid, Pair
 from emmc_rig.tables.plan import METHOD_TITLES, METHODS, PARTS
@@ -19,7 +16,6 @@ CAVEAT = (
     "beaten: which aperture variant of the MIT scenes it used, and how far its mask stood from the "
     "sensor, is unknown. Compare methods and scenarios within one run."
 )
-KINDS = {".png": "image/png", ".svg": "image/svg+xml"}
 TONES = {"holds": "good", "does not hold": "bad", "not measured": "watch"}
 ALTS = {
     "figure5": "Frames of the three scenarios with enlarged pieces",
@@ -41,42 +37,21 @@ def page(
     provenance: Mapping[str, str],
 ) -> str:
     """Return the page. about: sentences under the title. charts: by title. figures: by part."""
-    report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
-    template = resources.files("emmc_rig.tables").joinpath("page.html").read_text("utf-8")
-    style = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
-    assert style is not None
-    sections = [("findings", "Findings", _findings(findings))]
-    sections += [(grid.name, grid.title, _grid(grid)) for grid in grids]
+    style = resources.files("emmc_rig.tables").joinpath("page.css").read_text("utf-8")
+    sections = [Section("findings", "Findings", "Findings", _findings(findings))]
     if charts:
-        sections.insert(1, ("charts", "Charts", _charts(charts)))
+        sections.append(Section("charts", "Charts", "Charts", _charts(charts)))
+    sections += [_section(grid.name, grid.title, _grid(grid)) for grid in grids]
     sections += [
-        (f"{name}-picture", PARTS[name].title, _figure(name, path))
+        _section(f"{name}-picture", PARTS[name].title, _figure(name, path))
         for name, path in figures.items()
     ]
-    sections.append(("provenance", "Provenance", _provenance(provenance)))
-    parts = {
-        "title": _text(title),
-        "generator": _text(f"emmc-rig {__version__}"),
-        "style": re.sub(r"\{\{\w+\}\}", "", style[1]),
-        "about": "".join(f"<p>{_text(line)}</p>" for line in about),
-        "caveat": _text(CAVEAT),
-        "navigation": "".join(
-            f'<li><a href="#{key}">{_text(_short(name))}</a></li>' for key, name, _ in sections
-        ),
-        "sections": "".join(
-            f'<section id="{key}"><h2>{_text(name)}</h2>{body}</section>'
-            for key, name, body in sections
-        ),
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    sections.append(_section("provenance", "Provenance", provenance_table(dict(provenance))))
+    return framed(title, about, [CAVEAT], sections, style)
 
 
-def _short(name: str) -> str:
-    return name.partition(":")[0]
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value), quote=True)
+def _section(key: str, title: str, body: str) -> Section:
+    return Section(key, title.partition(":")[0], title, body)
 
 
 def _findings(findings: Sequence[Finding]) -> str:
@@ -89,15 +64,15 @@ def _findings(findings: Sequence[Finding]) -> str:
             if method != claim.judged_by
         ]
         rows.append(
-            f'<tr><th scope="row">{_text(claim.says)}'
-            f'<p class="note">{_text(claim.compares)}. Judged by '
-            f"{_text(METHOD_TITLES[claim.judged_by])}.</p>"
-            f'<p class="note">“{_text(claim.sentence)}”</p></th>'
-            f'<td class="verdict {TONES[finding.verdict]}">{_text(finding.verdict)}</td>'
-            f'<td class="number">{_text(judged or "-")}</td>'
+            f'<tr><th scope="row">{text(claim.says)}'
+            f'<p class="note">{text(claim.compares)}. Judged by '
+            f"{text(METHOD_TITLES[claim.judged_by])}.</p>"
+            f'<p class="note">“{text(claim.sentence)}”</p></th>'
+            f'<td class="verdict {TONES[finding.verdict]}">{text(finding.verdict)}</td>'
+            f'<td class="number">{text(judged or "-")}</td>'
             f'<td class="number">{f"{judged.holding} of {judged.scenes}" if judged else "-"}</td>'
-            f'<td class="number">{"<br>".join(map(_text, others)) or "-"}</td>'
-            f'<td class="number">{_text(finding.printed or "not printed")}</td></tr>'
+            f'<td class="number">{"<br>".join(map(text, others)) or "-"}</td>'
+            f'<td class="number">{text(finding.printed or "not printed")}</td></tr>'
         )
     heads = (
         "Finding, what is compared, and where the paper says so", "Here",
@@ -105,13 +80,8 @@ def _findings(findings: Sequence[Finding]) -> str:
     )  # fmt: skip
     return (
         '<p class="lead">A finding holds when the mean difference over the scenes is above zero.'
-        f'</p><table class="findings">{_head(heads)}<tbody>{"".join(rows)}</tbody></table>'
+        f'</p><table class="findings">{table_head(heads)}<tbody>{"".join(rows)}</tbody></table>'
     )
-
-
-def _head(names: Sequence[str]) -> str:
-    cells = "".join(f'<th scope="col">{_text(name)}</th>' for name in names)
-    return f"<thead><tr>{cells}</tr></thead>"
 
 
 def _grid(grid: Grid) -> str:
@@ -120,7 +90,7 @@ def _grid(grid: Grid) -> str:
     for line in grid.lines:
         best = max((p.ours for p in line.pairs if p.ours is not None), default=None)
         heads = "".join(
-            f'<th scope="row">{"" if before[: i + 1] == line.heads[: i + 1] else _text(head)}</th>'
+            f'<th scope="row">{"" if before[: i + 1] == line.heads[: i + 1] else text(head)}</th>'
             for i, head in enumerate(line.heads)
         )
         cells = "".join(_pair(pair, best) for pair in line.pairs)
@@ -130,8 +100,8 @@ def _grid(grid: Grid) -> str:
     methods = ", ".join(METHOD_TITLES[method] for method in METHODS)
     return (
         f'<p class="lead">PSNR in dB, the paper\'s after the bar; the best of a line is bold. '
-        f"Methods: {_text(methods)}.</p>"
-        f'<div class="scroll"><table class="grid">{_head((*grid.heads, *grid.columns))}'
+        f"Methods: {text(methods)}.</p>"
+        f'<div class="scroll"><table class="grid">{table_head((*grid.heads, *grid.columns))}'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
@@ -144,28 +114,15 @@ def _pair(pair: Pair, best: float | None) -> str:
     return f'<td class="number">{ours}{theirs}</td>'
 
 
-def _embedded(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f"data:{KINDS[path.suffix]};base64,{data}"
-
-
 def _charts(charts: Mapping[str, Path]) -> str:
     drawn = "".join(
-        f"<figure><figcaption><strong>{_text(title)}</strong></figcaption>"
-        f'<img src="{_embedded(path)}" alt="{_text(title)}"></figure>'
+        f"<figure><figcaption><strong>{text(title)}</strong></figcaption>"
+        f'<img src="{embedded(path)}" alt="{text(title)}"></figure>'
         for title, path in charts.items()
     )
     return f'<div class="charts">{drawn}</div>'
 
 
 def _figure(name: str, path: Path) -> str:
-    source = _embedded(path)
-    return f'<img class="shown" src="{source}" alt="{_text(ALTS[name])}">'
-
-
-def _provenance(provenance: Mapping[str, str]) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{_text(key)}</th><td><code>{_text(value)}</code></td></tr>'
-        for key, value in provenance.items()
-    )
-    return f'<table class="narrow"><tbody>{rows}</tbody></table>'
+    source = embedded(path)
+    return f'<img class="shown" src="{source}" alt="{text(ALTS[name])}">'

@@ -15,11 +15,11 @@ from pydantic import Field
 from emmc_rig import __version__
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
+from emmc_rig.journal import Journal, digest_of
 from emmc_rig.model.settings import Settings
+from emmc_rig.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.dictionaries import Source, TrainingSettings
-from emmc_rig.tables.journal import Journal, digest_of
 from emmc_rig.tables.library import Array, Cut, Library
-from emmc_rig.tables.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.tables.scores import scored
 from emmc_rig.tables.shots import Sensors, Shots
@@ -33,7 +33,7 @@ from reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patch
 from reconstruction.training_patches import PatchSettings
 from reconstruction.tv import TVSettings
 
-PICTURES = "pictures"
+CELLS, PICTURES = "cells.jsonl", "pictures"
 PAPERS_SOLVER = BPDNSettings(method="admm")
 
 
@@ -195,7 +195,7 @@ def do_cells(
     the cells done are kept; and the errors of the layers below.
     """
     cells, pictured = run.cells, run.pictured
-    journal = Journal(run.folder)
+    journal = Journal(run.folder / CELLS)
     watcher.begin("check the scenes", len(run.library.names))
     for name in run.library.names:
         run.library.digest(name)

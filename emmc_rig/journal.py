@@ -14,8 +14,6 @@ from pathlib import Path
 
 from emmc_rig.errors import AppError
 
-NAME = "cells.jsonl"
-
 
 def digest_of(inputs: Mapping[str, object]) -> str:
     """Return a digest of plain data, the same for equal content in any order of keys."""
@@ -23,19 +21,22 @@ def digest_of(inputs: Mapping[str, object]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
 
 
-def open_folder(out: Path) -> Path:
-    """Return the folder, created where missing; raise AppError when it is not one of ours."""
+def open_folder(out: Path, name: str, what: str) -> Path:
+    """Return the folder of a journal called `name`, created where missing.
+
+    what: what the folder holds, in words. Raises AppError when it holds something else.
+    """
     out = Path(os.path.abspath(out))
     if out.is_file():
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / NAME).is_file():
+    if out.is_dir() and any(out.iterdir()) and not (out / name).is_file():
         raise AppError(
-            f"--out {out}: the folder holds something else than earlier tables; "
+            f"--out {out}: the folder holds something else than {what}; "
             "choose another folder or empty it"
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with open(out / NAME, "ab"):
+        with open(out / name, "ab"):
             pass
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
@@ -45,8 +46,8 @@ def open_folder(out: Path) -> Path:
 class Journal:
     """The cells done so far, by digest."""
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / NAME
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._results: dict[str, dict] = {}
         text = self._path.read_bytes().decode("utf-8", errors="replace")
         self._torn = bool(text) and not text.endswith("\n")

@@ -1,0 +1,189 @@
+"""One point in a process of its own: a job as JSON from standard input, its figures to the output.
+
+Order matters: imports, frames, a warm-up on a small window (which compiles and loads), the timed
+runs, the peak of memory; only then the truth is read and compared.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from drivers.errors import DriverError
+from emmc_rig.benchmarks.memory import peak_memory_mib
+from emmc_rig.chart.captures import Frames, read_frames, read_truth
+from emmc_rig.chart.peers import PEERS, Given
+from emmc_rig.chart.reference import reference
+from emmc_rig.chart.scores import scored
+from emmc_rig.errors import AppError
+from emmc_rig.model.errors import ModelError
+from emmc_rig.pictures import pictures_of, telling_lines
+from emmc_rig.reconstruct import open_dictionary
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.result import Reconstruction
+
+FAILED = 3
+WARM_UP_PX = 27
+LARGEST_PICTURE_PX = 256
+KNOWN = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
+
+
+def measured(job: dict) -> dict:
+    """Return the figures of a job: capture, method, settings, dictionary, repeats, ...
+
+    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. window_cpu_s: of
+    the warm-up's window once it is warm, which tells what does not grow with the picture.
+    peak_mib: resident memory of the process; base_mib: before the timed runs, with Psi and frames.
+    """
+    frames = read_frames(Path(job["capture"]))
+    settings = MethodSettings.model_validate(job["settings"])
+    psi, dictionary, dictionary_s = frames.psi, None, 0.0
+    if job["needs_dictionary"]:
+        started = time.perf_counter()
+        dictionary = open_dictionary(job["dictionary"], psi.light_field_shape[:2], psi.binning)
+        dictionary_s = time.perf_counter() - started
+    window = _window(frames)
+    _solved(job["method"], window, dictionary, settings)
+    cpu_started = time.process_time()
+    _solved(job["method"], window, dictionary, settings)
+    window_cpu_s = time.process_time() - cpu_started
+    load, before = os.getloadavg()[0], reference()
+    base_mib = peak_memory_mib()
+    wall, cpu = [], []
+    result = None
+    while len(wall) < job["repeats"] and (not wall or sum(wall) < job["enough_s"]):
+        result = None
+        cpu_started, started = time.process_time(), time.perf_counter()
+        result = _solved(job["method"], frames, dictionary, settings)
+        wall.append(time.perf_counter() - started)
+        cpu.append(time.process_time() - cpu_started)
+    assert result is not None
+    peak_mib = peak_memory_mib()
+    after = reference()
+    truth, disparity = read_truth(Path(job["capture"]))
+    own = getattr(result, "maps", {}).get("disparity")
+    scores = scored(result.light_field, truth, disparity, own)
+    _save_pictures(Path(job["picture"]), result.light_field, truth)
+    return {
+        **asdict(scores),
+        "seconds": statistics.median(wall),
+        "fastest_s": min(wall),
+        "slowest_s": max(wall),
+        "cpu_seconds": statistics.median(cpu),
+        "window_cpu_s": window_cpu_s,
+        "window_values": int(np.prod(window.psi.light_field_shape)),
+        "repeats": len(wall),
+        "reference_s": (before.seconds + after.seconds) / 2,
+        "reference_cpu_s": (before.cpu_seconds + after.cpu_seconds) / 2,
+        "dictionary_s": dictionary_s,
+        "peak_mib": peak_mib,
+        "base_mib": base_mib,
+        "cores": get_num_threads(),
+        "load": load,
+        "steps": result.steps,
+        "status": result.status,
+        "advice": result.advice,
+        "shots": psi.shots,
+        "binning": psi.binning,
+        "views": list(psi.light_field_shape[:2]),
+        "size": list(psi.size),
+        "colours_stored": psi.weights.shape[4],
+        "disparity_range_px": None if disparity is None else float(np.ptp(disparity)),
+        "dictionary_atoms": dictionary.size if dictionary is not None else None,
+        "patches": result.parameters.get("patches"),
+    }
+
+
+def _solved(
+    method: str, frames: Frames, dictionary: Dictionary | None, settings: MethodSettings
+) -> Reconstruction:
+    given = Given(frames.psi, frames.readings, frames.usable, frames.noise_sigma)
+    if method in PEERS:
+        return PEERS[method].solve(given, dictionary)
+    return reconstruct(
+        method, given.psi, given.readings, given.noise_sigma, dictionary, settings, given.usable
+    )
+
+
+def _window(frames: Frames) -> Frames:
+    """Return a corner that is large enough for patches and small enough to take no time."""
+    k = frames.psi.binning
+    side = WARM_UP_PX // k * k
+    rows, columns = (slice(0, min(side, length)) for length in frames.psi.size)
+    seen = np.s_[:, : rows.stop // k, : columns.stop // k]
+    return Frames(
+        frames.psi.window(rows, columns),
+        np.ascontiguousarray(frames.readings[seen]),
+        np.ascontiguousarray(frames.usable[seen]),
+        frames.noise_sigma,
+    )
+
+
+def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
+    """Write what a point shows, and the truth's beside the captures, unless it is there."""
+    lines = telling_lines(truth)
+    truth_path = path.with_name(f"{path.stem.partition('-')[0]}-truth.webp")
+    for light_field, where in ((estimate, path), (truth, truth_path)):
+        if not where.exists() or where == path:
+            shown = _composed(light_field, lines)
+            done, data = cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, 90])
+            assert done
+            partial = where.with_name(f".{where.name}.{os.getpid()}.part")
+            partial.write_bytes(data.tobytes())
+            os.replace(partial, where)
+
+
+def _composed(light_field: NDArray, lines: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the centre view over the epipolar image of its most telling row, as 8-bit BGR.
+
+    Light is shown with the display's gamma; pixels are repeated, never blurred.
+    """
+    pictures = pictures_of(light_field, lines)
+    height, width = pictures.centre.shape[:2]
+    left = max(0, (width - LARGEST_PICTURE_PX) // 2)
+    top = min(max(0, lines[0] - LARGEST_PICTURE_PX // 2), max(0, height - LARGEST_PICTURE_PX))
+    across = slice(left, left + LARGEST_PICTURE_PX)
+    view = pictures.centre[top : top + LARGEST_PICTURE_PX, across]
+    scale = max(1, round(320 / view.shape[1]))
+    view = view.repeat(scale, axis=0).repeat(scale, axis=1)
+    epi = pictures.across[:, across].repeat(8, axis=0).repeat(scale, axis=1)
+    gap = np.ones((6, view.shape[1], 3), dtype=view.dtype)
+    stacked = np.clip(np.concatenate([view, gap, epi]), 0, 1) ** (1 / 2.2)
+    return np.ascontiguousarray(np.rint(stacked[..., ::-1] * 255).astype(np.uint8))
+
+
+def _plain(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def main() -> int:
+    """Do the job on standard input."""
+    job = json.load(sys.stdin)
+    try:
+        figures = measured(job)
+    except KNOWN as fault:
+        print(fault, file=sys.stderr)
+        return FAILED
+    except MemoryError:
+        print("not enough memory", file=sys.stderr)
+        return FAILED
+    print(json.dumps({key: _plain(value) for key, value in figures.items()}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,279 @@
+"""`emmc-rig chart` end to end, and `emmc-rig reconstruct` choosing by it."""
+
+import csv
+import html.parser
+import json
+import os
+import re
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from emmc_rig import cli
+from emmc_rig.chart import lock, measure, plan
+from emmc_rig.chart import run as chart_run
+from emmc_rig.chart.captures import Capture, kept_capture
+from emmc_rig.chart.command import chart_settings, run_chart
+from emmc_rig.chart.lock import timing_lock
+from emmc_rig.chart.measure import measured
+from emmc_rig.chart.peers import Peer
+from emmc_rig.chart.recommend import ADVICE, read_rows
+from emmc_rig.chart.reference import Reference
+from emmc_rig.chart.rows import COLUMNS
+from emmc_rig.chart.run import POINTS, ChartStopped, run_job
+from emmc_rig.demo import Silent
+from emmc_rig.errors import AppError
+from emmc_rig.journal import digest_of
+from emmc_rig.model.lightfield import save_views
+from emmc_rig.output import METRICS
+from simulators.scenes import render
+
+SIZE = (24, 32)
+LEVELS = {"tv": {"2 steps": {"tv": {"max_steps": 2}}, "default": {"tv": {"max_steps": 9}}}}
+
+
+def at_once(job, *_):
+    """Measure in this process: what it finds is the same, only the memory is not its own."""
+    return measured(job)
+
+
+@pytest.fixture(autouse=True)
+def lock_of_its_own(monkeypatch, tmp_path):
+    """Nothing is timed here, so that a chart on this machine need not be waited for."""
+    monkeypatch.setattr(lock, "lock_path", lambda: tmp_path / "lock")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few settings of total variation alone, measured in this process, by a known yardstick."""
+    monkeypatch.setattr(measure, "reference", lambda: Reference(0.01, 0.01))
+    monkeypatch.setattr(plan, "VARIATIONS", LEVELS)
+    monkeypatch.setattr(chart_run, "run_job", at_once)
+
+
+def settings(**more):
+    chosen = {"methods": ("tv",), "scaling": False, **more}
+    scenes, cameras = chosen.pop("scenes", ["dark"]), ["rgbw-bayer-1shot"]
+    return chart_settings(True, scenes, cameras, SIZE, 1, **chosen)
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        told = capsys.readouterr()
+        return stop.value.code, told.out, " ".join(told.err.split())
+
+    return call
+
+
+class Page(html.parser.HTMLParser):
+    """Collects ids and what is loaded from elsewhere."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.foreign = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href") and not value.startswith(("data:", "#")):
+                self.foreign.append(value)
+
+
+def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
+    measured_scene = tmp_path / "shed"
+    save_views(measured_scene, render("near-planar", size=(30, 36)).light_field)
+    chosen = settings(scenes=["dark", str(measured_scene)])
+    outcome = run_chart(chosen, tmp_path / "out", Silent())
+    folder = tmp_path / "out"
+    assert [chart.scene for chart in outcome.charts] == ["all scenes", "dark", "shed"]
+    with open(folder / "chart.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert [(r["scene"], r["level"]) for r in rows] == [
+        ("dark", "2 steps"), ("dark", "default"), ("shed", "2 steps"), ("shed", "default"),
+    ]  # fmt: skip
+    assert rows[0]["disparity_mae_px"]
+    assert not rows[2]["disparity_mae_px"]
+    text = (folder / "chart.html").read_text()
+    page = Page(text)
+    assert not page.foreign
+    assert len(page.ids) == len(set(page.ids))
+    marks = [name for name in page.ids if name.startswith("mark-")]
+    assert len(marks) == 6
+    points, pictures = (
+        json.loads(*re.findall(rf'id="{name}">(.*?)</script>', text))
+        for name in ("points", "pictures")
+    )
+    assert set(points) == set(marks)
+    shown = {pair[key] for one in points.values() for pair in one["pictures"]
+             for key in ("estimate", "truth")}  # fmt: skip
+    assert shown == set(pictures)
+    for name in shown:
+        picture = cv2.imread(str(folder / "pictures" / name))
+        assert picture is not None
+        assert picture.std() > 1
+    for chart in outcome.charts:
+        for ending in ("svg", "png"):
+            assert (folder / "charts" / f"chart-{chart.key}.{ending}").stat().st_size > 5000
+    front = json.loads((folder / METRICS).read_text())["fronts"]["rgbw-bayer-1shot, all scenes"]
+    assert front
+    assert {row.level for row in read_rows(folder)} == {"2 steps", "default"}
+
+
+def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
+    calls = []
+
+    def stopping(job, *others):
+        calls.append(job)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return measured(job)
+
+    monkeypatch.setattr(chart_run, "run_job", stopping)
+    with pytest.raises(ChartStopped, match="1 of 2 points are kept"):
+        run_chart(settings(), tmp_path / "out", Silent())
+    run_chart(settings(), tmp_path / "out", Silent())
+    assert len(calls) == 3
+    kept = (tmp_path / "out" / POINTS).read_text()
+    run_chart(settings(), tmp_path / "out", Silent())
+    assert len(calls) == 3
+    assert (tmp_path / "out" / POINTS).read_text() == kept
+
+
+def test_growth_is_charted(quick, monkeypatch, tmp_path):
+    capture = Capture("dark", "rgbw-bayer-1shot", SIZE)
+    first = []
+
+    def as_quick_as_small(run, point, path, picture, watcher):
+        if not first:
+            job = {
+                "capture": path, "settings": {"tv": {"max_steps": 2}}, "method": "tv",
+                "needs_dictionary": False, "repeats": 1, "enough_s": 1, "picture": picture,
+            }  # fmt: skip
+            first.append((measured(job), picture))
+        figures, shown = first[0]
+        picture.write_bytes(shown.read_bytes())
+        size = point.capture.size
+        seconds = 1e-4 * size[0] * size[1]
+        return {**figures, "cpu_seconds": seconds, "size": list(size)}
+
+    monkeypatch.setattr(chart_run.ChartRun, "_measured", as_quick_as_small)
+
+    def always_the_same(asked, seed, folder):
+        path, _ = kept_capture(capture, seed, folder)
+        return path, digest_of({"asked": repr(asked)})
+
+    monkeypatch.setattr(chart_run, "kept_capture", always_the_same)
+    outcome = run_chart(settings(scaling=True), tmp_path / "out", Silent())
+    pixels = next(growth for growth in outcome.growths if growth.axis == "pixels")
+    assert pixels.exponent == pytest.approx(1)
+    assert pixels.expected == pytest.approx(1)
+    assert (tmp_path / "out/charts/growth-disparity-range.svg").is_file()
+    assert "Growth with the size" in outcome.page.read_text()
+
+
+def test_a_point_is_measured_in_a_process_of_its_own(tmp_path):
+    path, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", SIZE), 0, tmp_path)
+    job = {
+        "capture": str(path), "settings": {"tv": {"max_steps": 3}}, "method": "tv",
+        "needs_dictionary": False, "dictionary": None, "repeats": 2, "enough_s": 60,
+        "picture": str(tmp_path / f"{digest}-x.webp"),
+    }  # fmt: skip
+    with timing_lock("a test") as held:
+        found = run_job(job, {"NUMBA_NUM_THREADS": "1"}, 300, held)
+        assert found["cores"] == 1
+        assert found["repeats"] == 2
+        assert found["steps"] == 3
+        assert 0 < found["fastest_s"] <= found["seconds"] <= found["slowest_s"]
+        assert 50 < found["base_mib"] <= found["peak_mib"]
+        assert (tmp_path / f"{digest}-truth.webp").is_file()
+        late = run_job(job, {}, 0.01, held)
+        assert late == {"failed": "not done after 0 s"}
+        wrong = {**job, "needs_dictionary": True, "dictionary": str(tmp_path / "none.h5")}
+        told = run_job(wrong, {}, 300, held)
+        assert "none.h5" in told["failed"]
+        assert not told["keep"]
+
+
+def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
+    absent = Peer("nobody's", ("no_such_library",), plan.PEERS["sklearn-omp"].solve)
+    monkeypatch.setitem(plan.PEERS, "absent", absent)
+    outcome = run_chart(settings(methods=("tv", "absent")), tmp_path / "out", Silent())
+    (line,) = outcome.left_out
+    assert "pip install" in line
+    assert {mark.configuration.method for c in outcome.charts for mark in c.marks} == {"tv"}
+    with pytest.raises(AppError, match="nothing to chart: absent: no_such_library"):
+        run_chart(settings(methods=("absent",)), tmp_path / "out", Silent())
+
+
+def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
+    monkeypatch.setattr(chart_run, "run_job", lambda *_: {"failed": "no room", "keep": False})
+    with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
+        run_chart(settings(), tmp_path / "out", Silent())
+    assert not (tmp_path / "out" / POINTS).read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--method", "tv-dic"], "did you mean 'tv-dict'"),
+        (["--scene", "nowhere"], "no scene 'nowhere'"),
+        (["--scene", "dark", "--scene", "./dark"], "two are called 'dark'"),
+        (["--camera", "no-camera"], "no-camera"),
+        (["--size", "big"], "write ROWSxCOLUMNS"),
+        (["--size", "8x8"], "needs 16x16"),
+        (["--out", "mine"], "something else than an earlier chart"),
+    ],
+)
+def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, told):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    code, _, err = command("chart", "--fast", "--method", "tv", *arguments)
+    assert code == 1
+    assert told in err
+    assert "Traceback" not in err
+
+
+def test_reconstruct_chooses_by_a_budget_or_a_wanted_psnr(quick, command, tmp_path):
+    scene = ["--scene", "dark", "--camera", "rgbw-bayer-1shot", "--size", "24x32"]
+    assert command("chart", "--fast", *scene, "--method", "tv", "--no-scaling")[0] == 0
+    assert (tmp_path / "emmc-chart" / ADVICE).is_file()
+    assert command("simulate", *scene)[0] == 0
+    code, _, err = command("reconstruct", "emmc-frames", "--budget", "1h", "--chart", "emmc-chart")
+    assert code == 0
+    assert "the most accurate within 3600 s" in err
+    metrics = json.loads((tmp_path / "emmc-reconstruction" / METRICS).read_text())
+    assert metrics["method"] == "tv"
+    assert metrics["steps"] in (2, 9)
+    assert "dB on average" in metrics["chosen"]
+    code, _, err = command("reconstruct", "emmc-frames", "--want", "90dB", "--chart", "emmc-chart")
+    assert code == 0
+    assert "nothing reaches 90 dB" in err
+    for wrong, told in (
+        (["--budget", "soon"], "write a time"),
+        (["--want", "good"], "write a PSNR"),
+        (["--budget", "9s", "--chart", "emmc-frames"], "emmc-rig chart"),
+    ):
+        code, _, err = command("reconstruct", "emmc-frames", *wrong)
+        assert code == 1
+        assert told in err
+    for wrong in (["--budget", "9s", "--method", "tv"], ["--chart", "emmc-chart"]):
+        assert command("reconstruct", "emmc-frames", *wrong)[0] == 2
+
+
+@pytest.mark.real_data
+def test_a_real_light_field_is_charted(quick, tmp_path):
+    folder = os.environ["EMMC_LIGHTFIELDS"]
+    scene = next(path for path in sorted(os.scandir(folder), key=str) if path.is_dir()).path
+    outcome = run_chart(settings(scenes=[scene]), tmp_path / "out", Silent())
+    assert np.isfinite([mark.psnr_db for mark in outcome.charts[0].marks]).all()
