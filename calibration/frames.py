@@ -12,6 +12,8 @@ from calibration.errors import CalibrationError
 
 LARGEST_CLIPPED_SHARE = 1e-3
 LARGEST_FLICKER = 0.02
+SURE = 6.0
+"""Deviations that noise alone hardly reaches."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ def average(
 
     Raises CalibrationError when there are none, when they differ in size, when more than
     LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
-    more than LARGEST_FLICKER of the brightest.
+    more than LARGEST_FLICKER of the brightest, and more than noise explains.
     """
     total = squares = None
     count = 0
@@ -56,18 +58,23 @@ def average(
         squares += values**2
         count += 1
         levels.append(float(values.mean()))
-        if max(levels) - min(levels) > LARGEST_FLICKER * max(levels):
-            raise CalibrationError(
-                f"{what}: repeats differ by {(max(levels) - min(levels)) / max(levels):.1%} in "
-                "brightness; the lamp flickers: let it warm up, run it on direct current, or "
-                "expose for whole periods of the mains"
-            )
     if total is None or squares is None:
         raise CalibrationError(f"{what}: no frame was taken")
     spread = np.nan
     if count > 1:
         spread = float(np.mean(squares - total**2 / count) / (count - 1))
+        _check_steady(levels, float(np.sqrt(spread / total.size)), what)
     return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s)
+
+
+def _check_steady(levels: list[float], noise: float, what: str) -> None:
+    """Raise CalibrationError when frames differ in brightness; noise: deviation of a level."""
+    difference, most = max(levels) - min(levels), max(levels)
+    if difference > max(LARGEST_FLICKER * most, SURE * noise):
+        raise CalibrationError(
+            f"{what}: repeats differ by {difference / most:.1%} in brightness; the lamp flickers: "
+            "let it warm up, run it on direct current, or expose for whole periods of the mains"
+        )
 
 
 @dataclass(frozen=True)
