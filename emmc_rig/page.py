@@ -12,6 +12,7 @@ from pathlib import Path
 
 from emmc_rig import __version__
 
+CAVEATS = '<aside class="warnings" aria-label="How to read this"><h2>How to read this</h2>'
 KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".webp": "image/webp"}
 
 
@@ -32,11 +33,15 @@ def framed(
     sections: Sequence[Section],
     style: str = "",
     script: str = "",
+    lead: str = "",
 ) -> str:
     """Return the page. about: sentences under the title. caveats: how to read it.
 
-    style, script: what only this page needs, as CSS and JavaScript.
+    style, script: what only this page needs, as CSS and JavaScript. lead: HTML before the sections.
     """
+    warnings = "".join(f"<li>{text(line)}</li>" for line in caveats)
+    if warnings:
+        lead = f"{CAVEATS}<ul>{warnings}</ul></aside>{lead}"
     report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
     template = resources.files("emmc_rig").joinpath("page.html").read_text("utf-8")
     common = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
@@ -47,7 +52,8 @@ def framed(
         "style": re.sub(r"\{\{\w+\}\}", "", common[1]),
         "own_style": style,
         "about": "".join(f"<p>{text(line)}</p>" for line in about),
-        "caveats": "".join(f"<li>{text(line)}</li>" for line in caveats),
+        "lead": lead,
+        "scripts": "; script-src 'unsafe-inline'" if script else "",
         "navigation": "".join(
             f'<li><a href="#{part.key}">{text(part.short)}</a></li>' for part in sections
         ),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import os
-import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -18,8 +17,8 @@ from calibration.choice import HeldOut
 from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
 from calibration.stage_map import StageMap
-from emmc_rig import __version__
 from emmc_rig.drawing import ACCENT, FAINT, INK, sheet, titled
+from emmc_rig.page import Section, framed, provenance_table
 from emmc_rig.report import card, png_of, psi_panels, text_of
 
 Array = NDArray[np.floating]
@@ -67,24 +66,14 @@ def write_calibration_report(
     if stage is not None:
         sections.append(("stage", "Stage map", _stage(stage)))
     sections.append(("provenance", "Provenance", _provenance(metrics)))
-    report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
-    template = resources.files("emmc_rig.calibrate").joinpath("page.html").read_text("utf-8")
-    style = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
-    assert style is not None
-    parts = {
-        "title": text_of(f"Calibration of {metrics['camera']}"),
-        "generator": text_of(f"emmc-rig {__version__}"),
-        "style": re.sub(r"\{\{\w+\}\}", "", style[1]),
-        "about": text_of(outcome.why),
-        "navigation": "".join(
-            f'<li><a href="#{key}">{text_of(name)}</a></li>' for key, name, _ in sections
-        ),
-        "sections": "".join(
-            f'<section id="{key}"><h2>{text_of(name)}</h2>{body}</section>'
-            for key, name, body in sections
-        ),
-    }
-    page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    style = resources.files("emmc_rig.calibrate").joinpath("page.css").read_text("utf-8")
+    page = framed(
+        f"Calibration of {metrics['camera']}",
+        [outcome.why],
+        (),
+        [Section(key, name, name, body) for key, name, body in sections],
+        style,
+    )
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         temporary.write_text(page, encoding="utf-8")
@@ -272,8 +261,4 @@ def _provenance(metrics: Mapping) -> str:
         "seconds to calibrate": f"{metrics['calibration_seconds']:.1f}",
         **metrics["versions"],
     }
-    rows = "".join(
-        f'<tr><th scope="row">{text_of(key)}</th><td><code>{text_of(value)}</code></td></tr>'
-        for key, value in shown.items()
-    )
-    return f'<table class="narrow"><tbody>{rows}</tbody></table>'
+    return provenance_table(shown)

@@ -6,8 +6,6 @@ The page is one file that opens offline and asks for nothing.
 from __future__ import annotations
 
 import base64
-import html
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib import resources
@@ -16,10 +14,10 @@ from pathlib import Path
 import cv2
 
 from drivers.errors import DriverError
-from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
 from emmc_rig.output import metrics_text, shown_bytes
+from emmc_rig.page import Section, framed, provenance_table, text
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -70,33 +68,18 @@ def quick_pictures(session: Session) -> int:
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
-    report = resources.files("emmc_rig").joinpath("report_template.html").read_text("utf-8")
-    template = resources.files("emmc_rig.session").joinpath("sheet.html").read_text("utf-8")
-    style = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
-    assert style is not None
     sections = [*_frames(session, pictures), ("timeline", "Timeline", _timeline(session))]
     sections.append(("events", "Events", _events(session)))
     sections.append(("provenance", "Provenance", _provenance(session)))
-    parts = {
-        "title": _text(session.header["title"]),
-        "generator": _text(f"emmc-rig {__version__}"),
-        "style": re.sub(r"\{\{\w+\}\}", "", style[1]),
-        "about": _text(_about(session)),
-        "cards": "".join(_cards(session)),
-        "navigation": "".join(
-            f'<li><a href="#{key}">{_text(name.partition(":")[0])}</a></li>'
-            for key, name, _ in sections
-        ),
-        "sections": "".join(
-            f'<section id="{key}"><h2>{_text(name)}</h2>{body}</section>'
-            for key, name, body in sections
-        ),
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value), quote=True)
+    style = resources.files("emmc_rig.session").joinpath("sheet.css").read_text("utf-8")
+    return framed(
+        session.header["title"],
+        [_about(session)],
+        (),
+        [Section(key, name.partition(":")[0], name, body) for key, name, body in sections],
+        style,
+        lead=f'<div class="cards">{"".join(_cards(session))}</div>',
+    )
 
 
 def _about(session: Session) -> str:
@@ -133,8 +116,8 @@ def _cards(session: Session) -> Iterator[str]:
 
 def _card(tone: str, name: str, value: str, note: str) -> str:
     return (
-        f'<div class="card {tone}"><h3>{_text(name)}</h3><p class="value">{_text(value)}</p>'
-        f'<p class="note">{_text(note)}</p></div>'
+        f'<div class="card {tone}"><h3>{text(name)}</h3><p class="value">{text(value)}</p>'
+        f'<p class="note">{text(note)}</p></div>'
     )
 
 
@@ -183,16 +166,16 @@ def _picture(session: Session, planned: PlannedFrame) -> str:
     figures = entry["figures"]
     saturated = f", {figures['saturated']:.1%} saturated" if figures["saturated"] >= 0.001 else ""
     return (
-        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{_text(planned.id)}">'
-        f"<figcaption><strong>{_text(planned.id)}</strong><br>{entry['exposure_s']:.4g} s"
+        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{text(planned.id)}">'
+        f"<figcaption><strong>{text(planned.id)}</strong><br>{entry['exposure_s']:.4g} s"
         f"{saturated}</figcaption></figure>"
     )
 
 
 def _absent(planned: PlannedFrame, why: str) -> str:
     return (
-        f'<figure class="absent"><p>{_text(why)}</p>'
-        f"<figcaption>{_text(planned.id)}</figcaption></figure>"
+        f'<figure class="absent"><p>{text(why)}</p>'
+        f"<figcaption>{text(planned.id)}</figcaption></figure>"
     )
 
 
@@ -214,7 +197,7 @@ def _timeline(session: Session) -> str:
     longest = max(runs, key=len)
     told = overlap(longest)
     legend = "".join(
-        f'<li><i style="background:{COLOURS[name]}"></i>{_text(meaning)}</li>'
+        f'<li><i style="background:{COLOURS[name]}"></i>{text(meaning)}</li>'
         for name, meaning in LEGEND.items()
     )
     shown = min(SHOWN_FRAMES, len(longest))
@@ -240,7 +223,7 @@ def events(session: Session) -> Iterator[tuple[str, str]]:
 
 def _events(session: Session) -> str:
     rows = "".join(
-        f'<tr><th scope="row">{_text(kind)}</th><td>{_text(told)}</td></tr>'
+        f'<tr><th scope="row">{text(kind)}</th><td>{text(told)}</td></tr>'
         for kind, told in events(session)
     )
     return f'<table class="narrow"><tbody>{rows}</tbody></table>'
@@ -271,8 +254,4 @@ def _provenance(session: Session) -> str:
         **session.header["versions"],
         **{f"SHA-256 of {name}": digest for name, digest in session.created["sha256"].items()},
     }
-    body = "".join(
-        f'<tr><th scope="row">{_text(key)}</th><td><code>{_text(value)}</code></td></tr>'
-        for key, value in rows.items()
-    )
-    return f'<table class="narrow"><tbody>{body}</tbody></table>'
+    return provenance_table(rows)
