@@ -20,6 +20,13 @@ def pytest_addoption(parser):
     )
 
 
+def pytest_xdist_auto_num_workers(config):
+    """Return the cores for a run of everything; a real device, or tests named, get one process."""
+    real = config.getoption("--stage") or config.getoption("--camera")
+    everything = config.args_source == config.ArgsSource.TESTPATHS
+    return os.cpu_count() if everything and not real else 0
+
+
 def pytest_collection_modifyitems(config, items):
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     skips = {}
