@@ -31,6 +31,7 @@ from emmc_rig.model.camera import (
     shipped_cameras,
 )
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.files import whole_file
 from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
@@ -209,13 +210,9 @@ def draw_camera(camera: Camera, path: Path) -> None:
     if states:
         _draw_masks(bands[2], camera, plates, states)
     _draw_weights(bands[-1], camera, psi)
-    partial = path.with_name(path.name + ".part")
     try:
-        try:
+        with whole_file(path) as partial:
             figure.savefig(partial, format="png")
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
     except OSError as fault:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.files import whole_file
 from emmc_rig.model.lightfield import centre_view, epi_horizontal, epi_vertical
 
 Array = NDArray[np.floating]
@@ -28,15 +28,10 @@ class Pictures:
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all; half precision is finer than a screen."""
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            path.parent.mkdir(exist_ok=True)
-            arrays = {f.name: getattr(self, f.name).astype(np.float16) for f in fields(self)}
-            with open(partial, "wb") as file:
-                np.savez(file, **arrays)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        arrays = {f.name: getattr(self, f.name).astype(np.float16) for f in fields(self)}
+        with whole_file(path) as partial, open(partial, "wb") as file:
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Pictures | None:

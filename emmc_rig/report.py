@@ -5,7 +5,6 @@ import html
 import itertools
 import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig import __version__
+from emmc_rig.model.files import write_text
 
 Array = NDArray[np.floating]
 
@@ -89,14 +89,7 @@ def write_report(path: str | Path, content: ReportContent) -> None:
 
     Raises OSError when the folder cannot be written.
     """
-    path = Path(path)
-    page = render(content).encode()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_bytes(page)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_text(Path(path), render(content))
 
 
 def render(content: ReportContent) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TypeVar
 import h5py
 import numpy as np
 
+from emmc_rig.model.files import whole_file
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import Iteration, LearningState
 from reconstruction.online import OnlineState
@@ -27,9 +27,8 @@ def save_checkpoint(path: Path, state: State, purpose: Mapping[str, object]) -> 
 
     Raises DictionaryError when it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with h5py.File(partial, "w") as file:
+        with whole_file(path) as partial, h5py.File(partial, "w") as file:
             file.attrs["format"] = FORMAT
             file["purpose"] = json.dumps(purpose)
             file["history"] = json.dumps([asdict(done) for done in state.history])
@@ -38,11 +37,8 @@ def save_checkpoint(path: Path, state: State, purpose: Mapping[str, object]) -> 
                     file.create_dataset(
                         field.name, data=getattr(state, field.name), chunks=True, fletcher32=True
                     )
-        os.replace(partial, path)
     except OSError as fault:
         raise DictionaryError(f"{path}: cannot be written ({_one_line(fault)})") from fault
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) -> S:

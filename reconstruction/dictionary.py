@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from emmc_rig.model.files import whole_file
 from reconstruction.errors import DictionaryError
 
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
@@ -108,12 +109,11 @@ class Dictionary:
         Raises DictionaryError when it cannot be written.
         """
         path = Path(path)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
         atom_bytes = self.atoms[0].nbytes
         rows = min(self.size, max(1, _CHUNK_BYTES // atom_bytes))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(partial, "w") as file:
+            with whole_file(path) as partial, h5py.File(partial, "w") as file:
                 file.attrs["format"] = FORMAT
                 file.attrs["kind"] = self.kind
                 file.create_dataset(
@@ -123,11 +123,8 @@ class Dictionary:
                     fletcher32=True,
                 )
                 file["provenance"] = self.provenance
-            os.replace(partial, path)
         except OSError as fault:
             raise DictionaryError(f"{path}: cannot be written ({_one_line(fault)})") from fault
-        finally:
-            partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Dictionary:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -18,6 +17,7 @@ from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
 from calibration.stage_map import StageMap
 from emmc_rig.drawing import ACCENT, FAINT, INK, sheet, titled
+from emmc_rig.model.files import write_text
 from emmc_rig.page import Section, framed, provenance_table
 from emmc_rig.report import card, png_of, psi_panels, text_of
 
@@ -74,12 +74,7 @@ def write_calibration_report(
         [Section(key, name, name, body) for key, name, body in sections],
         style,
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_text(path, page)
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[object]], chosen: int = -1) -> str:

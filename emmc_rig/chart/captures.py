@@ -6,7 +6,6 @@ inverse crime, the same for every method, which `emmc-rig demo` avoids.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
 from emmc_rig.journal import digest_of
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.files import whole_file
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.scene import open_scene
 from emmc_rig.simulate import exposed
@@ -124,18 +124,12 @@ def _write(
 ) -> None:
     psi = build_imaging_matrix(camera, (light_field.shape[2], light_field.shape[3]))
     shots = exposed(camera, psi, light_field, np.random.default_rng(seed))
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    psi_path = path.with_suffix(".psi")
-    try:
-        psi.save(psi_path)
-        with h5py.File(partial, "w") as file:
-            file["truth"], file["readings"] = light_field, shots.readings
-            file["usable"], file["noise_sigma"] = shots.usable, shots.noise_sigma
-            if disparity_px is not None:
-                file["disparity_px"] = disparity_px
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    psi.save(path.with_suffix(".psi"))
+    with whole_file(path) as partial, h5py.File(partial, "w") as file:
+        file["truth"], file["readings"] = light_field, shots.readings
+        file["usable"], file["noise_sigma"] = shots.usable, shots.noise_sigma
+        if disparity_px is not None:
+            file["disparity_px"] = disparity_px
 
 
 def read_frames(path: Path) -> Frames:

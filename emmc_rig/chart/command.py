@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from emmc_rig.chart.scaling import Growth, growths
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.journal import open_folder
+from emmc_rig.model.files import write_text
 from emmc_rig.output import command_line, versions, write_metrics
 from simulators.scenes import SCENES
 
@@ -108,9 +108,9 @@ def run_chart(
         seconds = clock() - started
         provenance = _provenance(run, seconds)
         text = page(run, _about(run, results, left_out), drawn, grown, drawn_growths, provenance)
-        _write(folder / CSV, csv_text(run.results))
-        _write(folder / ADVICE, saved(rows_of(results), provenance))
-        _write(folder / PAGE, text)
+        write_text(folder / CSV, csv_text(run.results))
+        write_text(folder / ADVICE, saved(rows_of(results), provenance))
+        write_text(folder / PAGE, text)
         write_metrics(folder, _metrics(run, found, grown, left_out, seconds))
     except ChartStopped:
         raise
@@ -145,16 +145,6 @@ def _missing_peers(points: Sequence[Point]) -> tuple[set[str], list[str]]:
             missing.add(name)
             told.append(f"{name}: {fault}")
     return missing, told
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _load(results: Sequence[dict]) -> str:

@@ -29,6 +29,7 @@ from emmc_rig.chart.reference import reference
 from emmc_rig.chart.scores import scored
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
+from emmc_rig.model.files import whole_file
 from emmc_rig.pictures import pictures_of, telling_lines
 from emmc_rig.reconstruct import open_dictionary
 from reconstruction.dictionary import Dictionary
@@ -142,9 +143,8 @@ def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
             shown = _composed(light_field, lines)
             done, data = cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, 90])
             assert done
-            partial = where.with_name(f".{where.name}.{os.getpid()}.part")
-            partial.write_bytes(data.tobytes())
-            os.replace(partial, where)
+            with whole_file(where) as partial:
+                partial.write_bytes(data.tobytes())
 
 
 def _composed(light_field: NDArray, lines: tuple[int, int]) -> NDArray[np.uint8]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +22,7 @@ from scipy.sparse.linalg import LinearOperator
 
 from emmc_rig.model import kernels
 from emmc_rig.model.errors import SensingError
+from emmc_rig.model.files import whole_file
 
 Array = NDArray[np.floating]
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
@@ -262,24 +262,9 @@ class ImagingMatrix:
 
     def save(self, path: Path) -> None:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
-        partial = path.with_name(path.name + ".part")
-        try:
-            with h5py.File(partial, "w") as file:
-                file.attrs.update(
-                    format=FORMAT,
-                    binning=self.binning,
-                    camera=self.camera_json,
-                    sha256=self.checksum(),
-                )
-                file["weights"] = self.weights
-                if self.colour is not None:
-                    file["colour"] = self.colour
-            os.replace(partial, path)
-        except OSError as fault:
-            raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
-        finally:
-            with contextlib.suppress(OSError):
-                partial.unlink()
+        with _psi_file(path, self.layout) as file:
+            file.attrs["sha256"] = self.checksum()
+            file["weights"] = self.weights
 
     @classmethod
     def load(cls, path: Path) -> ImagingMatrix:
@@ -313,29 +298,27 @@ def save_planes(path: Path, layout: PsiLayout, planes: Iterable[NDArray[np.float
         raise SensingError("planes are written of a Psi with one stored colour")
     digest = hashlib.sha256(f"{FORMAT}|{layout.binning}|{layout.camera_json}".encode())
     colour = NO_COLOUR_MAP if layout.colour is None else layout.colour
-    partial = path.with_name(path.name + ".part")
+    with _psi_file(path, layout) as file:
+        weights = file.create_dataset("weights", layout.shape, np.float32)
+        for place, plane in zip(np.ndindex(layout.shape[:3]), planes, strict=True):
+            values = np.ascontiguousarray(plane, dtype=np.float32)
+            weights[(*place, slice(None), 0)] = values
+            digest.update(values.view(np.uint8).data)
+        digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
+        file.attrs["sha256"] = digest.hexdigest()
+
+
+@contextlib.contextmanager
+def _psi_file(path: Path, layout: PsiLayout) -> Iterator[h5py.File]:
+    """Yield an HDF5 file with all but weights and checksum; it appears whole or not at all."""
     try:
-        with h5py.File(partial, "w") as file:
-            weights = file.create_dataset("weights", layout.shape, np.float32)
-            for place, plane in zip(np.ndindex(layout.shape[:3]), planes, strict=True):
-                values = np.ascontiguousarray(plane, dtype=np.float32)
-                weights[(*place, slice(None), 0)] = values
-                digest.update(values.view(np.uint8).data)
+        with whole_file(path) as partial, h5py.File(partial, "w") as file:
+            file.attrs.update(format=FORMAT, binning=layout.binning, camera=layout.camera_json)
             if layout.colour is not None:
                 file["colour"] = layout.colour
-            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
-            file.attrs.update(
-                format=FORMAT,
-                binning=layout.binning,
-                camera=layout.camera_json,
-                sha256=digest.hexdigest(),
-            )
-        os.replace(partial, path)
+            yield file
     except OSError as fault:
         raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
 
 
 class _FlatPsi(LinearOperator):

@@ -14,7 +14,6 @@ Frames pass one at a time: memory stays flat. Source: NeXus definitions 2024.02,
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -26,6 +25,7 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
+from emmc_rig.model.files import whole_file
 from emmc_rig.session.readings import decoded, fused_shot, mean_dark, shot_frames, whiteboards
 from emmc_rig.session.session import Session
 
@@ -50,17 +50,11 @@ def export_hdf5(
             f"{session.folder}: {len(missing)} of {len(session.frames)} frames are missing; "
             "resume it with `emmc-rig capture` first"
         )
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        try:
-            with h5py.File(part, "w") as file:
-                _write(session, file, compress, on_frame)
-            os.replace(part, path)
-        except OSError as fault:
-            raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+        with whole_file(path) as part, h5py.File(part, "w") as file:
+            _write(session, file, compress, on_frame)
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
 
 
 def _write(

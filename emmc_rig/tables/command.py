@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.journal import open_folder
+from emmc_rig.model.files import write_text
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.tables.charts import draw_charts
 from emmc_rig.tables.dictionaries import Given, LeaveOneOut, Source
@@ -72,8 +72,8 @@ def run_tables(
             "The paper's tables and figures, reproduced",
             _about(run, len(results)), found, findings, charts, figures, provenance,
         )  # fmt: skip
-        _write(folder / CSV, csv_text(run, results))
-        _write(folder / PAGE, text)
+        write_text(folder / CSV, csv_text(run, results))
+        write_text(folder / PAGE, text)
         write_metrics(folder, _metrics(run, dictionaries, results, findings, seconds))
     except TablesStopped:
         raise
@@ -102,16 +102,6 @@ def _source(
     cells = [cell for part in parts for cell in cells_of(part, library.names)]
     binnings = sorted({cell.capture.binning for cell in cells})
     return Given.opened(dictionaries, binnings, sorted({cell.scene for cell in cells}))
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _about(run: Run, cells: int) -> list[str]:
