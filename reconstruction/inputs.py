@@ -41,6 +41,33 @@ def checked_inputs(
     return np.where(usable, frames, 0).astype(psi.weights.dtype), usable
 
 
+def checked_noise(
+    psi: ImagingMatrix, noise_sigma: float | Array, usable: NDArray[np.bool_] | None
+) -> tuple[float, Array]:
+    """Return the typical standard deviation of the readings, and the variance of each, float32.
+
+    noise_sigma: one for all, or (shot, pixel_y, pixel_x); the typical one is the root mean square
+    of those usable. Readings that are not usable get it too. Raises ReconstructionError for a shape
+    that does not fit Psi, and for deviations in use that are negative or not finite.
+    """
+    if np.ndim(noise_sigma) == 0:
+        typical = float(noise_sigma)
+        return typical, np.full(psi.frames_shape, typical**2, dtype=np.float32)
+    each = np.asarray(noise_sigma)
+    if each.shape != psi.frames_shape:
+        raise ReconstructionError(
+            f"noise levels of shape {each.shape} given, Psi needs {psi.frames_shape} "
+            "(shot, row, column), or one for all"
+        )
+    used = np.ones(psi.frames_shape, dtype=bool) if usable is None else usable
+    if not (np.isfinite(each[used]) & (each[used] >= 0)).all():
+        raise ReconstructionError(
+            "the noise levels hold values that are negative or not finite: exclude these readings"
+        )
+    mean = float(np.mean(np.square(each[used], dtype=np.float64))) if used.any() else 0.0
+    return float(np.sqrt(mean)), np.where(used, np.square(each), mean).astype(np.float32)
+
+
 def check_light_fields(psi: ImagingMatrix, patches: PatchTerm | None, start: Array | None) -> None:
     """Raise ReconstructionError for patches or a start that do not fit Psi's light field."""
     shape = psi.light_field_shape

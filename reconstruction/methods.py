@@ -20,7 +20,7 @@ from reconstruction.adaptive.method import AdaptiveSettings, fast, reconstruct_a
 from reconstruction.choices import choose_mu
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_inputs
+from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.patch_term import PatchTerm
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.sparse import (
@@ -161,7 +161,7 @@ def reconstruct(
     name: str,
     psi: ImagingMatrix,
     frames: Array,
-    noise_sigma: float,
+    noise_sigma: float | Array,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
@@ -171,8 +171,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Return the light field that the method called `name` finds.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
-    deviation. usable: pixels to fit (default all). estimates: what `estimate_patches` found from
+    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
+    one or of each; methods that take one take the root mean square. usable: pixels to fit (default
+    all). estimates: what `estimate_patches` found from
     the same inputs, for `dict-admm` and `tv-dict` to go on from. Raises ReconstructionError for a
     method that is not known, a dictionary that is missing, and inputs that do not fit each other.
     """
@@ -182,6 +183,7 @@ def reconstruct(
         chosen = fast(settings.adaptive) if name == "adaptive-fast" else settings.adaptive
         result = reconstruct_adaptive(psi, frames, noise_sigma, chosen, usable, on_step, clock)
         return dataclasses.replace(result, method=name)
+    noise_sigma, _ = checked_noise(psi, noise_sigma, usable)
     if not method.needs_dictionary:
         return reconstruct_tv(psi, frames, noise_sigma, settings.tv, usable, on_step, clock=clock)
     if dictionary is None:

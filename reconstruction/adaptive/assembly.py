@@ -57,6 +57,7 @@ def _walk(
     margin,
     binning,
     size,
+    colours,
     first_row,
     last_row,
     starts,
@@ -65,9 +66,9 @@ def _walk(
 ):
     """Count the entries of readings into starts (reading,), or, given columns, set the entries.
 
-    size: (y, x) of the padded texture. Pixel rows first_row to last_row - 1. starts: where each
-    reading's entries begin, (reading + 1,), when there are columns. slopes: (2, c, y, x), of which
-    derivatives by the disparity are made, or of one sample: entries of Psi itself.
+    size: (y, x) of the padded texture, of so many colours. Pixel rows first_row to last_row - 1.
+    starts: where each reading's entries begin, (reading + 1,), when there are columns. slopes:
+    (2, c, y, x), of which derivatives by the disparity are made, or of one sample: entries of Psi.
     """
     shots, views_v, views_u, _, stored, samples_x = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, samples_x // binning
@@ -160,7 +161,7 @@ def _walk(
                                             else:
                                                 place = (iy + i) * size[1] + ix + j
                                                 if not derivative:
-                                                    place += (layer * 3 + c) * plane
+                                                    place += (layer * colours + c) * plane
                                                 columns[at] = place
                                                 values[at] = value
                                                 at += 1
@@ -172,8 +173,9 @@ def assembled(
     hidden: NDArray[np.uint8],
     margin: int,
     slopes: Array | None = None,
+    colours: int = 3,
 ) -> sparse.csr_array | None:
-    """Return Psi of surfaces, (readings, 2 x 3 x texture); None where it would grow too large.
+    """Return Psi of surfaces, (readings, 2 x colours x texture); None where it grew too large.
 
     disparity, hidden: (v, u, y, x). slopes: (2, c, y, x), derivatives of the padded texture along
     y and x: then return the derivative by the centre view's disparity, (readings, texture).
@@ -198,6 +200,7 @@ def assembled(
                 margin,
                 psi.binning,
                 size,
+                colours,
                 first,
                 last,
                 starts,
@@ -215,5 +218,5 @@ def assembled(
     places = np.empty(starts[-1], dtype=np.int32)
     values = np.empty(starts[-1], dtype=np.float32)
     walk(starts, places, values)
-    width = size[0] * size[1] * (1 if derivative else 6)
+    width = size[0] * size[1] * (1 if derivative else 2 * colours)
     return sparse.csr_array((values, places, starts.astype(np.int32)), shape=(readings, width))

@@ -62,10 +62,12 @@ class Scene:
     centre: Array
 
 
-def surfaces_of(psi: ImagingMatrix, padded: Array, margin: int, nearer: int) -> Surfaces:
+def surfaces_of(
+    psi: ImagingMatrix, padded: Array, margin: int, nearer: int, colours: int = 3
+) -> Surfaces:
     """Return Psi of the surfaces of the centre view's disparity, padded by a margin (y, x)."""
     disparity, hidden = carried(padded, margin, nearer, psi.light_field_shape[:4])
-    return Surfaces(psi, disparity, hidden, margin)
+    return Surfaces(psi, disparity, hidden, margin, colours)
 
 
 def solve(
@@ -83,8 +85,8 @@ def solve(
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
-    not usable. picture: (y, x, c) to begin with. layers: whether hidden surfaces continue those
-    beside them, else they look like what hides them.
+    not usable. picture: (y, x, c) to begin with, of one colour or three. layers: whether
+    hidden surfaces continue those beside them, else they look like what hides them.
     """
     furthest = float(np.abs(centre).max()) + settings.room_px
     half = max(psi.light_field_shape[:2]) // 2
@@ -93,7 +95,8 @@ def solve(
     padded = searched = np.pad(centre, around, mode="edge")
     begun = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge")
     reach = max(1, int(np.ceil(np.ptp(centre) * half)))
-    surfaces = surfaces_of(psi, padded, margin, nearer)
+    colours = picture.shape[-1]
+    surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
     now = np.stack([begun, begun]).astype(np.float32)
     before, clean = now, now
@@ -124,7 +127,7 @@ def solve(
                 surfaces, padded, now[0], missed, doubted.astype(np.float32), settings.slope_px
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
-            surfaces = surfaces_of(psi, padded, margin, nearer)
+            surfaces = surfaces_of(psi, padded, margin, nearer, colours)
         before, now = (
             now,
             fitted(surfaces, frames, precision, clean, float(sigma), settings.fit_steps),

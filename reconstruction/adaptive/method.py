@@ -1,12 +1,15 @@
 """The adaptive method: disparities by evidence, then the texture of the surfaces they make.
 
-1. A smooth picture is what all models start from.
-2. Patches judge disparities by the likelihood of their readings (`evidence`, `search`), and agree
+1. Patches judge disparities by the likelihood of their readings (`evidence`, `search`), and agree
    with their neighbours (`labels`).
+2. If the whole scene needs no more than one plane, or no colour, it gets no more (`parsimony`).
 3. The centre view's disparity is carried to all views (`visibility`), so that the frames are
    linear in the surfaces' texture (`rays`).
-4. The texture is fitted to all frames at once, with what repeats in the scene as prior, and the
-   disparity is sharpened per pixel on the way (`joint`, `texture`, `shrinkage`, `refine`).
+4. The texture is fitted to all frames at once, from total variation's centre view, with what
+   repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
+   `texture`, `shrinkage`, `refine`).
+5. Where no surface explains the frames total variation decides (`free`), and everywhere when it
+   explains readings that were kept from the fit better than surfaces do.
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 """
@@ -21,22 +24,34 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.free import freed, misfit
+from reconstruction.adaptive.free import freed, misfit, missed_variance
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
-from reconstruction.adaptive.uncertainty import deviation, held_out
+from reconstruction.adaptive.parsimony import (
+    colour_is_needed,
+    grey_bound_db,
+    grey_psi,
+    may_be_grey,
+    one_plane,
+    plane_bound_db,
+)
+from reconstruction.adaptive.uncertainty import FEWEST, deviation, held_out
 from reconstruction.choices import smooth_guess
-from reconstruction.inputs import checked_inputs
+from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
 COARSE_LENGTH_PX = 8.0
+TRIAL_STEPS = 4
+"""Of the fits, with colour and without, that tell whether the scene has any."""
 EXPLAINED = 0.7
 """Share of what held-out readings differ by from the smooth picture's that must be explained: 0.92
 to 0.96 on four real scenes, 0.53 to 0.66 with a Psi whose masks were 5 samples off."""
@@ -69,6 +84,12 @@ class AdaptiveSettings(Settings):
         default="larger", description="disparity of what is in front; pictures may be flipped"
     )
     texture: TextureSettings = Field(default_factory=TextureSettings)
+    parsimony: bool = Field(
+        default=True, description="one plane, or no colour, where the whole scene needs no more"
+    )
+    start_steps: int = Field(
+        default=40, ge=1, description="of total variation, from which textures begin"
+    )
     free: bool = Field(
         default=True, description="let total variation decide where no surface explains the frames"
     )
@@ -83,7 +104,7 @@ def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
 def reconstruct_adaptive(
     psi: ImagingMatrix,
     frames: Array,
-    noise_sigma: float,
+    noise_sigma: float | Array,
     settings: AdaptiveSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
@@ -91,13 +112,14 @@ def reconstruct_adaptive(
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
-    deviation. usable: pixels to fit (default all). Raises ReconstructionError for inputs that do
-    not fit each other.
+    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
+    one or of each. usable: pixels to fit (default all). Raises ReconstructionError for inputs that
+    do not fit each other.
     """
     settings = settings or AdaptiveSettings()
     started = clock()
-    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    typical, noise = checked_noise(psi, noise_sigma, usable)
+    frames, usable = checked_inputs(psi, frames, typical, usable)
     total = settings.texture.steps + 3
 
     def tell(step: int) -> None:
@@ -105,7 +127,7 @@ def reconstruct_adaptive(
             on_step(Progress(step, None, None, total))
 
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
-    variance = np.full(frames.shape, noise_sigma**2 + settings.misfit**2, dtype=np.float32)
+    variance = noise + np.float32(settings.misfit**2)
     flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
     k = psi.binning
     grey = picture.mean(axis=-1)
@@ -132,26 +154,31 @@ def reconstruct_adaptive(
     searched_s = clock() - started
     tell(2)
     held = held_out(usable)
+    # Total variation is what surfaces must beat on the readings kept from both, and their begin.
+    plain = reconstruct_tv(
+        psi, frames, typical, TVSettings(max_steps=settings.start_steps), usable & ~held
+    ).light_field
+    precision = np.where(usable & ~held, 1 / variance, 0).astype(np.float32)
+    nearer = 1 if settings.nearer == "larger" else -1
+    needed = psi, centre, centre_view(plain), settings.texture
+    left_out: list[str] = []
+    if settings.parsimony:
+        needed, left_out = _needed(needed, volume, frames, precision, held, nearer, settings)
     found = solve(
-        psi,
-        centre,
-        1 if settings.nearer == "larger" else -1,
+        needed[0],
+        needed[1],
+        nearer,
         frames,
-        np.where(usable & ~held, 1 / variance, 0).astype(np.float32),
-        picture,
-        settings.texture,
+        precision,
+        needed[2],
+        needed[3],
         settings.layers,
         on_step=lambda step: tell(2 + step),
     )
-    light_field = np.clip(found.surfaces.light_field(found.texture), 0, 1)
-    doubt = search.variance_per_pixel(volume, psi.size, k)
-    sure = deviation(found, doubt, frames, noise_sigma, held)
+    light_field = found.surfaces.light_field(found.texture)
+    light_field = np.broadcast_to(np.clip(light_field, 0, 1), psi.light_field_shape)
     missed = frames - found.surfaces.forward(found.texture)
-    unexplained = misfit(psi, missed, noise_sigma, usable)
-    surface = light_field
-    if settings.free:
-        light_field = freed(psi, frames, noise_sigma, usable, surface, unexplained)
-    tell(total)
+    unexplained = misfit(psi, missed, noise, usable)
     kinds = texture_map(volume, psi.size, k)
     maps = {
         "disparity": found.centre,
@@ -159,13 +186,30 @@ def reconstruct_adaptive(
         "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
         "model": model_map(kinds, found, unexplained, k),
     }
-    if sure is not None:
-        # What total variation moved is in doubt by as much.
-        moved = np.square(light_field - surface).mean(axis=-1)
-        maps["sigma"] = np.sqrt(np.square(sure.sigma) + moved)
-    shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
-    explained = _explained(missed, data.readings, noise_sigma, held)
+    explained = _explained(missed, data.readings, noise, held)
     judged = _judgement(settings, volume, explained)
+    plainly = (frames - psi.forward(plain))[held]
+    if held.sum() >= FEWEST and np.square(plainly).mean() < np.square(missed[held]).mean():
+        judged.append(
+            "readings kept from the fit speak against surfaces: total variation is returned"
+        )
+        settled = reconstruct_tv(psi, frames, typical, TVSettings(), usable, start=plain)
+        light_field = settled.light_field
+        maps["model"][:] = MODELS.index("free")
+        spread = missed_variance(psi, plainly, noise, held)
+        maps["sigma"] = np.full(light_field.shape[:4], np.sqrt(spread), dtype=np.float32)
+    else:
+        surface = light_field
+        if settings.free:
+            light_field = freed(psi, frames, typical, usable, surface, unexplained)
+        doubt = search.variance_per_pixel(volume, psi.size, k)
+        sure = deviation(found, doubt, frames, noise, held)
+        if sure is not None:
+            # What total variation moved is in doubt by as much.
+            moved = np.square(light_field - surface).mean(axis=-1)
+            maps["sigma"] = np.sqrt(np.square(sure.sigma) + moved)
+    tell(total)
+    shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     return Reconstruction(
         method="adaptive",
         light_field=light_field,
@@ -175,7 +219,7 @@ def reconstruct_adaptive(
         objective=(),
         seconds=clock() - started,
         parameters={
-            "noise_sigma": noise_sigma,
+            "noise_sigma": typical,
             "lowest_px": float(found.centre.min()),
             "highest_px": float(found.centre.max()),
             "disparities": len(volume.disparities),
@@ -188,21 +232,62 @@ def reconstruct_adaptive(
             },
         },
         maps=maps,
+        left_out=tuple(left_out),
     )
 
 
-def _explained(
-    missed: Array, plain: Array, noise_sigma: float, held: NDArray[np.bool_]
-) -> float | None:
+Needed = tuple[ImagingMatrix, Array, Array, TextureSettings]
+
+
+def _needed(
+    asked: Needed,
+    volume: search.Volume,
+    frames: Array,
+    precision: Array,
+    held: NDArray[np.bool_],
+    nearer: int,
+    settings: AdaptiveSettings,
+) -> tuple[Needed, list[str]]:
+    """Return what the whole scene needs of Psi, disparity, picture and steps, and what it does not.
+
+    asked: what is taken if the scene needs all.
+    """
+    psi, centre, picture, texture = asked
+    left_out = []
+    pixels = psi.frames_shape[1:]
+    plane = one_plane(volume, pixels)
+    if plane is not None:
+        bound = plane_bound_db(plane, volume, pixels, picture)
+        kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
+        left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
+        centre = plane.over(psi.size, psi.binning)
+        texture = texture.model_copy(update={"refine_steps": 0})
+    if may_be_grey(picture):
+        quick = texture.model_copy(update={"steps": TRIAL_STEPS, "refine_steps": 0})
+        both = (psi, picture), (grey_psi(psi), picture.mean(axis=-1, keepdims=True))
+        missed = []
+        for seen, begun in both:
+            found = solve(seen, centre, nearer, frames, precision, begun, quick, settings.layers)
+            missed.append((frames - found.surfaces.forward(found.texture))[held])
+        if not colour_is_needed(*missed):
+            left_out.append(f"colour: one for all (at best {grey_bound_db(picture):.0f} dB)")
+            psi, picture = both[1]
+    return (psi, centre, picture, texture), left_out
+
+
+def _explained(missed: Array, plain: Array, noise: Array, held: NDArray[np.bool_]) -> float | None:
     """Return the share of the plain residual's variance that held-out readings no longer miss.
 
-    missed, plain: residuals of the scene found and of the smooth picture. None where the smooth
-    picture explains the readings as well as their noise allows.
+    missed, plain: residuals of the scene found and of the smooth picture; noise: the readings'
+    variance. None where the smooth picture explains the readings as well as their noise allows.
     """
-    before = float(np.mean(np.square(plain[held]))) - noise_sigma**2 if held.any() else 0.0
-    if before <= 3 * noise_sigma**2:
+    if not held.any():
         return None
-    return 1 - (float(np.mean(np.square(missed[held]))) - noise_sigma**2) / before
+    allowed = float(np.mean(noise[held]))
+    before = float(np.mean(np.square(plain[held]))) - allowed
+    if before <= 3 * allowed:
+        return None
+    return 1 - (float(np.mean(np.square(missed[held]))) - allowed) / before
 
 
 def _judgement(

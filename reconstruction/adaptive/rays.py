@@ -114,15 +114,20 @@ class Surfaces:
 
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
     centre view does not. Textures have the shape `textures_shape`, (layer, c, y, x), padded by
-    `margin` samples on all sides.
+    `margin` samples on all sides; colours: of them, 1 for a Psi that sees only the first.
     """
 
     def __init__(
-        self, psi: ImagingMatrix, disparity: Array, hidden: NDArray[np.uint8], margin: int
+        self,
+        psi: ImagingMatrix,
+        disparity: Array,
+        hidden: NDArray[np.uint8],
+        margin: int,
+        colours: int = 3,
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
-        self.textures_shape = (2, 3, rows + 2 * margin, columns + 2 * margin)
+        self.textures_shape = (2, colours, rows + 2 * margin, columns + 2 * margin)
         views = psi.light_field_shape[:2]
         self._even = np.ones((1, *views), dtype=np.float32)
         steps = np.indices(views, dtype=np.float32)
@@ -130,7 +135,8 @@ class Surfaces:
 
     @cached_property
     def _matrix(self) -> sparse.csr_array | None:
-        return assembled(self.psi, self.disparity, self.hidden, self.margin)
+        colours = self.textures_shape[1]
+        return assembled(self.psi, self.disparity, self.hidden, self.margin, colours=colours)
 
     @cached_property
     def _transposed(self) -> sparse.csc_array | None:
@@ -226,7 +232,7 @@ class Surfaces:
 
     def light_field(self, textures: Array) -> Array:
         """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""
-        out = np.empty(self.psi.light_field_shape, dtype=np.float32)
+        out = np.empty((*self.disparity.shape, textures.shape[1]), dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
             _render(self.disparity, self.hidden, textures, self.margin, first, last, out)

@@ -51,13 +51,15 @@ class Volume:
     """Probabilities of disparities on a grid of patches.
 
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
-    disparity). kind: (row, column) of the texture. decisive: (row, column), whether the patch's
+    disparity); evidence: theirs, log-likelihoods, -inf where not judged. kind: (row, column) of the
+    texture. decisive: (row, column), whether the patch's
     own evidence prefers any disparity. at_end: share of deciding patches at the range's ends.
     """
 
     disparities: NDArray[np.float64]
     centres: tuple[Array, Array]
     probability: NDArray[np.float32]
+    evidence: NDArray[np.float32]
     kind: NDArray[np.int64]
     decisive: NDArray[np.bool_]
     at_end: float = 0.0
@@ -66,6 +68,11 @@ class Volume:
 def reading_side(shots: int) -> int:
     """Return how many pixels wide a patch is: about as many readings for any number of shots."""
     return max(4, round(8 / shots**0.5))
+
+
+def coarse_side(shots: int) -> int:
+    """Return how many pixels wide a patch of the coarse search is: there are few of them."""
+    return min(8, max(4, round(12 / shots**0.5)))
 
 
 def _judged(
@@ -103,7 +110,7 @@ def coarse(
     data: Data, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
 ) -> Volume:
     """Return the coarse search over disparities up to `furthest_px` to both sides."""
-    side = reading_side(data.psi.shots)
+    side = coarse_side(data.psi.shots)
     room = (min(data.psi.frames_shape[1:]) - 1) // (side - 1)
     patches = EvidencePatches(side, 3 * side // 2, min(COARSE_SPACING, max(room, 1)))
     reach = COARSE_STEP_PX * np.floor(min(START_PX, furthest_px) / COARSE_STEP_PX)
@@ -134,7 +141,7 @@ def coarse(
         known = np.concatenate([wanted[0], known, wanted[1]])
     half = (patches.side - 1) * patches.spacing / 2
     centres = grid[0] + half, grid[1] + half
-    return Volume(known, centres, chances, kind, deciding, max(share))
+    return Volume(known, centres, chances, evidence, kind, deciding, max(share))
 
 
 def _candidates(
@@ -190,7 +197,7 @@ def fine(
         evidence * OWN_SHARE, compatibility(labels, slope_px * patches.stride, jump)
     )
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
-    return Volume(labels, centres, chances, kind, deciding, rough.at_end)
+    return Volume(labels, centres, chances, evidence, kind, deciding, rough.at_end)
 
 
 def _pixel_maps(

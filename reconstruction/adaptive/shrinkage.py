@@ -161,14 +161,15 @@ def denoised(
     chroma: float = 2.5,
     reach: int = REACH,
 ) -> Array:
-    """Return a picture (c, y, x) in RGB without white noise of deviation sigma in every colour.
+    """Return a picture (c, y, x) without white noise of deviation sigma in every colour.
 
-    guide: (c, y, x), a cleaner picture, in which like blocks are found. step: between reference
-    blocks; first: where they begin, to vary over repeated calls. threshold: in deviations, chroma
-    times as large in chrominance, which varies less.
+    picture: of one colour, or RGB. guide: (c, y, x), a cleaner picture, in which like blocks are
+    found. step: between reference blocks; first: where they begin, to vary over repeated calls.
+    threshold: in deviations, chroma times as large in chrominance, which varies less.
     """
-    opponent = np.ascontiguousarray(np.einsum("oc,cyx->oyx", _OPPONENT, picture, optimize=True))
-    luminance = np.ascontiguousarray(np.einsum("c,cyx->yx", _OPPONENT[0], guide, optimize=True))
+    mixing = _OPPONENT if len(picture) == 3 else np.eye(len(picture), dtype=np.float32)
+    opponent = np.ascontiguousarray(np.einsum("oc,cyx->oyx", mixing, picture, optimize=True))
+    luminance = np.ascontiguousarray(np.einsum("c,cyx->yx", mixing[0], guide, optimize=True))
     # Blocks of two bands overlap: each adds to its own sums.
     sums = np.zeros((get_num_threads(), 2, *picture.shape), dtype=np.float32)
     rows = _starts(picture.shape[1], step, first)
@@ -193,4 +194,4 @@ def denoised(
     in_bands(work, len(rows), len(sums))
     total, weight = sums.sum(axis=0)
     mean = total / weight
-    return np.ascontiguousarray(np.einsum("oc,oyx->cyx", _OPPONENT, mean, optimize=True))
+    return np.ascontiguousarray(np.einsum("oc,oyx->cyx", mixing, mean, optimize=True))

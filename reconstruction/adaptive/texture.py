@@ -76,7 +76,7 @@ def background(front: Array, centre: Array, nearer: int, reach: int) -> Array:
         if not missing.any():
             break
         share = cv2.GaussianBlur(known, (0, 0), width)
-        for c in range(3):
+        for c in range(len(front)):
             blurred = cv2.GaussianBlur(front[c] * known, (0, 0), width)
             filled[c][missing] = (blurred / np.maximum(share, 1e-6))[missing]
         have = np.where(missing, share, have)

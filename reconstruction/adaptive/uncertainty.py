@@ -102,20 +102,22 @@ def deviation(
     scene: Scene,
     doubt: Array,
     frames: Array,
-    noise_sigma: float,
+    noise: Array,
     held: NDArray[np.bool_],
 ) -> Deviation | None:
     """Return the standard deviation of the scene's light field; None with too few readings held.
 
-    doubt: (y, x), variance of the disparity. frames, held: (shot, pixel_y, pixel_x).
+    doubt: (y, x), variance of the disparity. frames, their variance `noise`, held: (shot, pixel_y,
+    pixel_x).
     """
     count = int(held.sum())
     if count < FEWEST:
         return None
     parts = _parts(scene, doubt)
     missed = (frames - scene.surfaces.forward(scene.texture))[held].astype(np.float64)
-    noise, blur, slip = _gathered(scene, parts, held)
-    base = noise_sigma**2 + noise + 1e-12
+    let_in, blur, slip = _gathered(scene, parts, held)
+    of_readings = noise[held].astype(np.float64)
+    base = of_readings + let_in + 1e-12
 
     def surprise(logs: NDArray[np.float64]) -> float:
         variance = base + np.exp(logs[0]) * blur + np.exp(logs[1]) * slip
@@ -124,9 +126,9 @@ def deviation(
 
     found = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
     weights = np.exp(found)
-    predicted = noise + weights[0] * blur + weights[1] * slip
+    predicted = let_in + weights[0] * blur + weights[1] * slip
     # The scale at which 68 % of the held-out readings lie within one deviation, noise included.
-    beyond = np.maximum(np.square(missed) - noise_sigma**2, 0) / np.maximum(predicted, 1e-20)
+    beyond = np.maximum(np.square(missed) - of_readings, 0) / np.maximum(predicted, 1e-20)
     scale = max(float(np.quantile(beyond, WITHIN_ONE)), LEAST_SCALE)
     variance = scale * (parts[0] + weights[0] * parts[1] + weights[1] * parts[2])
     return Deviation(np.sqrt(variance).astype(np.float32), count, *map(float, weights))
