@@ -15,7 +15,7 @@ from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
-from reconstruction.adaptive.planning import expected_errors, patch_error
+from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.shrinkage import denoised
@@ -274,7 +274,8 @@ def test_bad_inputs_are_refused_in_one_line(bayer):
 
 
 def planned(psi, variance=1e-5):
-    return patch_error(psi, (0, 0), 0.6, 0.02, 0.1, variance, TexturePrior())
+    shots = range(psi.shots)
+    return patch_errors(psi, [shots], 0.6, 0.02, 0.1, variance, TexturePrior())[0]
 
 
 def test_expected_error_is_the_prior_without_readings_and_falls_with_every_shot(coded_psi):
@@ -305,11 +306,10 @@ def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi):
 
 def test_the_mask_position_that_tells_more_is_expected_to_err_less(bayer, planted):
     maps = planted[3].maps
-    same = ImagingMatrix(bayer.weights[[0, 0]].copy(), bayer.colour[[0, 0]].copy())
     moved = np.concatenate([bayer.weights, np.roll(bayer.weights, 9, axis=5)])
-    other = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
+    psi = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
     grey = planted[3].light_field[2, 2].mean(axis=-1)
     errors = expected_errors(
-        [same, other], maps["disparity"], maps["texture"], grey, 0.004**2, patches=4
+        psi, [(0, 0), (0, 1)], maps["disparity"], maps["texture"], grey, 0.004**2, patches=4
     )
     assert errors[1] < errors[0]
