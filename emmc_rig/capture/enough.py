@@ -81,8 +81,9 @@ def judged(
         psi,
         [tuple(shots), *((*shots, shot) for shot in free)],
         result.maps["disparity"],
+        result.maps["disparity_sigma"],
         result.maps["texture"],
-        result.light_field[views_v // 2, views_u // 2].mean(axis=-1),
+        result.light_field[views_v // 2, views_u // 2],
         noise_sigma**2,
     )
     gains_db = 10 * np.log10(errors[0] / errors[1:])

@@ -1,8 +1,9 @@
 """Which further shot would help most: the error to be expected with each, before it is taken.
 
-A patch of known disparity and kind of texture is Gaussian (see `evidence`), so that its expected
-error given any shots follows from their Psi alone: prior variance less what the readings explain,
-K - K Psi^T (Psi K Psi^T + noise)^-1 Psi K. It is averaged over patches spread over the scene.
+A patch of one kind of texture is Gaussian (see `evidence`), and what its disparity is in doubt by
+moves it along its slopes from view to view. So its expected error given any shots follows from
+their Psi alone: prior variance less what the readings explain, K - K Psi^T (Psi K Psi^T + noise)^-1
+Psi K. It is averaged over patches spread over the scene.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
@@ -22,6 +24,8 @@ from reconstruction.problem import OPPONENT
 Array = NDArray[np.floating]
 SIDE = 8
 PATCHES = 24
+MOST_DOUBT_PX = 1.0
+"""Further off a texture is another one, and its slopes say nothing."""
 TARGETS = 4
 """Samples a side, in the middle of a patch, whose error counts."""
 
@@ -34,11 +38,14 @@ def patch_errors(
     chroma: float,
     variance: float,
     prior: TexturePrior,
+    doubt: float = 0.0,
+    slopes: Array | None = None,
 ) -> NDArray[np.float64]:
     """Return the expected squared error of a value in the middle of a patch, (choice,).
 
     psi: of the patch, SIDE x SIDE samples in pixels of k x k. choices: indices of shots, each.
     amplitude: variance of luminance; chroma: that of a chrominance over it. variance: of a reading.
+    doubt: variance of the disparity; slopes: of the centre view, down and right (2, y, x, c).
     """
     k, readings = psi.binning, (SIDE // psi.binning) ** 2
     views_v, views_u = psi.light_field_shape[:2]
@@ -46,7 +53,7 @@ def patch_errors(
     at = np.stack([y - disparity * (v - views_v // 2), x - disparity * (u - views_u // 2)], axis=1)
     first = (SIDE - TARGETS) // 2
     inner = (np.minimum(y, x) >= first) & (np.maximum(y, x) < first + TARGETS)
-    alike = prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
+    alike = prior.covariance(cdist(at, at, "sqeuclidean"))
     ray = np.arange(len(at))
     pixel = y // k * (SIDE // k) + x // k
     opponent = [sparse.csr_array((psi.shots * readings, len(at))) for _ in OPPONENT]
@@ -61,16 +68,23 @@ def patch_errors(
                 )
     variances = amplitude * np.array([1, chroma, chroma])
     seen = [axis @ alike for axis in opponent]
+    steps = np.stack([v - views_v // 2, u - views_u // 2])
+    moved = np.zeros((3, len(at)))
+    if slopes is not None:
+        moved = OPPONENT @ np.einsum("sr,src->cr", steps, slopes[:, y, x])
+    shifted = sum(axis @ part for axis, part in zip(opponent, moved, strict=True))
     covariance = sum(
         size * (axis @ near.T) for size, near, axis in zip(variances, seen, opponent, strict=True)
-    ) + variance * np.eye(psi.shots * readings)
+    )
+    covariance += doubt * np.outer(shifted, shifted)
     errors = np.zeros(len(choices))
     for number, shots in enumerate(choices):
         rows = np.concatenate([shot * readings + np.arange(readings) for shot in shots])
-        factor = cho_factor(covariance[np.ix_(rows, rows)])
-        for size, near in zip(variances, seen, strict=True):
-            cross = size * near[np.ix_(rows, inner)]
-            errors[number] += size - np.mean(np.sum(cross * cho_solve(factor, cross), axis=0))
+        factor = cho_factor(covariance[np.ix_(rows, rows)] + variance * np.eye(len(rows)))
+        for size, near, part in zip(variances, seen, moved[:, inner], strict=True):
+            cross = size * near[np.ix_(rows, inner)] + doubt * np.outer(shifted[rows], part)
+            explained = np.sum(cross * cho_solve(factor, cross), axis=0)
+            errors[number] += np.mean(size + doubt * part**2 - explained)
     return errors / 3
 
 
@@ -78,15 +92,17 @@ def expected_errors(
     psi: ImagingMatrix,
     choices: Sequence[Sequence[int]],
     disparity: Array,
+    doubt: Array,
     kinds: Array,
-    brightness: Array,
+    picture: Array,
     variance: float,
     patches: int = PATCHES,
 ) -> NDArray[np.float64]:
     """Return the mean squared error to be expected with each choice of shots, (choice,).
 
-    psi: of all shots there may be. choices: indices of shots, each. disparity, brightness: (y, x)
-    of the centre view. kinds: (y, x) indices of the textures in TexturePrior.kinds. Raises
+    psi: of all shots there may be. choices: indices of shots, each. disparity, doubt: (y, x), in
+    pixels, its own and its standard deviation. kinds: (y, x) indices of the textures in
+    TexturePrior.kinds. picture: the centre view (y, x, c). variance: of a reading. Raises
     ReconstructionError for light fields smaller than a patch.
     """
     prior = TexturePrior()
@@ -104,17 +120,21 @@ def expected_errors(
         for y in np.linspace(0, rows - SIDE, down)
         for x in np.linspace(0, columns - SIDE, across)
     ]
+    slopes = np.stack(np.gradient(np.asarray(picture, dtype=np.float64), axis=(0, 1)))
     errors = np.zeros(len(choices))
     for y, x in corners:
         middle = y + SIDE // 2, x + SIDE // 2
+        patch = np.s_[y : y + SIDE, x : x + SIDE]
         amplitude, chroma = prior.kinds[int(kinds[middle])]
         errors += patch_errors(
-            psi.window(slice(y, y + SIDE), slice(x, x + SIDE)),
+            psi.window(*patch),
             choices,
             float(disparity[middle]),
-            amplitude * float(brightness[middle]) ** 2,
+            amplitude * float(np.mean(picture[middle])) ** 2,
             chroma,
             variance,
             prior,
+            min(float(doubt[middle]), MOST_DOUBT_PX) ** 2,
+            slopes[:, *patch],
         )
     return errors / len(corners)
