@@ -1,8 +1,9 @@
 """How many shots scenes need, and what choosing them saves: sessions judged after every shot.
 
-A session with every planned shot of a scene is captured on the simulated rig, which traces rays;
-its whiteboards give Psi. Shots are then chosen from it as `emmc-rig capture --until` chooses them,
-and beside that taken in the plan's order; both are compared with the truth after each shot.
+A session with every planned shot of a scene is captured on the simulated rig, which traces rays.
+The whiteboards of the first give Psi to all: the bench is the same. Shots are then chosen from it
+as `emmc-rig capture --until` chooses them, and beside that taken in the plan's order; both are
+compared with the truth after each shot.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
 
 ROWS, SESSIONS = "next_shots.jsonl", "sessions"
-PLANNED, MOST = 9, 6
+PLANNED, MOST = 6, 5
 """Shots to choose from, and to take at most."""
 RAYS = 512
 REVISION = 1
@@ -50,11 +51,15 @@ REVISION = 1
 
 @dataclass(frozen=True)
 class ShotRow:
-    """After some shots: the PSNR that the deviation states, and that against the truth."""
+    """After some shots: the PSNR that the deviation states, and that against the truth.
+
+    foretold_db: what the shot that is chosen next is expected to gain; None where none is chosen.
+    """
 
     shots: tuple[int, ...]
     stated_db: float
     psnr_db: float
+    foretold_db: float | None = None
 
     @property
     def count(self) -> int:
@@ -76,7 +81,7 @@ class SceneRows:
     def from_dict(cls, data: Mapping[str, Any]) -> SceneRows:
         """Return what `asdict` described."""
         chosen, in_order = (
-            tuple(ShotRow(tuple(row["shots"]), row["stated_db"], row["psnr_db"]) for row in rows)
+            tuple(ShotRow(**{**row, "shots": tuple(row["shots"])}) for row in rows)
             for rows in (data["chosen"], data["in_order"])
         )
         return cls(data["scene"], chosen, in_order, data["copied_db"])
@@ -145,10 +150,14 @@ def after(session: Session, scale: Scale, shots: Sequence[int]) -> tuple[Reconst
 
 
 def rows_of(
-    session: Session, truth: np.ndarray, scene: str, most: int, on_row: Callable[[str], None]
+    session: Session,
+    scale: Scale,
+    truth: np.ndarray,
+    scene: str,
+    most: int,
+    on_row: Callable[[str], None],
 ) -> SceneRows:
     """Return what a session's shots give, chosen and in order, up to `most` of them."""
-    scale = session_scale(session)
     known: dict[tuple[int, ...], tuple[ShotRow, Judgement]] = {}
 
     def row(shots: tuple[int, ...]) -> tuple[ShotRow, Judgement]:
@@ -156,10 +165,9 @@ def rows_of(
             result, sigma = after(session, scale, shots)
             target_db = math.inf if len(shots) < most else 0.0
             found = judged(scale.psi, result, shots, sigma, target_db)
-            known[shots] = (
-                ShotRow(shots, found.stated_db, psnr_db(result.light_field, truth)),
-                found,
-            )
+            gain = None if found.next is None else found.expected_db[found.next] - found.stated_db
+            achieved_db = psnr_db(result.light_field, truth)
+            known[shots] = ShotRow(shots, found.stated_db, achieved_db, gain), found
             on_row(f"{scene}, {len(shots)} shots")
         return known[shots]
 
@@ -194,6 +202,7 @@ def next_shots(
     """
     journal = Journal(folder / ROWS)
     plan = candidate_plan(camera_name, camera, size)
+    scale: Scale | None = None
     for spec in scenes:
         imaged = ImagedRig(scene=spec, size=size, seed=seed, rays=rays)
         fine = fine_scene(
@@ -214,8 +223,15 @@ def next_shots(
         result = journal.get(digest)
         if result is None:
             (folder / SESSIONS).mkdir(exist_ok=True)
-            session = captured(plan, imaged, folder / SESSIONS / f"{fine.scene.name}-{digest[:8]}")
-            result = asdict(rows_of(session, truth, fine.scene.name, most, on_row))
+            place = folder / SESSIONS / f"{fine.scene.name}-{digest[:8]}"
+            if scale is None:
+                session = captured(plan, imaged, place)
+                scale = session_scale(session)
+            else:
+                shots_alone = plan.model_copy(update={"whiteboards": None})
+                session = captured(shots_alone, imaged, place.with_name(f"{place.name}-shots"))
+            on_row(f"{fine.scene.name}, captured")
+            result = asdict(rows_of(session, scale, truth, fine.scene.name, most, on_row))
             journal.add(digest, inputs, result)
         yield SceneRows.from_dict(result)
 

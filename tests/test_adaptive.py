@@ -20,6 +20,7 @@ from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.shrinkage import denoised
 from reconstruction.adaptive.texture import fitted
+from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import OPPONENT
@@ -271,6 +272,14 @@ def test_bad_inputs_are_refused_in_one_line(bayer):
         reconstruct_adaptive(
             bayer, np.zeros(bayer.frames_shape), 0.01, usable=np.zeros(bayer.frames_shape, bool)
         )
+
+
+def test_a_pixel_is_kept_from_the_fit_with_all_its_shots_or_not_at_all():
+    usable = np.ones((3, 40, 50), bool)
+    usable[1, :20] = False
+    held = held_out(usable)
+    assert 0 < held.sum() < 0.06 * usable.sum()
+    np.testing.assert_array_equal(held, usable & held.any(axis=0))
 
 
 def planned(psi, variance=1e-5):

@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calibration.shadow import shadow_mask
-from emmc_rig.capture.enough import METHOD, judged
+from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan
 from emmc_rig.capture.watcher import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.session.decisions import decided_words, decisions
+from emmc_rig.session.decisions import decided_words, decisions, ended
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session, wall_time
@@ -84,7 +84,7 @@ class Until:
             return first
         chosen = self._chosen()
         due = tuple(frame for frame in missing if frame.bench.shot in chosen)
-        if due or not missing:
+        if due or ended(session.journal.entries) is not None:
             return due
         self._decide(chosen, now_s)
         return self(now_s)
@@ -104,14 +104,9 @@ class Until:
         assert target_db is not None
         began_s = now_s()
         self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
-        self._scale = self._scale or session_scale(session)
-        psi = self._scale.psi
-        taken = scaled_readings(session, self._scale, shots)
-        result = reconstruct(
-            METHOD, taken.psi, taken.readings, taken.noise_sigma, usable=taken.usable
-        )
-        found = judged(psi, result, shots, taken.noise_sigma, target_db)
-        spared = [] if found.next is not None else sorted(set(range(psi.shots)) - set(shots))
+        found = self._judged(shots, target_db)
+        planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
+        spared = [] if found.next is not None else sorted(planned - set(shots))
         entry = {
             "run": session.runs,
             "shots": list(shots),
@@ -131,3 +126,10 @@ class Until:
         }
         session.note("decided", **entry)
         self._watcher.tell(decided_words(entry))
+
+    def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
+        self._scale = self._scale or session_scale(self._session)
+        taken = scaled_readings(self._session, self._scale, shots)
+        sigma = taken.noise_sigma
+        result = reconstruct(METHOD, taken.psi, taken.readings, sigma, usable=taken.usable)
+        return judged(self._scale.psi, result, shots, sigma, target_db)
