@@ -61,13 +61,16 @@ def test_a_plan_to_choose_from_moves_the_mask_and_can_be_calibrated():
 
 def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(next_shot, "PLANNED", 3)
-    camera = find_camera("rgbw-bayer-1shot")
+    whole = find_camera("rgbw-bayer-1shot")
+    few = tmp_path / "few-views.yaml"
+    few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
+    camera = find_camera(str(few))
     folder = open_folder(tmp_path / "out", next_shot.ROWS, "shots")
     told = []
 
     def measured():
         rows = next_shot.next_shots(
-            ["near-planar"], "rgbw-bayer-1shot", camera, (32, 40), 0, folder, told.append, 64, 2
+            ["near-planar"], str(few), camera, (32, 40), 0, folder, told.append, 64, 2
         )
         return list(rows)
 
