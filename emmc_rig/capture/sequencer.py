@@ -25,10 +25,8 @@ from emmc_rig.capture.checks import (
     LEAST_LIKENESS,
     Figures,
     FrameRefusedError,
-    Shift,
     check,
     figures,
-    registered,
 )
 from emmc_rig.capture.control import Control, uninterrupted
 from emmc_rig.capture.metering import (
@@ -45,6 +43,7 @@ from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.output import command_line, shown_bytes, versions
+from emmc_rig.registration import Shift, registered
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
