@@ -616,16 +616,14 @@ def _chart_next_shot(
         bars.begin("capture and judge", None)
         found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
         bars.finish()
-    table = Table(
-        "scene", "target, dB", "shots by --until", "stated dB", "dB", "in order, for the target",
-        box=SIMPLE,
-    )  # fmt: skip
+    names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
+    table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]
     for one in rows:
         table.add_row(
             one.scene,
             f"{one.target_db:g}",
-            f"{one.stopped.count}" if one.reached else f"{one.stopped.count}, short of it",
+            f"{one.stopped.count}" if one.reached else f"{one.stopped.count}, short",
             f"{one.stopped.stated_db:.2f}",
             f"{one.stopped.psnr_db:.2f}",
             "-" if one.fixed is None else str(one.fixed),

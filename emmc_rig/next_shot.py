@@ -251,15 +251,17 @@ def total_savings(rows: Sequence[Saving]) -> Iterator[str]:
     """Yield, for every target, the shots that choosing saves against one number for all scenes."""
     for target_db in dict.fromkeys(row.target_db for row in rows):
         served = [
-            (row.stopped.count, row.fixed)
+            (row, row.fixed)
             for row in rows
             if row.target_db == target_db and row.reached and row.fixed is not None
         ]
         if not served:
             yield f"{target_db:g} dB: no scene reaches it with the shots there are"
             continue
-        taken, fixed = sum(count for count, _ in served), max(count for _, count in served)
+        taken = sum(row.stopped.count for row, _ in served)
+        fixed = max(count for _, count in served)
+        met = sum(row.stopped.psnr_db >= target_db for row, _ in served)
         yield (
-            f"{target_db:g} dB: {taken} shots for the {len(served)} scenes that reach it, "
-            f"{fixed * len(served)} with the fixed number that serves them all, {fixed}"
+            f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it in "
+            f"truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
         )

@@ -44,8 +44,8 @@ def test_what_choosing_saves_is_read_off_the_rows():
     assert (hard.stopped.count, hard.reached, hard.fixed) == (3, False, None)
     told = list(next_shot.total_savings([easy, middle, hard]))
     assert told[0] == (
-        "20 dB: 1 shots for the 1 scenes that reach it, 1 with the fixed number that serves them "
-        "all, 1"
+        "20 dB: 1 shots for 1 scene(s), 1 of which meet it in truth; 1 with the fixed number that "
+        "serves them all, 1"
     )
     assert told[2] == "40 dB: no scene reaches it with the shots there are"
 
