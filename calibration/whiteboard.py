@@ -13,8 +13,8 @@ Source: whiteboard calibration as in Marwah et al. (ACM TOG 2013), supplement, t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,16 @@ class Calibration:
     white_dn_per_s: NDArray[np.float32]
     gain: SensorGain
     good: NDArray[np.bool_] | None = None
+
+    def of_shots(self, shots: Sequence[int], camera_json: str = "") -> Calibration:
+        """Return the calibration of some shots alone; camera_json: see `ImagingMatrix.of_shots`."""
+        chosen = list(shots)
+        return replace(
+            self,
+            psi=self.psi.of_shots(chosen, camera_json),
+            deviation=self.deviation[chosen],
+            white_dn_per_s=self.white_dn_per_s[chosen],
+        )
 
     def usable(self, frames_dn: Frames, white_level_dn: int) -> NDArray[np.bool_]:
         """Return which readings to use, (shot, y, x): of good pixels, and not saturated."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
-MOST_SHOTS = 5
-"""Simulated when the target is not reached."""
 DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 TIMED_SIZE, TIMED_CALLS = "593x840", 7
@@ -416,8 +415,9 @@ def chart(
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
     until: Annotated[
-        float, typer.Option("--until", help="PSNR, dB, at which --next-shot stops")
-    ] = 30.0,
+        list[float] | None,
+        typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
+    ] = None,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     repeats: Annotated[
@@ -439,12 +439,15 @@ def chart(
             _chart_kernels(named, size or TIMED_SIZE, repeats or TIMED_CALLS, place)
         return
     if ablation or next_shot:
-        seen, through = (scene or [DEFAULT_SCENE])[0], (camera or ["rgbw-bayer-1shot"])[0]
-        cut = _size(size) or (128, 160)
+        through, cut = (camera or ["rgbw-bayer-1shot"])[0], _size(size) or (128, 160)
         if ablation:
+            seen = (scene or [DEFAULT_SCENE])[0]
             _chart_ablation(seen, through, cut, seed, out or Path("emmc-ablation"))
         else:
-            _chart_next_shot(seen, through, cut, until, seed, out or Path("emmc-next-shot"))
+            from simulators.scenes import SCENES
+
+            place, targets = out or Path("emmc-next-shot"), sorted(until or [30.0])
+            _chart_next_shot(scene or list(SCENES), through, cut, targets, seed, place)
         return
     from emmc_rig.chart.command import chart_settings, run_chart, shown_charts
     from emmc_rig.chart.run import ChartStopped
@@ -599,32 +602,45 @@ def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, o
 
 
 def _chart_next_shot(
-    scene: str, camera: str, size: tuple[int, int], until: float, seed: int, out: Path
+    scenes: list[str], camera: str, size: tuple[int, int], until: list[float], seed: int, out: Path
 ) -> None:
     from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.next_shot import shot_plan
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.journal import open_folder
+    from emmc_rig.next_shot import ROWS, next_shots, savings, total_savings
+    from emmc_rig.output import command_line, versions, write_metrics
 
-    table = Table("shots", "mask positions", "stated dB", "dB", "positions in order, dB")
-    rows = []
-    with result_folder(out) as folder:
-        for row in shot_plan(scene, find_camera(camera), size, until, MOST_SHOTS, seed):
-            rows.append(row.as_dict())
-            table.add_row(
-                str(row.shots),
-                " ".join(map(str, row.positions)),
-                f"{row.stated_db:.2f}",
-                f"{row.psnr_db:.2f}",
-                f"{row.fixed_db:.2f}",
-            )
-        metrics = {"scene": scene, "camera": camera, "size": list(size), "rows": rows}
-        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    described = find_camera(camera)
+    folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
+    with shown_progress() as progress:
+        bars = Bars(progress)
+        bars.begin("capture and judge", None)
+        found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
+        bars.finish()
+    names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
+    table = Table(*names, box=SIMPLE)
+    rows = [one for scene in found for one in savings(scene, until)]
+    for one in rows:
+        table.add_row(
+            one.scene,
+            f"{one.target_db:g}",
+            f"{one.stopped.count}" if one.reached else f"{one.stopped.count}, short",
+            f"{one.stopped.stated_db:.2f}",
+            f"{one.stopped.psnr_db:.2f}",
+            "-" if one.fixed is None else str(one.fixed),
+        )
     Console().print(table)
-    reached = rows[-1]["stated_db"] >= until
-    typer.echo(
-        f"{rows[-1]['shots']} shot(s): the stated PSNR "
-        + (f"reaches {until:g} dB" if reached else f"stays below {until:g} dB")
-    )
+    for line in total_savings(rows):
+        typer.echo(line)
+    metrics = {
+        "camera": camera,
+        "size": list(size),
+        "seed": seed,
+        "rows": [row.as_dict() for row in rows],
+        "scenes": [asdict(scene) for scene in found],
+        "command": command_line(),
+        "versions": versions(),
+    }
+    write_metrics(folder, metrics)
 
 
 def _chart_kernels(camera: str, size: str | None, repeats: int, out: Path) -> None:

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from drivers.raw import RawFrame
 
+BAYER = ("rggb", "bggr", "grbg", "gbrg")
 LETTERS = {"r": "red", "g": "green", "b": "blue"}
 STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
 BLOCKS = " ▁▂▃▄▅▆▇█"
@@ -27,7 +28,7 @@ def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
     A tile that is not Bayer counts as grey.
     """
     mosaic = frame.mosaic
-    if len(frame.cfa) != 4 or set(frame.cfa) != set(LETTERS):
+    if frame.cfa not in BAYER:
         return {"grey": [mosaic]}
     planes: dict[str, list[NDArray[np.uint16]]] = {name: [] for name in LETTERS.values()}
     for index, letter in enumerate(frame.cfa):
@@ -108,6 +109,11 @@ def preview(frame: RawFrame) -> NDArray[np.uint8]:
     scale = LONGEST_PREVIEW_PX / max(linear.shape[:2])
     if scale < 1:
         linear = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return srgb_codes(linear)
+
+
+def srgb_codes(linear: Array) -> NDArray[np.uint8]:
+    """Return linear light in [0, 1] (any shape) as 8 bits for a display (IEC 61966-2-1)."""
     coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.round(255 * coded).astype(np.uint8)
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -78,6 +79,14 @@ def parse_size(
     if not (cross and rows.isdigit() and columns.isdigit()):
         raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
     return int(rows), int(columns)
+
+
+def parse_psnr(text: str, option: str) -> float:
+    """Return the dB of "28dB" or "28"; raises AppError for anything else."""
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
+    if found is None or not float(found[1]) > 0:
+        raise AppError(f"{option} {text}: write a PSNR, for instance 28dB")
+    return float(found[1])
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:

@@ -76,7 +76,9 @@ def read_capture(folder: Path) -> Capture:
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")
-    return _captured(readings, deviation, usable)
+    judged = deviation[usable]
+    sigma = float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
+    return Capture(readings, sigma, usable)
 
 
 def read_session(folder: Path, psi_out: Path) -> Capture:
@@ -86,7 +88,7 @@ def read_session(folder: Path, psi_out: Path) -> Capture:
     """
     taken = session_readings(Session(folder))
     taken.psi.save(psi_out)
-    return _captured(taken.readings, np.sqrt(taken.variance), taken.usable)
+    return Capture(taken.readings, taken.noise_sigma, taken.usable)
 
 
 def _read(folder: Path, out: Path, psi_path: Path | None) -> tuple[Capture, Path]:
@@ -95,14 +97,6 @@ def _read(folder: Path, out: Path, psi_path: Path | None) -> tuple[Capture, Path
         capture = read_session(folder, out / PSI)
         return capture, psi_path or out / PSI
     return read_capture(folder), psi_path or folder / PSI
-
-
-def _captured(
-    readings: NDArray[np.float32], deviation: NDArray[np.floating], usable: NDArray[np.bool_]
-) -> Capture:
-    judged = deviation[usable]
-    sigma = float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
-    return Capture(readings, sigma, usable)
 
 
 def open_dictionary(spec: str | None, views: tuple[int, int], binning: int) -> Dictionary:

@@ -15,11 +15,12 @@ from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
-from reconstruction.adaptive.planning import expected_errors, patch_error
+from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.shrinkage import denoised
 from reconstruction.adaptive.texture import fitted
+from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import OPPONENT
@@ -273,8 +274,17 @@ def test_bad_inputs_are_refused_in_one_line(bayer):
         )
 
 
+def test_a_pixel_is_kept_from_the_fit_with_all_its_shots_or_not_at_all():
+    usable = np.ones((3, 40, 50), bool)
+    usable[1, :20] = False
+    held = held_out(usable)
+    assert 0 < held.sum() < 0.06 * usable.sum()
+    np.testing.assert_array_equal(held, usable & held.any(axis=0))
+
+
 def planned(psi, variance=1e-5):
-    return patch_error(psi, (0, 0), 0.6, 0.02, 0.1, variance, TexturePrior())
+    shots = range(psi.shots)
+    return patch_errors(psi, [shots], 0.6, 0.02, 0.1, variance, TexturePrior())[0]
 
 
 def test_expected_error_is_the_prior_without_readings_and_falls_with_every_shot(coded_psi):
@@ -288,28 +298,31 @@ def test_expected_error_is_the_prior_without_readings_and_falls_with_every_shot(
     assert planned(again) == pytest.approx(planned(one, 0.5e-5), rel=1e-6)
 
 
-def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi):
+@pytest.mark.parametrize("doubt", [0.0, 0.3])
+def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi, doubt):
     psi = coded_psi(size=(8, 8), views=(3, 3))
     prior, variance = TexturePrior(), 1e-4
+    slopes = np.random.default_rng(0).normal(0, 0.05, (2, 8, 8, 3))
     v, u, y, x, c = np.indices(psi.light_field_shape).reshape(5, -1)
     at = np.stack([y - 0.6 * (v - 1), x - 0.6 * (u - 1)], axis=1)
     colours = OPPONENT.T @ np.diag([1, 0.1, 0.1]) @ OPPONENT
     texture = 0.02 * prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
     texture *= colours[c[:, None], c[None]]
+    moved = (v - 1) * slopes[0, y, x, c] + (u - 1) * slopes[1, y, x, c]
+    texture += doubt * np.outer(moved, moved)
     matrix = psi.to_scipy().toarray()
     seen = matrix @ texture
     posterior = texture - seen.T @ np.linalg.solve(seen @ matrix.T + variance * np.eye(64), seen)
     inner = (np.minimum(y, x) >= 2) & (np.maximum(y, x) < 6)
-    assert planned(psi, variance) == pytest.approx(np.diag(posterior)[inner].mean(), rel=1e-3)
+    expected = patch_errors(psi, [[0]], 0.6, 0.02, 0.1, variance, prior, doubt, slopes)
+    assert expected[0] == pytest.approx(np.diag(posterior)[inner].mean(), rel=1e-3)
 
 
 def test_the_mask_position_that_tells_more_is_expected_to_err_less(bayer, planted):
     maps = planted[3].maps
-    same = ImagingMatrix(bayer.weights[[0, 0]].copy(), bayer.colour[[0, 0]].copy())
     moved = np.concatenate([bayer.weights, np.roll(bayer.weights, 9, axis=5)])
-    other = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
-    grey = planted[3].light_field[2, 2].mean(axis=-1)
-    errors = expected_errors(
-        [same, other], maps["disparity"], maps["texture"], grey, 0.004**2, patches=4
-    )
+    psi = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
+    picture = planted[3].light_field[2, 2]
+    of_scene = (maps["disparity"], maps["disparity_sigma"], maps["texture"], picture)
+    errors = expected_errors(psi, [(0, 0), (0, 1)], *of_scene, 0.004**2, patches=4)
     assert errors[1] < errors[0]

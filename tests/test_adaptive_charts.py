@@ -1,15 +1,13 @@
 """`emmc-rig chart --ablation` and `--next-shot`: on tiny scenes, with one row of each kind."""
 
-import dataclasses
-
-import numpy as np
 import pytest
 
 from emmc_rig import ablation, next_shot
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.errors import AppError
-from emmc_rig.model.camera import build_imaging_matrix
-from reconstruction.result import Reconstruction
+from emmc_rig.capture.plan import planned_camera
+from emmc_rig.capture.until import refuse_without_choice
+from emmc_rig.journal import open_folder
+from emmc_rig.session.session import Session
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
@@ -30,32 +28,58 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(tmp_pa
         assert row.buys_db == pytest.approx(rows[0].psnr_db - row.psnr_db)
 
 
-def test_a_camera_goes_to_the_mask_positions_asked_for():
-    camera = find_camera(CAMERA)
-    moved = next_shot.camera_at(camera, [0, 2])
-    in_order = camera.with_shots(3)
-    psi, whole = (build_imaging_matrix(c, (8, 8)) for c in (moved, in_order))
-    np.testing.assert_array_equal(psi.weights, whole.weights[[0, 2]])
-    fixed = camera.model_copy(update={"more_shots_step_um": None})
-    with pytest.raises(AppError, match="more_shots_step_um"):
-        next_shot.camera_at(fixed, [0, 1])
+def row(shots, stated_db, psnr_db):
+    return next_shot.ShotRow(tuple(range(shots)), stated_db, psnr_db)
 
 
-def test_the_stated_psnr_is_that_of_the_deviation():
-    result = Reconstruction(
-        "adaptive", np.empty((0,), np.float32), "converged", "", 1, (), 0.0, {},
-        {"sigma": np.full((2, 2), 0.1)},
-    )  # fmt: skip
-    assert next_shot.stated_psnr_db(result) == pytest.approx(20)
-    with pytest.raises(AppError, match="states no deviation"):
-        next_shot.stated_psnr_db(dataclasses.replace(result, maps={}))
+ROWS = next_shot.SceneRows(
+    "s", (row(1, 24, 25), row(2, 29, 28), row(3, 31, 30)), (row(1, 24, 25), row(2, 26, 27)), 20.0
+)
 
 
-def test_shots_are_planned_until_the_target_or_the_most(monkeypatch):
-    monkeypatch.setattr(next_shot, "POSITIONS", 2)
-    camera = find_camera(CAMERA)
-    rows = list(next_shot.shot_plan("deep-occlusions", camera, SIZE, 60.0, 2, 0))
-    assert [row.shots for row in rows] == [1, 2]
-    assert rows[0].positions == (0,)
-    assert rows[1].positions[1] in range(1, next_shot.POSITIONS + 1)
-    assert len(list(next_shot.shot_plan("deep-occlusions", camera, SIZE, 1.0, 2, 0))) == 1
+def test_what_choosing_saves_is_read_off_the_rows():
+    easy, middle, hard = next_shot.savings(ROWS, (20, 27, 40))
+    assert (easy.stopped.count, easy.reached, easy.fixed) == (1, True, 1)
+    assert (middle.stopped.count, middle.reached, middle.fixed) == (2, True, 2)
+    assert (hard.stopped.count, hard.reached, hard.fixed) == (3, False, None)
+    told = list(next_shot.total_savings([easy, middle, hard]))
+    assert told[0] == (
+        "20 dB: 1 shots for 1 scene(s), 1 of which meet it in truth; 1 with the fixed number that "
+        "serves them all, 1"
+    )
+    assert told[2] == "40 dB: no scene reaches it with the shots there are"
+
+
+def test_a_plan_to_choose_from_moves_the_mask_and_can_be_calibrated():
+    camera = find_camera("rgbw-bayer-1shot")
+    plan = next_shot.candidate_plan("rgbw-bayer-1shot", camera, (32, 48))
+    refuse_without_choice(plan, planned_camera(plan))
+    (dx, dy) = (camera.more_shots_step_um or {})["mask"]
+    places = [shot.offset_um.get("mask", (0, 0)) for shot in planned_camera(plan).shots]
+    assert places == [(n * dx, n * dy) for n in range(next_shot.PLANNED)]
+
+
+def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(next_shot, "PLANNED", 3)
+    whole = find_camera("rgbw-bayer-1shot")
+    few = tmp_path / "few-views.yaml"
+    few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
+    camera = find_camera(str(few))
+    folder = open_folder(tmp_path / "out", next_shot.ROWS, "shots")
+    told = []
+
+    def measured():
+        rows = next_shot.next_shots(
+            ["near-planar"], str(few), camera, (32, 40), 0, folder, told.append, 64, 2
+        )
+        return list(rows)
+
+    (scene,) = measured()
+    assert [one.count for one in scene.chosen] == [1, 2]
+    assert [one.shots for one in scene.in_order] == [(0,), (0, 1)]
+    assert scene.chosen[0] == scene.in_order[0]
+    (session,) = (folder / next_shot.SESSIONS).iterdir()
+    assert Session(session).is_complete
+    before = len(told)
+    assert measured() == [scene]
+    assert len(told) == before

@@ -16,7 +16,7 @@ from capture_rigs import begun, plan_and_camera, still_rig, wish_for
 
 from drivers.errors import DriverError
 from drivers.raw import decode_raw
-from emmc_rig.capture.checks import check, figures, registered
+from emmc_rig.capture.checks import check, figures
 from emmc_rig.capture.command import (
     begun_session,
     disk_faults_told,
@@ -33,6 +33,7 @@ from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import simulated_rig
+from emmc_rig.registration import registered
 from emmc_rig.scene import fine_scene
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session

@@ -63,7 +63,7 @@ def calibrate(
     from emmc_rig.calibrate.bench import BenchTruth
     from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
     from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import result_folder
+    from emmc_rig.output import parse_size, result_folder
 
     if drift is not None:
         _judge_drift(known, drift, out)
@@ -75,13 +75,12 @@ def calibrate(
         return
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
-    rows, cross, columns = size.lower().partition("x")
-    if not (cross and rows.isdigit() and columns.isdigit()):
-        raise AppError(f"--size {size}: write ROWSxCOLUMNS, for instance 192x256")
+    shape = parse_size(size)
+    assert shape is not None
     settings = CalibrateSettings(
         camera,
         find_camera(camera),
-        (int(rows), int(columns)),
+        shape,
         route,
         target,
         seed,

@@ -47,7 +47,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, versions, write_metrics
-from emmc_rig.session.readings import session_outcome
+from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
 from emmc_rig.session.session import Session
 
 PLAN, REPORT = "plan.yaml", "report.html"
@@ -443,7 +443,7 @@ def run_calibrate(
     Writes psi.h5, calibration.h5, metrics.json and report.html.
     """
     run = run_calibration(settings, watcher)
-    _save(folder, run.outcome)
+    _save(folder, run.outcome, run.outcome.calibration)
     write_calibration_report(
         folder / REPORT,
         run.outcome,
@@ -484,16 +484,21 @@ def calibrate_session(
         "command": command_line(),
         "versions": versions(),
     }
-    _save(folder, outcome)
+    shots = taken_shots(session)
+    chosen = outcome.calibration
+    if len(shots) < chosen.psi.shots:
+        # What `reconstruct --psi` takes with the session's own shots.
+        chosen = chosen.of_shots(shots, camera_json_of(session, shots))
+    _save(folder, outcome, chosen)
     write_calibration_report(folder / REPORT, outcome, metrics)
     write_metrics(folder, metrics)
     return metrics
 
 
-def _save(folder: Path, outcome: Outcome) -> None:
+def _save(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
     known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
-    outcome.calibration.psi.save(folder / PSI)
-    save_calibration(folder / CALIBRATION, outcome.calibration, known)
+    chosen.psi.save(folder / PSI)
+    save_calibration(folder / CALIBRATION, chosen, known)
 
 
 def free_route_error(settings: CalibrateSettings, repeats: int) -> float:

@@ -47,6 +47,13 @@ def capture(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
     ] = False,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            help="PSNR, as 30dB: choose among the plan's shots, stop when no more are needed",
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
     ] = False,
@@ -65,13 +72,14 @@ def capture(
         return
     if plan is None:
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
-    from emmc_rig.output import parse_size
+    from emmc_rig.output import parse_psnr, parse_size
     from emmc_rig.rig_config import ImagedRig
 
     imaged = ImagedRig(
         scene=scene, size=parse_size(size), seed=seed, real_time=real_time, rays=rays
     )
-    _run(plan, rig, imaged, dry_run, out)
+    until_db = None if until is None else parse_psnr(until, "--until")
+    _run(plan, rig, imaged, until_db, dry_run, out)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -87,6 +95,7 @@ def _run(
     plan: Path,
     rig: str | None,
     imaged: ImagedRig,
+    until_db: float | None,
     dry_run: bool,
     out: Path | None,
 ) -> None:
@@ -97,15 +106,16 @@ def _run(
     from emmc_rig.output import shown_bytes, shown_seconds
     from emmc_rig.rig_config import rig_description
     from emmc_rig.session.contact_sheet import quick_pictures, write_sheet
+    from emmc_rig.session.decisions import decided_words, ended
     from emmc_rig.session.session import REPORT, is_session
 
     chosen = None if rig is None else rig_description(rig, imaged)
     if is_session(plan):
-        wish = wish_from_session(plan, chosen)
+        wish = wish_from_session(plan, chosen, until_db)
     elif chosen is None:
         raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
     else:
-        wish = wish_from_plan(plan, out, chosen)
+        wish = wish_from_plan(plan, out, chosen, until_db)
     console, control = Console(stderr=True), Control()
     display = CaptureDisplay(console, control)
 
@@ -119,10 +129,11 @@ def _run(
 
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
+            most = "" if until_db is None else "at most "
             hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
             display.tell(
-                f"{expected.frames} frames to take, about {shown_seconds(expected.seconds)} and "
-                f"{shown_bytes(expected.bytes)}{hands}"
+                f"{most}{expected.frames} frames to take, about "
+                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}"
             )
         return not dry_run
 
@@ -143,12 +154,15 @@ def _run(
         display.tell(f"no report: {fault}")
     if not outcome.complete:
         raise CaptureStoppedError(
-            f"stopped: {outcome.missing} of {len(session.frames)} frames are still to be taken; "
+            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
             f"{go_on}"
         )
     retried = f", {outcome.retries} retries" if outcome.retries else ""
     typer.echo(
-        f"complete: {len(session.frames)} frames verified, {outcome.taken} taken in "
+        f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "
         f"{shown_seconds(outcome.seconds)}{retried}; in {session.folder}"
     )
+    last = ended(session.journal.entries)
+    if last is not None:
+        typer.echo(decided_words(last))
     typer.echo(f"open {session.folder / REPORT}")

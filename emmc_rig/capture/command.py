@@ -25,6 +25,7 @@ from emmc_rig.capture.plan import (
     planned_camera,
 )
 from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
@@ -50,7 +51,10 @@ DISK_RESERVE_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Wish:
-    """What to capture and where to; rig: see `emmc_rig.rig_config`, None on resuming alike."""
+    """What to capture and where to; rig: see `emmc_rig.rig_config`, None on resuming alike.
+
+    until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
+    """
 
     plan_path: Path
     plan: Plan
@@ -58,6 +62,7 @@ class Wish:
     camera: Camera
     out: Path
     rig: Mapping[str, Any]
+    until_db: float | None = None
 
 
 def session_folder(plan_path: Path) -> Path:
@@ -65,25 +70,36 @@ def session_folder(plan_path: Path) -> Path:
     return plan_path.with_name(f"{plan_path.stem}-session")
 
 
-def wish_from_plan(plan_path: Path, out: Path | None, rig: Mapping[str, Any]) -> Wish:
+def wish_from_plan(
+    plan_path: Path, out: Path | None, rig: Mapping[str, Any], until_db: float | None = None
+) -> Wish:
     """Return what a plan file asks for; raises AppError."""
     plan = load_plan(plan_path)
     camera = planned_camera(plan, plan_path.parent)
     text = plan_path.read_text(encoding="utf-8")
-    return Wish(plan_path, plan, text, camera, out or session_folder(plan_path), rig)
+    return Wish(plan_path, plan, text, camera, out or session_folder(plan_path), rig, until_db)
 
 
-def wish_from_session(folder: Path, rig: Mapping[str, Any] | None) -> Wish:
+def wish_from_session(
+    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None = None
+) -> Wish:
     """Return what a session was begun for; raises AppError."""
     session = Session(folder)
     plan = validated(Plan, yaml.safe_load(session.plan_yaml), str(folder), AppError)
     camera = validated(Camera, session.camera, str(folder), CameraError)
-    return Wish(folder, plan, session.plan_yaml, camera, folder, rig or session.rig)
+    return Wish(folder, plan, session.plan_yaml, camera, folder, rig or session.rig, until_db)
 
 
 def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
     """Return every frame of a wish in the order of the capture."""
     return ordered(expand(wish.plan, wish.camera, rig.window_um), wish.plan.order)
+
+
+def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
+    """Return the frames that going on may take; another target asks for spared shots again."""
+    other_target = wish.until_db not in (None, session.target_db)
+    frames = session.frames if other_target else session.needed
+    return tuple(frame for frame in frames if frame.id not in session.stored)
 
 
 def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
@@ -115,6 +131,7 @@ def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTE
         "created": wall_time(),
         "command": command_line(),
         "versions": versions(),
+        **({} if wish.until_db is None else {"until_db": wish.until_db}),
     }
     return Session.create(wish.out, frozen, about, disk)
 
@@ -190,7 +207,7 @@ def disk_faults_told(session: Session) -> Iterator[None]:
         }.get(fault.errno or 0, f"{fault.strerror or fault}; mend that")
         raise AppError(
             f"{session.folder}: {why}, then run the same command to go on; "
-            f"{len(session.stored)} of {len(session.frames)} frames are safe"
+            f"{len(session.stored)} of {len(session.needed)} frames are safe"
         ) from fault
 
 
@@ -206,10 +223,12 @@ def run_capture(
     agreed: is told what it will take. Raises AppError or a `DriverError`.
     """
     control = control or Control()
+    if wish.until_db is not None:
+        refuse_without_choice(wish.plan, wish.camera)
     with ExitStack() as open_things:
         session = begun_session(wish)
         rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
-        frames = planned_frames(wish, rig) if session is None else session.missing()
+        frames = planned_frames(wish, rig) if session is None else still_possible(wish, session)
         expected = estimated(frames, wish.plan, rig)
         refuse_small_disk(wish.out, expected)
         if not agreed(expected):
@@ -218,7 +237,10 @@ def run_capture(
         open_things.enter_context(only_program(session))
         refuse_other_camera(session, rig)
         with interruptible(control, watcher.tell), disk_faults_told(session):
-            return session, Sequencer(session, wish.plan, rig, watcher, control).run()
+            if wish.until_db not in (None, session.target_db):
+                session.note("until", target_db=wish.until_db, wall=wall_time())
+            choose = None if session.target_db is None else Until(session, watcher)
+            return session, Sequencer(session, wish.plan, rig, watcher, control, choose).run()
 
 
 def write_new(path: Path, text: str) -> None:

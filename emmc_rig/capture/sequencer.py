@@ -25,10 +25,8 @@ from emmc_rig.capture.checks import (
     LEAST_LIKENESS,
     Figures,
     FrameRefusedError,
-    Shift,
     check,
     figures,
-    registered,
 )
 from emmc_rig.capture.control import Control, uninterrupted
 from emmc_rig.capture.metering import (
@@ -45,6 +43,7 @@ from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig
 from emmc_rig.output import command_line, shown_bytes, versions
+from emmc_rig.registration import Shift, registered
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
@@ -79,10 +78,15 @@ class _Applied:
     gain: float | None = None
 
 
+Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
+"""What to take next, asked again once that is on the disk; it is told the seconds of the run."""
+
+
 class Sequencer:
     """A run over a session; `run` once.
 
-    timer: seconds that never run backwards, for the timeline; wall: the time of day, for people.
+    choose: by default all that is missing. timer: seconds that never run backwards, for the
+    timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -92,12 +96,14 @@ class Sequencer:
         rig: Rig,
         watcher: Watcher | None = None,
         control: Control | None = None,
+        choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
         self._watcher = watcher or Unwatched()
         self._control = control or Control()
+        self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
         self._camera: CameraDevice = rig.camera
         self._applied = _Applied()
@@ -126,9 +132,10 @@ class Sequencer:
             whole = set(session.stored)
             self._discard_damaged(whole)
             self._metered = first_meterings(session)
-            frames = session.missing()
-            self._watcher.begin(len(session.frames) - len(frames), len(session.frames))
-            refuse_impossible(self._rig, frames)
+            missing, needed = session.missing(), len(session.needed)
+            self._watcher.begin(needed - len(missing), needed)
+            refuse_impossible(self._rig, missing)
+            frames = self._choose(self._now_s)
             if frames:
                 self._retrying("home", self._home)
                 self._compare_with_last_good()
@@ -137,11 +144,11 @@ class Sequencer:
                 taken = {frame.id for frame in frames}
                 for name, fault in self._discard_damaged(taken).items():
                     self._budget.spend(name, DriverError(fault), 1)
-                frames = session.missing()
+                frames = self._choose(self._now_s) if self._control.may_go_on() else ()
             self._writer.flush()
             left = len(session.missing())
             if not left and not session.is_complete:
-                session.note("complete", frames=len(session.frames), wall=self._wall())
+                session.note("complete", frames=len(session.needed), wall=self._wall())
         return Outcome(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )

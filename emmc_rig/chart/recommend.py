@@ -19,6 +19,7 @@ import numpy as np
 
 from emmc_rig.chart.plan import Configuration, Point
 from emmc_rig.errors import AppError
+from emmc_rig.output import parse_psnr
 from reconstruction.methods import METHODS, MethodSettings
 
 ADVICE, SHIPPED = "recommended.json", "recommended.json"
@@ -173,10 +174,7 @@ def parse_budget(text: str) -> float:
 
 def parse_wanted(text: str) -> float:
     """Return the dB of "28dB" or "28"; raise AppError for anything else."""
-    found = re.fullmatch(_NUMBER + "(db|)", text.strip().lower())
-    if found is None:
-        raise AppError(f"--want {text}: write a PSNR, for instance 28dB")
-    return float(found[1])
+    return parse_psnr(text, "--want")
 
 
 def advised(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -10,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
+from emmc_rig.registration import registered, without_tile
 
 LONGEST_PX = 2048
 """Figures are taken from the middle of the frame: a mask is as askew there as elsewhere."""
-BAYER = ("rggb", "bggr", "grbg", "gbrg")
 NOISE_QUANTILE = 0.9
 """Of the gradients, the strongest tenth: edges of cells, hardly noise."""
 
@@ -31,24 +30,6 @@ class Alignment:
     straightness: float
     shift_px: tuple[float, float] | None = None
     match: float | None = None
-
-
-def plane_of(frame: RawFrame) -> tuple[NDArray[np.float32], float]:
-    """Return the middle of a frame without its colours (y, x), and its pitch in sensor pixels.
-
-    A Bayer tile becomes one value: its mean shifts as the picture does, while the pixels of one
-    colour lie too far apart to tell where between them an edge is.
-    """
-    cuts = []
-    for length in frame.mosaic.shape:
-        kept = min(length, LONGEST_PX) // 2 * 2
-        start = (length - kept) // 4 * 2
-        cuts.append(slice(start, start + kept))
-    middle = frame.mosaic[tuple(cuts)].astype(np.float32)
-    if frame.cfa not in BAYER:
-        return middle, 1.0
-    rows, columns = middle.shape
-    return middle.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)), 2.0
 
 
 def grid_direction(plane: NDArray[np.float32]) -> tuple[float, float]:
@@ -72,30 +53,13 @@ def grid_direction(plane: NDArray[np.float32]) -> tuple[float, float]:
 
 def measure(frame: RawFrame, reference: RawFrame | None = None) -> Alignment:
     """Return a frame's alignment; a reference of another size or colour phase is none."""
-    plane, pitch = plane_of(frame)
+    plane, _ = without_tile(frame, LONGEST_PX)
     rotation_deg, straightness = grid_direction(plane)
     if reference is None or (reference.mosaic.shape, reference.cfa) != (
         frame.mosaic.shape,
         frame.cfa,
     ):
         return Alignment(rotation_deg, straightness)
-    (x, y), match = _shift(plane_of(reference)[0], plane)
-    return Alignment(rotation_deg, straightness, (pitch * x, pitch * y), match)
-
-
-def _shift(
-    before: NDArray[np.float32], after: NDArray[np.float32]
-) -> tuple[tuple[float, float], float]:
-    """Return how far a picture moved, and how alike the two then are.
-
-    Phase correlation finds it to a pixel, wherever it is; enhanced correlation (Evangelidis and
-    Psarakis 2008) refines that. Where the latter diverges, the former stands.
-    """
-    hann = cv2.createHanningWindow(after.shape[::-1], cv2.CV_32F)
-    (x, y), match = cv2.phaseCorrelate(before - before.mean(), after - after.mean(), hann)
-    start = np.array([[1, 0, x], [0, 1, y]], np.float32)
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
-    with suppress(cv2.error):
-        match, found = cv2.findTransformECC(before, after, start, cv2.MOTION_TRANSLATION, stop)
-        x, y = found[:, 2]
-    return (float(x), float(y)), max(0.0, float(match))
+    shift = registered(frame, reference, LONGEST_PX)
+    match = max(0.0, shift.likeness)
+    return Alignment(rotation_deg, straightness, (shift.x_px, shift.y_px), match)

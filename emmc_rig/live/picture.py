@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
+from emmc_rig.frame_view import BAYER, srgb_codes
 
 Kind = Literal["mosaic", "colour"]
 KINDS = get_args(Kind)
@@ -19,12 +20,7 @@ SMALLEST_PART = 1 / 256
 BRIGHTEST = 0.999
 SATURATED_BGR = (60, 60, 255)
 CLIPPED_BGR = (255, 90, 60)
-FROM_BAYER = {
-    "rggb": cv2.COLOR_BayerRGGB2BGR,
-    "bggr": cv2.COLOR_BayerBGGR2BGR,
-    "grbg": cv2.COLOR_BayerGRBG2BGR,
-    "gbrg": cv2.COLOR_BayerGBRG2BGR,
-}
+FROM_BAYER = {cfa: getattr(cv2, f"COLOR_Bayer{cfa.upper()}2BGR") for cfa in BAYER}
 
 
 @dataclass(frozen=True)
@@ -80,9 +76,7 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     if view.bright:
         linear = np.clip(linear / max(1 / span, float(np.quantile(linear, BRIGHTEST))), 0, 1)
     scale = view.longest_px / max(mosaic.shape)
-    shrunk = _resized(linear, scale)
-    coded = np.where(shrunk <= 0.0031308, 12.92 * shrunk, 1.055 * shrunk ** (1 / 2.4) - 0.055)
-    shown = np.round(255 * coded).astype(np.uint8)
+    shown = srgb_codes(_resized(linear, scale))
     if view.marked:
         # The most of each spot, not the mean: one saturated pixel in a large frame is seen.
         for where, colour in (

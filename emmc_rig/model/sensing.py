@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -159,6 +159,16 @@ class ImagingMatrix:
             None if self.colour is None else np.ascontiguousarray(self.colour[:, rows, columns]),
             self.binning,
             self.camera_json,
+        )
+
+    def of_shots(self, shots: Sequence[int], camera_json: str = "") -> ImagingMatrix:
+        """Return Psi of some shots, in the order given; camera_json: of a camera with these."""
+        chosen = list(shots)
+        return ImagingMatrix(
+            self.weights[chosen],
+            None if self.colour is None else self.colour[chosen],
+            self.binning,
+            camera_json,
         )
 
     def forward(self, light_field: Array) -> Array:

@@ -100,7 +100,7 @@ def export(
     from emmc_rig.session.session import Session
 
     opened = Session(session)
-    with _bar("export", len(opened.frames)) as step:
+    with _bar("export", len(opened.needed)) as step:
         export_hdf5(opened, out, compress, lambda frame_id: step())
     typer.echo(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
 

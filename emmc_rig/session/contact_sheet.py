@@ -17,7 +17,8 @@ from drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.frame_view import preview, thinned
 from emmc_rig.output import metrics_text, shown_bytes
-from emmc_rig.page import Section, framed, provenance_table, text
+from emmc_rig.page import Section, framed, provenance_table, table_head, text
+from emmc_rig.session.decisions import decided_words, decisions, ended
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -69,6 +70,8 @@ def quick_pictures(session: Session) -> int:
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
     sections = [*_frames(session, pictures), ("timeline", "Timeline", _timeline(session))]
+    if decisions(session.journal.entries):
+        sections.append(("decisions", "Shots: what they gave, and which was next", _shots(session)))
     sections.append(("events", "Events", _events(session)))
     sections.append(("provenance", "Provenance", _provenance(session)))
     style = resources.files("emmc_rig.session").joinpath("sheet.css").read_text("utf-8")
@@ -93,7 +96,7 @@ def _about(session: Session) -> str:
 
 
 def _cards(session: Session) -> Iterator[str]:
-    stored, planned = len(session.stored), len(session.frames)
+    stored, planned = len(session.stored), len(session.needed)
     tone, state = ("good", "complete") if session.is_complete else ("watch", "not complete")
     yield _card(
         tone, "State", state, "every frame verified" if session.is_complete else "resume it"
@@ -129,7 +132,7 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
     left = pictures
     for kind in reversed(KINDS):
-        frames = sorted((f for f in session.frames if f.kind == kind), key=_place_in_plan)
+        frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
         if not frames:
             continue
         shown = _chosen(frames, left)
@@ -196,18 +199,47 @@ def _timeline(session: Session) -> str:
         return '<p class="lead">No frame was taken yet.</p>'
     longest = max(runs, key=len)
     told = overlap(longest)
+    run = longest[0]["run"]
+    decided = [one for one in decisions(session.journal.entries) if one["run"] == run]
     legend = "".join(
         f'<li><i style="background:{COLOURS[name]}"></i>{text(meaning)}</li>'
         for name, meaning in LEGEND.items()
+        if decided or name != "decide"
     )
-    shown = min(SHOWN_FRAMES, len(longest))
+    # Shots, and what is decided between them, come last.
+    shown = longest[-SHOWN_FRAMES:] if decided else longest[:SHOWN_FRAMES]
+    which = "last" if decided else "first"
     return (
-        f'<p class="lead">Run {longest[0]["run"]}, its first {shown} of {len(longest)} frames. '
+        f'<p class="lead">Run {run}, its {which} {len(shown)} of {len(longest)} frames. '
         f"In all {told.seconds:.1f} s: {told.moving_s:.1f} s moving and settling, "
         f"{told.exposing_s:.1f} s exposing and downloading, {told.writing_s:.1f} s hashing and "
         f"writing, of which {told.hidden_share:.0%} while the bench worked.</p>"
         f'<ul class="legend">{legend}</ul>'
-        f'<div class="scroll">{timeline_svg(longest)}</div>'
+        f'<div class="scroll">{timeline_svg(shown, decided)}</div>'
+    )
+
+
+def _shots(session: Session) -> str:
+    """Return a table of what was decided after each shot."""
+    rows = "".join(
+        f"<tr><td>{text(', '.join(map(str, one['shots'])))}</td>"
+        f"<td>{one['stated_db']:.2f}</td><td>{one['target_db']:g}</td>"
+        f"<td>{text('none' if one['next'] is None else one['next'])}</td>"
+        f"<td>{text('; '.join(filter(None, (one['why'], one['advice']))))}</td></tr>"
+        for one in decisions(session.journal.entries)
+    )
+    names = ("shots taken", "stated PSNR, dB", "wanted, dB", "next shot", "why")
+    last = ended(session.journal.entries)
+    spared = (
+        f" Of the plan, shots {', '.join(map(str, last['spared']))} were not needed."
+        if last is not None and last["spared"]
+        else ""
+    )
+    return (
+        '<p class="lead">After each shot the light field was reconstructed; its own standard '
+        "deviation, checked on readings kept from the fit, stands for the PSNR stated. Shots count "
+        f"from 0, as in the plan.{spared}</p>"
+        f"<table>{table_head(names)}<tbody>{rows}</tbody></table>"
     )
 
 
@@ -245,6 +277,10 @@ def _told(entry: Entry) -> str:
         )
     if kind == "stopped":
         return f"{entry['wall']}: {entry['reason']}"
+    if kind == "until":
+        return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
+    if kind == "decided":
+        return decided_words(entry)
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
 
 

@@ -47,7 +47,7 @@ def export_hdf5(
     missing = session.missing()
     if missing:
         raise AppError(
-            f"{session.folder}: {len(missing)} of {len(session.frames)} frames are missing; "
+            f"{session.folder}: {len(missing)} of {len(session.needed)} frames are missing; "
             "resume it with `emmc-rig capture` first"
         )
     try:
@@ -63,7 +63,7 @@ def _write(
     file.attrs["default"] = "entry"
     file.attrs["creator"] = "emmc-rig"
     entry = _group(file, "entry", "NXentry", default="data")
-    frames = session.frames
+    frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]
     entry["title"] = session.header["title"]
     entry["program_name"] = "emmc-rig"
@@ -102,7 +102,7 @@ def _write(
 def _detector(
     session: Session, instrument: Group, compress: bool, on_frame: Callable[[str], None]
 ) -> None:
-    frames = session.frames
+    frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]
     detector = _group(instrument, "detector", "NXdetector")
     shape = tuple(lines[0]["shape"])

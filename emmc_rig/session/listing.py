@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+from emmc_rig.session.decisions import ended
 from emmc_rig.session.journal import heads
 from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete, is_session
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a session says of itself."""
+    """What a session says of itself; planned: frames, but those that the scene did not need."""
 
     name: str
     title: str
@@ -44,7 +45,9 @@ def summary(folder: Path) -> Summary:
     stored = count_stored(entries)
     size = sum(entry["bytes"] for entry in stored.values())
     name = folder.resolve().name
-    return Summary(name, title, created, state, len(stored), entries[0]["frames"], size)
+    last = ended(entries)
+    planned = entries[0]["frames"] - (0 if last is None else last["spared_frames"])
+    return Summary(name, title, created, state, len(stored), planned, size)
 
 
 def sessions_in(folder: Path) -> Iterator[Summary]:

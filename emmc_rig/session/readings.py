@@ -41,6 +41,26 @@ class SessionReadings:
     variance: NDArray[np.float32]
     usable: NDArray[np.bool_]
 
+    @property
+    def noise_sigma(self) -> float:
+        """Root mean variance of the usable readings, which solvers take as their typical noise."""
+        judged = self.variance[self.usable]
+        return float(np.sqrt(np.mean(judged, dtype=np.float64))) if judged.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """What turns a session's frames into readings, of every planned shot, taken or not.
+
+    white_dn_per_s: (shot, y, x), what a reading of 1 gives. good: (y, x), pixels to use at all.
+    """
+
+    psi: ImagingMatrix
+    white_dn_per_s: NDArray[np.floating]
+    dark: MeanFrame
+    gain: SensorGain
+    good: NDArray[np.bool_]
+
 
 def camera_of(session: Session) -> Camera:
     """Return the camera as planned."""
@@ -138,9 +158,9 @@ def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
-    """Return the frames of each shot of the scene: its bracket and repeats."""
+    """Return the frames of each shot of the scene that is needed: its bracket and repeats."""
     shots: dict[int, list[PlannedFrame]] = defaultdict(list)
-    for frame in session.frames:
+    for frame in session.needed:
         if frame.kind == "shot":
             shots[frame.bench.shot].append(frame)
     return dict(sorted(shots.items()))
@@ -221,35 +241,72 @@ def session_outcome(
     return calibrate(camera, design, routes, held_out, few, pinholes, on_stage=on_stage)
 
 
-def session_readings(session: Session) -> SessionReadings:
-    """Return what a session's shots read, by the Psi of its whiteboards.
+def taken_shots(session: Session) -> tuple[int, ...]:
+    """Return the shots of the scene that the session needs, by their place in the plan."""
+    return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
 
-    Without whiteboards, by the designed Psi and the camera's own noise model, which is coarser.
+
+def camera_json_of(session: Session, shots: Sequence[int]) -> str:
+    """Return the camera with some of its shots alone, as `ImagingMatrix.camera_json`.
+
+    "" where no camera is made of them: where a mask shows another pattern in every shot.
+    """
+    camera = camera_of(session)
+    count = len(camera.shots)
+    if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
+        return ""
+    exposures_s = camera.exposures_s()
+    chosen = [
+        camera.shots[shot].model_copy(update={"exposure_s": float(exposures_s[shot])})
+        for shot in shots
+    ]
+    return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
+
+
+def session_scale(session: Session) -> Scale:
+    """Return what the session's whiteboards and darks tell.
+
+    Without whiteboards it is the designed Psi and the camera's own noise model, which is coarser.
+    Raises AppError or CalibrationError.
     """
     dark = mean_dark(session)
     if any(frame.kind in ("whiteboard", "open") for frame in session.frames):
-        calibration = session_calibration(session)
-        psi, white, gain = calibration.psi, calibration.white_dn_per_s, calibration.gain
-        good = True if calibration.good is None else calibration.good
-    else:
-        camera = camera_of(session)
-        noise = camera.sensor.noise
-        psi, good = designed_psi(session, dark), True
-        gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
-        per_second = noise.gain_dn_per_electron * noise.electrons_per_s
-        white = per_second * pixel_light(camera, psi.size)
-    shots = shot_frames(session)
+        known = session_calibration(session)
+        good = np.ones(dark.mean_dn.shape, dtype=bool) if known.good is None else known.good
+        return Scale(known.psi, known.white_dn_per_s, dark, known.gain, good)
+    camera = camera_of(session)
+    noise = camera.sensor.noise
+    psi = designed_psi(session, dark)
+    per_second = noise.gain_dn_per_electron * noise.electrons_per_s
+    white = per_second * pixel_light(camera, psi.size)
+    gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
+    return Scale(psi, white, dark, gain, np.ones(dark.mean_dn.shape, dtype=bool))
+
+
+def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> SessionReadings:
+    """Return what some shots read, and their Psi, in the order given."""
+    whole = list(shots) == list(range(scale.psi.shots))
+    psi = scale.psi if whole else scale.psi.of_shots(shots, camera_json_of(session, shots))
+    frames = shot_frames(session)
     readings = np.empty(psi.frames_shape, dtype=np.float32)
     variance = np.empty(psi.frames_shape, dtype=np.float32)
     usable = np.empty(psi.frames_shape, dtype=bool)
-    for shot, frames in shots.items():
-        linear = fused_shot(session, frames, dark, gain)
-        seen = white[shot] > 0
-        scale = np.where(seen, white[shot], 1.0)
-        readings[shot] = linear.dn_per_s / scale
-        variance[shot] = linear.variance / scale**2
-        usable[shot] = linear.usable & seen & good
+    for place, shot in enumerate(shots):
+        linear = fused_shot(session, frames[shot], scale.dark, scale.gain)
+        seen = scale.white_dn_per_s[shot] > 0
+        white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
+        readings[place] = linear.dn_per_s / white
+        variance[place] = linear.variance / white**2
+        usable[place] = linear.usable & seen & scale.good
     return SessionReadings(psi, readings, variance, usable)
+
+
+def session_readings(session: Session) -> SessionReadings:
+    """Return what the shots read that a session needs, by the Psi of its whiteboards.
+
+    Raises AppError or CalibrationError.
+    """
+    return scaled_readings(session, session_scale(session), taken_shots(session))
 
 
 def designed_psi(session: Session, frame: MeanFrame) -> ImagingMatrix:

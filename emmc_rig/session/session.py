@@ -9,6 +9,9 @@
         frames/        00012-shot-02.dng: the camera's own bytes, named by place and frame
         journal.jsonl  what happened
 
+Where a capture ends when the scene needs no more shots, the journal says which are spared: these
+count as not planned (see `decisions`).
+
 The first journal line holds the SHA-256 of the frozen files. A frame counts when its journal line
 is readable and its file has the bytes that the line tells of; a frame that was taken twice counts
 by its last line. A file without a line is what a crash left between the two: it is taken again,
@@ -31,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
+from emmc_rig.session.decisions import spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.storage import (
@@ -177,9 +181,20 @@ class Session:
         """How often a capture was started on it."""
         return sum(entry["kind"] == "run" for entry in self.journal.entries)
 
+    @property
+    def target_db(self) -> float | None:
+        """The PSNR at which no further shot is taken; None: every planned shot is."""
+        return wanted_db(self.journal.entries, self.header.get("until_db"))
+
+    @property
+    def needed(self) -> tuple[PlannedFrame, ...]:
+        """Every frame to be taken but those of shots that the scene was found not to need."""
+        spared = spared_shots(self.journal.entries)
+        return tuple(f for f in self.frames if f.kind != "shot" or f.bench.shot not in spared)
+
     def missing(self) -> tuple[PlannedFrame, ...]:
         """Return the frames that are still to be taken, in order."""
-        return tuple(frame for frame in self.frames if frame.id not in self.stored)
+        return tuple(frame for frame in self.needed if frame.id not in self.stored)
 
     @property
     def is_complete(self) -> bool:

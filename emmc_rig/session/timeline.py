@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
+from emmc_rig.session.decisions import decisions
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.session import Session
 
@@ -17,6 +18,7 @@ COLOURS = {
     "expose": "#c4720b",
     "read back": "#8a94a3",
     "check": "#8a94a3",
+    "decide": "#7b4ea3",
     "hand over": "#b42318",
     "write": "#18794e",
 }
@@ -25,6 +27,7 @@ LEGEND = {
     "settle": "settle",
     "expose": "expose and download",
     "check": "attend, read back, check",
+    "decide": "reconstruct, choose the next shot",
     "hand over": "wait for the disk",
     "write": "hash, write, sync",
 }
@@ -86,10 +89,12 @@ def overlap(entries: Sequence[Entry]) -> Overlap:
 
 def session_metrics(session: Session) -> dict[str, object]:
     """Return the figures of a session: frames, bytes, retries, and how its runs spent time."""
-    entries = session.journal.entries
+    entries, needed = session.journal.entries, session.needed
     return {
         "title": session.header["title"],
-        "frames": len(session.frames),
+        "frames": len(needed),
+        "spared": len(session.frames) - len(needed),
+        "decided": decisions(entries),
         "stored": len(session.stored),
         "complete": session.is_complete,
         "bytes": sum(entry["bytes"] for entry in session.stored.values()),
@@ -117,12 +122,16 @@ def _common(ones: Sequence[Span], others: Sequence[Span]) -> float:
     return total
 
 
-def timeline_svg(entries: Sequence[Entry]) -> str:
-    """Return a chart of the first frames of a run as SVG: the bench above, the disk below."""
-    shown = entries[:SHOWN_FRAMES]
+def timeline_svg(entries: Sequence[Entry], decided: Sequence[Entry] = ()) -> str:
+    """Return a chart of frames of a run as SVG: the bench above, the disk below.
+
+    decided: what was decided in that run; those are shown that come after the first frame.
+    """
+    begin_s = min((span[0] for one in entries for span in one["spans_s"].values()), default=0.0)
+    after = [one for one in decided if one["spans_s"]["decide"][0] >= begin_s]
     spans = [
-        (name, span[0], span[1], entry["id"])
-        for entry in shown
+        (name, span[0], span[1], entry.get("id", "decision"))
+        for entry in (*entries, *after)
         for name, span in entry["spans_s"].items()
         if name in COLOURS
     ]

@@ -36,7 +36,8 @@ class FrameVerdict:
 class Verdict:
     """What became of a session.
 
-    missing: frames not captured yet. damaged: by id, what is wrong. frozen: files that were
+    planned: frames, but for `spared` ones that the scene was found not to need. missing: frames not
+    captured yet. damaged: by id, what is wrong. frozen: files that were
     changed since the session began. unreadable: journal lines torn or damaged.
     leftovers, foreign: files that do not count, relative to the session.
     """
@@ -49,6 +50,7 @@ class Verdict:
     unreadable: int = 0
     leftovers: tuple[str, ...] = ()
     foreign: tuple[str, ...] = ()
+    spared: int = 0
 
     @property
     def is_complete(self) -> bool:
@@ -63,6 +65,8 @@ class Verdict:
         if self.missing:
             shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
+        if self.spared:
+            yield f"{self.spared} more frame(s) planned, which the scene did not need"
         if self.unreadable:
             yield f"{self.unreadable} journal line(s) torn or damaged; their frames do not count"
         if self.leftovers:
@@ -134,7 +138,7 @@ def verify(
             session.frozen_file(name)
         except AppError as fault:
             frozen.append(str(fault))
-    planned = {frame.id for frame in session.frames}
+    planned = {frame.id for frame in session.needed}
     stored = {name: entry for name, entry in session.stored.items() if name in planned}
     damaged = verify_frames(session, stored.values(), on_frame, threads)
     leftovers, foreign = session.strangers()
@@ -147,11 +151,13 @@ def verify(
         unreadable=session.journal.unreadable,
         leftovers=tuple(leftovers),
         foreign=tuple(foreign),
+        spared=len(session.frames) - len(planned),
     )
 
 
 def counts(session: Session) -> dict[str, tuple[int, int]]:
-    """Return, by kind of frame, how many are stored and how many are planned."""
-    planned = Counter(frame.kind for frame in session.frames)
-    stored = Counter(frame.kind for frame in session.frames if frame.id in session.stored)
+    """Return, by kind of frame, how many are stored and how many are needed."""
+    needed = session.needed
+    planned = Counter(frame.kind for frame in needed)
+    stored = Counter(frame.kind for frame in needed if frame.id in session.stored)
     return {kind: (stored[kind], planned[kind]) for kind in planned}

@@ -182,6 +182,7 @@ def reconstruct_adaptive(
     kinds = texture_map(volume, psi.size, k)
     maps = {
         "disparity": found.centre,
+        "disparity_sigma": np.sqrt(doubt),
         "texture": kinds,
         "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
         "model": model_map(kinds, found, unexplained, k),

@@ -1,8 +1,9 @@
 """Which further shot would help most: the error to be expected with each, before it is taken.
 
-A patch of known disparity and kind of texture is Gaussian (see `evidence`), so that its expected
-error given any shots follows from their Psi alone: prior variance less what the readings explain,
-K - K Psi^T (Psi K Psi^T + noise)^-1 Psi K. It is averaged over patches spread over the scene.
+A patch of one kind of texture is Gaussian (see `evidence`), and what its disparity is in doubt by
+moves it along its slopes from view to view. So its expected error given any shots follows from
+their Psi alone: prior variance less what the readings explain, K - K Psi^T (Psi K Psi^T + noise)^-1
+Psi K. It is averaged over patches spread over the scene.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
@@ -21,94 +24,117 @@ from reconstruction.problem import OPPONENT
 Array = NDArray[np.floating]
 SIDE = 8
 PATCHES = 24
+MOST_DOUBT_PX = 1.0
+"""Further off a texture is another one, and its slopes say nothing."""
 TARGETS = 4
 """Samples a side, in the middle of a patch, whose error counts."""
 
 
-def patch_error(
+def patch_errors(
     psi: ImagingMatrix,
-    corner: tuple[int, int],
+    choices: Sequence[Sequence[int]],
     disparity: float,
     amplitude: float,
     chroma: float,
     variance: float,
     prior: TexturePrior,
-) -> float:
-    """Return the expected squared error of a value in the middle of a patch.
+    doubt: float = 0.0,
+    slopes: Array | None = None,
+) -> NDArray[np.float64]:
+    """Return the expected squared error of a value in the middle of a patch, (choice,).
 
-    corner: (y, x), in samples, of SIDE x SIDE samples in pixels of k x k. amplitude: variance of
-    luminance; chroma: that of a chrominance over it. variance: of a reading.
+    psi: of the patch, SIDE x SIDE samples in pixels of k x k. choices: indices of shots, each.
+    amplitude: variance of luminance; chroma: that of a chrominance over it. variance: of a reading.
+    doubt: variance of the disparity; slopes: of the centre view, down and right (2, y, x, c).
     """
-    k = psi.binning
-    rows, columns = (slice(at, at + SIDE) for at in corner)
-    part = psi.window(rows, columns)
-    views_v, views_u = part.light_field_shape[:2]
+    k, readings = psi.binning, (SIDE // psi.binning) ** 2
+    views_v, views_u = psi.light_field_shape[:2]
     v, u, y, x = (axis.ravel() for axis in np.indices((views_v, views_u, SIDE, SIDE)))
     at = np.stack([y - disparity * (v - views_v // 2), x - disparity * (u - views_u // 2)], axis=1)
     first = (SIDE - TARGETS) // 2
     inner = (np.minimum(y, x) >= first) & (np.maximum(y, x) < first + TARGETS)
-    alike = prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
-    rays = np.zeros((psi.shots, SIDE // k, SIDE // k, 3, at.shape[0]))
+    alike = prior.covariance(cdist(at, at, "sqeuclidean"))
+    ray = np.arange(len(at))
+    pixel = y // k * (SIDE // k) + x // k
+    opponent = [sparse.csr_array((psi.shots * readings, len(at))) for _ in OPPONENT]
     for shot in range(psi.shots):
-        for kind in range(part.weights.shape[4]):
-            weights = part.weights[shot, v, u, y, kind, x]
-            colour = kind if part.colour is None else part.colour[shot, y, x]
-            rays[shot, y // k, x // k, colour, np.arange(at.shape[0])] = weights
-    opponent = np.einsum("oc,mcr->omr", OPPONENT, rays.reshape(-1, 3, at.shape[0]))
+        for kind in range(psi.weights.shape[4]):
+            weights = psi.weights[shot, v, u, y, kind, x]
+            colour = np.full_like(y, kind) if psi.colour is None else psi.colour[shot, y, x]
+            for axis, mixed in enumerate(OPPONENT):
+                opponent[axis] += sparse.csr_array(
+                    (weights * mixed[colour], (shot * readings + pixel, ray)),
+                    shape=opponent[axis].shape,
+                )
     variances = amplitude * np.array([1, chroma, chroma])
     seen = [axis @ alike for axis in opponent]
+    steps = np.stack([v - views_v // 2, u - views_u // 2])
+    moved = np.zeros((3, len(at)))
+    if slopes is not None:
+        moved = OPPONENT @ np.einsum("sr,src->cr", steps, slopes[:, y, x])
+    shifted = sum(axis @ part for axis, part in zip(opponent, moved, strict=True))
     covariance = sum(
-        size * near @ axis.T for size, near, axis in zip(variances, seen, opponent, strict=True)
+        size * (axis @ near.T) for size, near, axis in zip(variances, seen, opponent, strict=True)
     )
-    factor = cho_factor(covariance + variance * np.eye(opponent.shape[1]))
-    error = 0.0
-    for size, near in zip(variances, seen, strict=True):
-        cross = size * near[:, inner]
-        error += size - float(np.mean(np.sum(cross * cho_solve(factor, cross), axis=0)))
-    return error / 3
+    covariance += doubt * np.outer(shifted, shifted)
+    errors = np.zeros(len(choices))
+    for number, shots in enumerate(choices):
+        rows = np.concatenate([shot * readings + np.arange(readings) for shot in shots])
+        factor = cho_factor(covariance[np.ix_(rows, rows)] + variance * np.eye(len(rows)))
+        for size, near, part in zip(variances, seen, moved[:, inner], strict=True):
+            cross = size * near[np.ix_(rows, inner)] + doubt * np.outer(shifted[rows], part)
+            explained = np.sum(cross * cho_solve(factor, cross), axis=0)
+            errors[number] += np.mean(size + doubt * part**2 - explained)
+    return errors / 3
 
 
 def expected_errors(
-    candidates: Sequence[ImagingMatrix],
+    psi: ImagingMatrix,
+    choices: Sequence[Sequence[int]],
     disparity: Array,
+    doubt: Array,
     kinds: Array,
-    brightness: Array,
+    picture: Array,
     variance: float,
     patches: int = PATCHES,
 ) -> NDArray[np.float64]:
-    """Return the mean squared error to be expected with each candidate's shots, (candidate,).
+    """Return the mean squared error to be expected with each choice of shots, (choice,).
 
-    candidates: Psi of all shots taken and one more, each. disparity, brightness: (y, x) of the
-    centre view. kinds: (y, x) indices of the textures in TexturePrior.kinds. Raises
+    psi: of all shots there may be. choices: indices of shots, each. disparity, doubt: (y, x), in
+    pixels, its own and its standard deviation. kinds: (y, x) indices of the textures in
+    TexturePrior.kinds. picture: the centre view (y, x, c). variance: of a reading. Raises
     ReconstructionError for light fields smaller than a patch.
     """
     prior = TexturePrior()
     rows, columns = disparity.shape
-    if min(rows, columns) < SIDE or SIDE % candidates[0].binning:
+    k = psi.binning
+    if min(rows, columns) < SIDE or SIDE % k:
         raise ReconstructionError(
-            f"a light field of {rows}x{columns} in pixels of {candidates[0].binning} samples "
+            f"a light field of {rows}x{columns} in pixels of {k} samples "
             f"holds no patch of {SIDE}x{SIDE}"
         )
     across = max(1, round((patches * columns / rows) ** 0.5))
     down = max(1, patches // across)
-    k = candidates[0].binning
     corners = [
         (int(y) // k * k, int(x) // k * k)
         for y in np.linspace(0, rows - SIDE, down)
         for x in np.linspace(0, columns - SIDE, across)
     ]
-    errors = np.zeros(len(candidates))
-    for corner in corners:
-        middle = corner[0] + SIDE // 2, corner[1] + SIDE // 2
+    slopes = np.stack(np.gradient(np.asarray(picture, dtype=np.float64), axis=(0, 1)))
+    errors = np.zeros(len(choices))
+    for y, x in corners:
+        middle = y + SIDE // 2, x + SIDE // 2
+        patch = np.s_[y : y + SIDE, x : x + SIDE]
         amplitude, chroma = prior.kinds[int(kinds[middle])]
-        for number, psi in enumerate(candidates):
-            errors[number] += patch_error(
-                psi,
-                corner,
-                float(disparity[middle]),
-                amplitude * float(brightness[middle]) ** 2,
-                chroma,
-                variance,
-                prior,
-            )
+        errors += patch_errors(
+            psi.window(*patch),
+            choices,
+            float(disparity[middle]),
+            amplitude * float(np.mean(picture[middle])) ** 2,
+            chroma,
+            variance,
+            prior,
+            min(float(doubt[middle]), MOST_DOUBT_PX) ** 2,
+            slopes[:, *patch],
+        )
     return errors / len(corners)

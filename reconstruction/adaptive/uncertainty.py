@@ -40,10 +40,12 @@ def held_out(
 ) -> NDArray[np.bool_]:
     """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit.
 
-    More than the share where there are few, so that a deviation can be fitted to them.
+    A pixel is kept with all its shots: what it read in one would tell what it reads in another, and
+    nothing of how well the light field is known in between. More than the share where there are
+    few, so that a deviation can be fitted to them.
     """
     share = min(max(share, 2 * FEWEST / max(int(usable.sum()), 1)), MOST_SHARE)
-    return usable & (np.random.default_rng(seed).random(usable.shape) < share)
+    return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
 @dataclass(frozen=True, eq=False)

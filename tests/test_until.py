@@ -1,0 +1,340 @@
+"""`emmc-rig capture --until`: shots chosen one by one; a session ends when it has enough."""
+
+import io
+import json
+import math
+import shutil
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from itertools import pairwise
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from capture_rigs import begun, still_rig
+
+from emmc_rig import cli
+from emmc_rig.capture.enough import judged, stated_psnr_db
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.capture.until import Until
+from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.errors import AppError
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.session.contact_sheet import events, sheet
+from emmc_rig.session.decisions import decisions
+from emmc_rig.session.listing import summary
+from emmc_rig.session.session import JOURNAL, Session
+from emmc_rig.session.verify import verify
+from reconstruction.result import Reconstruction
+from simulators.disk import SimulatedDisk
+
+SIZE = (32, 40)
+RIG = ("--rig", "simulated", "--scene", "deep-occlusions", "--size", "32x40", "--rays", "64")
+CAMERA = {
+    "title": "nine views",
+    "views": [3, 3],
+    "sensor": {"cfa": "rggb"},
+    "masks": {
+        "mask": {"distance_mm": 0.24, "cell_um": 36, "pattern": {"kind": "random_rgbw", "seed": 1}}
+    },
+    "more_shots_step_um": {"mask": [270, 162]},
+}
+PLAN = {
+    "camera": "camera.yaml",
+    "shots": [{"exposure_s": 0.05}] * 3,
+    "whiteboards": {"views": [[1, 1]], "shots": [0], "open": [{"repeats": 2}, {"held_out": True}]},
+    "darks": {"repeats": 2},
+}
+
+
+def program(*arguments):
+    """Run the program in this process; returns exit code, standard output and standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setenv("COLUMNS", "160")
+        patch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    return stop.value.code or 0, out.getvalue(), err.getvalue()
+
+
+def plan_file(folder, **changes):
+    path = folder / "plan.yaml"
+    (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA))
+    path.write_text(yaml.safe_dump({**PLAN, **changes}))
+    return path
+
+
+def contents(session):
+    return {frame.id: session.read(frame.id) for frame in session.needed}
+
+
+def decided(session):
+    """What was decided, without when."""
+    timed = ("spans_s", "wall", "run")
+    entries = decisions(session.journal.entries)
+    return [{key: value for key, value in e.items() if key not in timed} for e in entries]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _judged_once():
+    """The rig's frames are the same each time, so that the same shots are judged but once."""
+    judge, known = Until._judged, {}
+
+    def remembered(self, shots, target_db):
+        key = shots, target_db
+        if key not in known:
+            known[key] = judge(self, shots, target_db)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Until, "_judged", remembered)
+        yield
+
+
+@pytest.fixture(scope="module")
+def enough(tmp_path_factory):
+    """A folder with a session that needed one shot of three."""
+    folder = tmp_path_factory.mktemp("enough")
+    plan_file(folder)
+    code, out, err = program(
+        "capture", folder / "plan.yaml", *RIG, "--until", "12dB", "--out", folder / "s"
+    )
+    assert code == 0, err
+    assert "the target is reached, 2 shots spared" in out
+    return folder / "s"
+
+
+@pytest.fixture(scope="module")
+def every(tmp_path_factory):
+    """A folder with a session whose target lies beyond its three shots."""
+    folder = tmp_path_factory.mktemp("every")
+    plan_file(folder)
+    code, out, err = program(
+        "capture", folder / "plan.yaml", *RIG, "--until", "70", "--out", folder / "s"
+    )
+    assert code == 0, err
+    assert "every planned shot is taken" in out
+    return folder / "s"
+
+
+def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
+    session = Session(enough)
+    (only,) = decisions(session.journal.entries)
+    assert only["stated_db"] >= only["target_db"] == 12
+    assert (only["shots"], only["next"], only["spared"]) == ([0], None, [1, 2])
+    assert session.is_complete
+    assert not session.missing()
+    assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
+    assert not any(name.startswith(("shot-1", "shot-2")) for name in session.stored)
+    # Whiteboards and darks come first: Psi of every shot must be known to choose among them.
+    assert session.journal.entries[-2] == only
+    kinds = {frame.id: frame.kind for frame in session.frames}
+    assert [kinds[name] for name in session.stored].index("shot") == len(session.stored) - 1
+
+
+def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough):
+    code, out, _ = program("session", "verify", enough)
+    assert code == 0
+    assert "2 more frame(s) planned, which the scene did not need" in out
+    code, out, _ = program("session", "show", enough)
+    assert "shot         1 of 1" in out
+    assert "12 wanted; no more, the target is reached" in out
+    told = summary(enough)
+    assert (told.state, told.stored) == ("complete", told.planned)
+    verdict = verify(Session(enough))
+    assert (verdict.is_complete, verdict.missing, verdict.spared) == (True, (), 2)
+
+
+def test_its_page_shows_what_was_decided_and_when(every):
+    page = sheet(Session(every))
+    assert "Shots: what they gave" in page
+    assert "reconstruct, choose the next shot" in page
+    assert "decision: reconstruct" in page
+    metrics = json.loads((every / "metrics.json").read_text())
+    assert metrics["decided"][0]["shots"] == [0]
+    assert metrics["spared"] == 0
+
+
+def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enough, tmp_path):
+    code, _, err = program("calibrate", enough, "--out", tmp_path / "c")
+    assert code == 0, err
+    psi = ImagingMatrix.load(tmp_path / "c" / "psi.h5")
+    assert psi.shots == 1
+    settings = tmp_path / "s.yaml"
+    settings.write_text("tv: {max_steps: 3}")
+    for out, more in (("a", ()), ("b", ("--psi", tmp_path / "c" / "psi.h5"))):
+        code, _, err = program(
+            "reconstruct", enough, "--settings", settings, *more, "--out", tmp_path / out
+        )
+        assert code == 0, err
+        assert json.loads((tmp_path / out / "metrics.json").read_text())["shots"] == 1
+    code, _, err = program("session", "export", enough, "--out", tmp_path / "x.h5")
+    assert code == 0, err
+    with h5py.File(tmp_path / "x.h5") as file:
+        ids = file["entry/data/frame_id"].asstr()[:].tolist()  # type: ignore[union-attr]
+    assert "shot-0-e0-r0" in ids
+    assert "shot-1-e0-r0" not in ids
+
+
+def test_every_next_shot_is_the_one_expected_to_help_most(every):
+    taken = decided(Session(every))
+    assert [len(one["shots"]) for one in taken] == [1, 2, 3]
+    for one, after in pairwise(taken):
+        assert one["next"] == int(max(one["expected_db"], key=one["expected_db"].get))
+        assert after["shots"] == [*one["shots"], one["next"]]
+        assert one["expected_db"][str(one["next"])] > one["stated_db"]
+
+
+def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(enough, copy)
+    code, out, err = program("capture", copy)
+    assert code == 0, err
+    assert "0 taken" in out
+    code, out, err = program("capture", copy, "--until", "70", "--dry-run")
+    assert "at most 2 frames to take" in err
+    code, out, err = program("capture", copy, "--until", "70")
+    assert code == 0, err
+    assert "2 taken" in out
+    again = Session(copy)
+    assert contents(again) == contents(Session(every))
+    assert decided(again)[-1] == decided(Session(every))[-1]
+    assert any(kind == "until" and "70 dB" in line for kind, line in events(again))
+
+
+def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(every, tmp_path):
+    """What a kill leaves: a journal up to a line, and perhaps a file that no line tells of."""
+    whole = (every / JOURNAL).read_bytes().splitlines(keepends=True)
+    first = next(n for n, line in enumerate(whole) if b'"shot-0-e0-r0"' in line)
+    expected, frames = decided(Session(every)), contents(Session(every))
+    for count in range(first, len(whole)):
+        copy = tmp_path / str(count)
+        shutil.copytree(every, copy)
+        (copy / JOURNAL).write_bytes(b"".join(whole[:count]))
+        code, _, err = program("capture", copy)
+        assert code == 0, err
+        session = Session(copy)
+        assert decided(session) == expected
+        assert contents(session) == frames
+        assert verify(session).is_complete
+        shutil.rmtree(copy)
+
+
+def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(every, copy)
+    whole = (copy / JOURNAL).read_bytes().splitlines(keepends=True)
+    last = next(n for n, line in enumerate(whole) if b'"kind":"decided"' in line)
+    (copy / JOURNAL).write_bytes(b"".join(whole[:last]))
+    rig = still_rig(SIZE)
+    session = Session(copy)
+
+    class Impatient(Unwatched):
+        def tell(self, message):
+            if "reconstructing" in message:
+                raise KeyboardInterrupt
+
+    plan = begun(tmp_path, SimulatedDisk(), rig)[1]
+    with pytest.raises(KeyboardInterrupt):
+        Sequencer(session, plan, rig, choose=Until(session, Impatient())).run()
+    again = Session(copy)
+    assert again.journal.entries[-1]["kind"] == "stopped"
+    assert not decisions(again.journal.entries)
+    assert "shot-0-e0-r0" in again.stored
+
+
+def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(enough, copy)
+    session = Session(copy)
+    path = session.path_of(session.stored["shot-0-e0-r0"])
+    good = path.read_bytes()
+    path.write_bytes(good[:-10])
+    code, out, _ = program("capture", copy)
+    assert code == 0
+    assert "1 taken" in out
+    assert path.read_bytes() == good
+    assert len(decisions(Session(copy).journal.entries)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "until", "line"),
+    [
+        ({}, "much", "--until much: write a PSNR"),
+        ({}, "0", "--until 0: write a PSNR"),
+        ({}, "nan", "--until nan: write a PSNR"),
+        ({"shots": [{}]}, "30", "one shot"),
+        ({"whiteboards": None}, "30", "no whiteboards"),
+        ({"darks": None}, "30", "no darks"),
+        ({"whiteboards": {"views": [[1, 1]]}}, "30", "neither open whiteboards nor the pinhole"),
+        ({"whiteboards": {"shots": [0]}}, "30", "neither open whiteboards nor the pinhole"),
+        ({"whiteboards": {"open": [{}]}}, "30", "held out"),
+    ],
+)
+def test_a_capture_that_cannot_choose_says_why_and_makes_nothing(tmp_path, changes, until, line):
+    path = plan_file(tmp_path, **changes)
+    code, _, err = program("capture", path, *RIG, "--until", until, "--out", tmp_path / "s")
+    assert code == 1
+    lines = [one for one in err.splitlines() if one.startswith("emmc-rig:")]
+    assert len(lines) == 1
+    assert line in lines[0]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
+
+
+def result_with(**maps):
+    light_field = np.full((3, 3, 8, 8, 3), 0.5, np.float32)
+    return Reconstruction("adaptive", light_field, "converged", "", 1, (), 1.0, {}, maps)
+
+
+def planar_result(sigma):
+    return result_with(
+        sigma=np.full((3, 3, 8, 8), sigma),
+        disparity=np.zeros((8, 8)),
+        disparity_sigma=np.full((8, 8), 0.1),
+        texture=np.full((8, 8), 2, np.uint8),
+    )
+
+
+def test_the_stated_psnr_is_that_of_the_deviation():
+    assert stated_psnr_db(result_with(sigma=np.full((2, 2), 0.1))) == pytest.approx(20)
+    with pytest.raises(AppError, match="states no deviation"):
+        stated_psnr_db(result_with())
+
+
+def test_shots_that_tell_nothing_are_not_worth_taking(coded_psi):
+    psi = coded_psi(shots=3, size=(8, 8), views=(3, 3))
+    dark = psi.weights.copy()
+    dark[1:] = 0
+    blind = ImagingMatrix(dark, psi.colour)
+    found = judged(blind, planar_result(0.1), (0,), 0.004, 40.0)
+    assert found.next is None
+    assert "no further shot is expected to gain" in found.why
+    assert found.expected_db == pytest.approx({1: 20.0, 2: 20.0}, abs=1e-6)
+    assert judged(psi, planar_result(0.1), (0,), 0.004, 40.0).next in (1, 2)
+
+
+def test_enough_is_enough_and_all_is_all(coded_psi):
+    psi = coded_psi(shots=2, size=(8, 8), views=(3, 3))
+    found = judged(psi, planar_result(0.1), (0,), 0.004, 19.9)
+    assert (found.next, found.why) == (None, "the target is reached")
+    found = judged(psi, planar_result(0.1), (1, 0), 0.004, math.inf)
+    assert (found.next, found.why) == (None, "every planned shot is taken")
+
+
+def test_what_a_session_needs_follows_from_the_last_thing_it_was_told(tmp_path: Path):
+    session, _ = begun(tmp_path, SimulatedDisk(), still_rig())
+    shots = {f.bench.shot for f in session.frames if f.kind == "shot"}
+    assert shots == {0, 1}
+    assert session.target_db is None
+    told = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
+    session.note("until", target_db=30.0)
+    session.note("decided", next=1, spared=[], **told)
+    assert session.needed == session.frames
+    session.note("decided", next=None, spared=[1], **told)
+    assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
+    session.note("until", target_db=33.0)
+    assert session.needed == session.frames
+    assert session.target_db == 33.0
