@@ -180,6 +180,7 @@ def reconstruct_adaptive(
     missed = frames - found.surfaces.forward(found.texture)
     unexplained = misfit(psi, missed, noise, usable)
     kinds = texture_map(volume, psi.size, k)
+    doubt = search.variance_per_pixel(volume, psi.size, k)
     maps = {
         "disparity": found.centre,
         "disparity_sigma": np.sqrt(doubt),
@@ -203,7 +204,6 @@ def reconstruct_adaptive(
         surface = light_field
         if settings.free:
             light_field = freed(psi, frames, typical, usable, surface, unexplained)
-        doubt = search.variance_per_pixel(volume, psi.size, k)
         sure = deviation(found, doubt, frames, noise, held)
         if sure is not None:
             # What total variation moved is in doubt by as much.
