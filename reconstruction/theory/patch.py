@@ -75,7 +75,7 @@ def _separations(
     for axis in range(4):
         apart = rays[:, None, axis] - rays[None, :, axis] + reach[axis]
         number = number * np.int32(spans[axis]) + apart.astype(np.int32)
-    kinds = np.stack([axis.ravel() for axis in np.indices(spans)], axis=1) - reach
+    kinds = np.stack([axis.ravel() for axis in np.indices(tuple(spans))], axis=1) - reach
     return rays, number, kinds
 
 
@@ -136,7 +136,7 @@ class PatchModel:
         """Return the correlation of the rays at a disparity, (ray, ray)."""
         _, number, kinds = _separations(self.views, self.side)
         apart = kinds[:, :2] - disparity * kinds[:, 2:]
-        return prior.covariance(np.square(apart).sum(axis=1))[number]
+        return np.asarray(prior.covariance(np.square(apart).sum(axis=1))[number], np.float64)
 
     def alike_slope(self, disparity: float, prior: TexturePrior) -> NDArray[np.float64]:
         """Return the derivative of `alike` by the disparity, (ray, ray)."""
