@@ -60,7 +60,7 @@ def test_the_reference_is_dense_algebra(coded_psi, cfa, binning, shots):
 
 
 def test_kernels_round_as_float32_must(capture):
-    findings = rounding([capture, example("rgbw-mono", 2), example(shots=3, binning=2)])
+    findings = rounding([capture, example("rgbw-mono"), example(shots=3, binning=2)])
     assert len(findings) == 5
     assert [one.name for one in findings if one.verdict != SOUND] == []
 

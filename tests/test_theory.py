@@ -69,7 +69,7 @@ def test_the_patch_is_psi_in_opponent_colours(coded_psi):
 
 def test_the_error_expected_is_that_of_draws(patch):
     rays, readings = drawn(patch, DISPARITY, 400)
-    estimates = np.array([patch.estimate(DISPARITY, TEXTURE, VARIANCE, one) for one in readings])
+    estimates = patch.estimate(DISPARITY, TEXTURE, VARIANCE, readings)
     errors = np.square(estimates - rays[:, patch.middle]).mean(axis=(1, 2))
     expected = patch.expected(DISPARITY, TEXTURE, VARIANCE)
     assert abs(errors.mean() - expected.error) < 4 * errors.std() / 20
@@ -85,7 +85,7 @@ def test_the_noise_gain_is_the_slope_of_the_error_and_what_noise_alone_does(patc
     )
     assert (ahead - behind) / (2 * step) == pytest.approx(expected.noise_gain**2, rel=1e-3)
     noise = np.random.default_rng(0).standard_normal((300, patch.readings))
-    passed = [patch.estimate(DISPARITY, TEXTURE, VARIANCE, one) for one in noise]
+    passed = patch.estimate(DISPARITY, TEXTURE, VARIANCE, noise)
     assert np.sqrt(np.mean(np.square(passed))) == pytest.approx(expected.noise_gain, rel=0.1)
 
 
@@ -137,7 +137,7 @@ def test_no_estimate_of_the_disparity_beats_the_bounds(bayer_patch, variance):
         return reading @ inverse @ reading + log_det
 
     misses = []
-    for draw in range(60):
+    for draw in range(40):
         true = round(float(rng.uniform(-1, 1)), 2)
         reading = drawn(bayer_patch, true, 1, seed=draw, variance=variance)[1][0]
         coarse = np.linspace(-1, 1, 21)
@@ -192,7 +192,7 @@ def test_a_mask_in_contact_does_not_tell_views_apart(coded_psi, bayer_patch):
     )
     # At disparity 0 all views see the same, and being nearer or further blurs alike.
     assert blind < 1e-9 * apart
-    spots = [spot_coherence(one, np.array([-1.0, 1.0]))[0, 1] for one in (contact, bayer_patch)]
+    spots = [spot_coherence(one, np.array([-2.0, 2.0]))[0, 1] for one in (contact, bayer_patch)]
     assert spots[0] == pytest.approx(1)
     assert spots[1] < 0.95
     modes = [
@@ -200,7 +200,7 @@ def test_a_mask_in_contact_does_not_tell_views_apart(coded_psi, bayer_patch):
         for one in (contact, bayer_patch)
     ]
     assert modes[0] == pytest.approx(0, abs=1e-6)
-    assert modes[1] > 0.1
+    assert modes[1] > 100 * modes[0] + 0.005
 
 
 def test_condition_and_gain_are_those_of_the_dense_matrix(patch):
@@ -219,7 +219,7 @@ def test_condition_and_gain_are_those_of_the_dense_matrix(patch):
 
 
 def test_more_modes_than_readings_cannot_be_told(patch):
-    both = union([subspace(patch, d, TEXTURE, 60) for d in (-1.5, 1.5)])
+    both = union([subspace(patch, d, TEXTURE, patch.readings) for d in (-1.5, 1.5)])
     assert both.size > patch.readings
     assert condition(patch, both).number == np.inf
 

@@ -1,4 +1,4 @@
-"""The mismatch protocol as a section of the page: ideal, mismatched, oracle and blind, by method."""
+"""The mismatch protocol as a section of the page: four scenarios, every method."""
 
 from __future__ import annotations
 
@@ -51,11 +51,7 @@ def draw_mismatch(rows: Sequence[Mismatch], path: Path) -> Path:
 
 def recovered_share(rows: Sequence[Mismatch], of_oracle: bool = False) -> float | None:
     """Return what blind mending recovers of all that was lost; None where next to nothing was."""
-    whole = [
-        row
-        for row in rows
-        if (row.of_oracle if of_oracle else row.recovered) is not None
-    ]
+    whole = [row for row in rows if (row.of_oracle if of_oracle else row.recovered) is not None]
     best = (row.oracle if of_oracle else row.ideal for row in whole)
     lost = sum(one - row.mismatched for one, row in zip(best, whole, strict=True))
     return sum(row.blind - row.mismatched for row in whole) / lost if whole else None

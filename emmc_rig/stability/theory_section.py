@@ -71,9 +71,7 @@ def compared(points: Sequence[TheoryPoint], methods: Sequence[str]) -> list[Comp
     return found
 
 
-def rank_correlation(
-    one: Sequence[float | None], other: Sequence[float | None]
-) -> float | None:
+def rank_correlation(one: Sequence[float | None], other: Sequence[float | None]) -> float | None:
     """Return Spearman's correlation; infinite values count as larger than all (None: infinite).
 
     None where fewer than three pairs are known, or one of the two does not vary.
@@ -97,9 +95,7 @@ def judged(one: Compared, method: str) -> str:
     if measured is None:
         return "not measured"
     words = []
-    for end, found, wanted in zip(
-        ("low", "high"), _place(measured), _place(expected), strict=True
-    ):
+    for end, found, wanted in zip(("low", "high"), _place(measured), _place(expected), strict=True):
         if found is None and wanted is None:
             continue
         if found is None or wanted is None:

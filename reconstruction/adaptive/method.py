@@ -37,6 +37,9 @@ Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
 COARSE_LENGTH_PX = 8.0
+DIM, TINY = 0.1, 1e-12
+"""Mean brightness below which a scene is reconstructed as if it were so bright: what the settings
+call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
 EXPLAINED = 0.7
 """Share of what held-out readings differ by from the smooth picture's that must be explained: 0.92
 to 0.96 on four real scenes, 0.53 to 0.66 with a Psi whose masks were 5 samples off."""
@@ -104,7 +107,11 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
+    given, noise_given = frames, noise_sigma
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
+    scale = min(1.0, max(float(picture.mean()), TINY) / DIM)
+    frames, picture = frames / np.float32(scale), picture / np.float32(scale)
+    noise_sigma /= scale
     variance = np.full(frames.shape, noise_sigma**2 + settings.misfit**2, dtype=np.float32)
     flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
     k = psi.binning
@@ -143,14 +150,15 @@ def reconstruct_adaptive(
         settings.layers,
         on_step=lambda step: tell(2 + step),
     )
-    light_field = np.clip(found.surfaces.light_field(found.texture), 0, 1)
+    light_field = np.clip(found.surfaces.light_field(found.texture) * np.float32(scale), 0, 1)
     doubt = search.variance_per_pixel(volume, psi.size, k)
     sure = deviation(found, doubt, frames, noise_sigma, held)
     missed = frames - found.surfaces.forward(found.texture)
     unexplained = misfit(psi, missed, noise_sigma, usable)
     surface = light_field
     if settings.free:
-        light_field = freed(psi, frames, noise_sigma, usable, surface, unexplained)
+        misses = unexplained * np.float32(scale**2)
+        light_field = freed(psi, given, noise_given, usable, surface, misses, scale)
     tell(total)
     kinds = texture_map(volume, psi.size, k)
     maps = {
@@ -162,7 +170,7 @@ def reconstruct_adaptive(
     if sure is not None:
         # What total variation moved is in doubt by as much.
         moved = np.square(light_field - surface).mean(axis=-1)
-        maps["sigma"] = np.sqrt(np.square(sure.sigma) + moved)
+        maps["sigma"] = np.sqrt(np.square(sure.sigma * np.float32(scale)) + moved)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     explained = _explained(missed, data.readings, noise_sigma, held)
     judged = _judgement(settings, volume, explained)
@@ -175,7 +183,7 @@ def reconstruct_adaptive(
         objective=(),
         seconds=clock() - started,
         parameters={
-            "noise_sigma": noise_sigma,
+            "noise_sigma": noise_given,
             "lowest_px": float(found.centre.min()),
             "highest_px": float(found.centre.max()),
             "disparities": len(volume.disparities),

@@ -1,8 +1,8 @@
 """Which further shot would help most: the error to be expected with each, before it is taken.
 
 A patch of known disparity and kind of texture is Gaussian (see `evidence`), so that its expected
-error given any shots follows from their Psi alone (see `theory.patch`). It is averaged over patches
-spread over the scene.
+error given any shots follows from their Psi alone: prior variance less what the readings explain,
+K - K Psi^T (Psi K Psi^T + noise)^-1 Psi K. It is averaged over patches spread over the scene.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
-from reconstruction.theory.patch import SIDE, PatchModel, Texture
+from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
+SIDE = 8
 PATCHES = 24
+TARGETS = 4
+"""Samples a side, in the middle of a patch, whose error counts."""
 
 
 def patch_error(
@@ -35,8 +39,33 @@ def patch_error(
     corner: (y, x), in samples, of SIDE x SIDE samples in pixels of k x k. amplitude: variance of
     luminance; chroma: that of a chrominance over it. variance: of a reading.
     """
-    patch = PatchModel.of(psi, corner)
-    return patch.expected(disparity, Texture(amplitude, chroma, prior), variance).error
+    k = psi.binning
+    rows, columns = (slice(at, at + SIDE) for at in corner)
+    part = psi.window(rows, columns)
+    views_v, views_u = part.light_field_shape[:2]
+    v, u, y, x = (axis.ravel() for axis in np.indices((views_v, views_u, SIDE, SIDE)))
+    at = np.stack([y - disparity * (v - views_v // 2), x - disparity * (u - views_u // 2)], axis=1)
+    first = (SIDE - TARGETS) // 2
+    inner = (np.minimum(y, x) >= first) & (np.maximum(y, x) < first + TARGETS)
+    alike = prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
+    rays = np.zeros((psi.shots, SIDE // k, SIDE // k, 3, at.shape[0]))
+    for shot in range(psi.shots):
+        for kind in range(part.weights.shape[4]):
+            weights = part.weights[shot, v, u, y, kind, x]
+            colour = kind if part.colour is None else part.colour[shot, y, x]
+            rays[shot, y // k, x // k, colour, np.arange(at.shape[0])] = weights
+    opponent = np.einsum("oc,mcr->omr", OPPONENT, rays.reshape(-1, 3, at.shape[0]))
+    variances = amplitude * np.array([1, chroma, chroma])
+    seen = [axis @ alike for axis in opponent]
+    covariance = sum(
+        size * near @ axis.T for size, near, axis in zip(variances, seen, opponent, strict=True)
+    )
+    factor = cho_factor(covariance + variance * np.eye(opponent.shape[1]))
+    error = 0.0
+    for size, near in zip(variances, seen, strict=True):
+        cross = size * near[:, inner]
+        error += size - float(np.mean(np.sum(cross * cho_solve(factor, cross), axis=0)))
+    return error / 3
 
 
 def expected_errors(

@@ -179,13 +179,18 @@ class PatchModel:
     def estimate(
         self, disparity: float, texture: Texture, variance: Array | float, readings: Array
     ) -> NDArray[np.float64]:
-        """Return the posterior mean of the middle's rays, (ray, c) in RGB, from (reading,)."""
+        """Return the posterior mean of the middle's rays, (..., ray, c) in RGB.
+
+        readings: (..., reading).
+        """
         seen = self._seen(self.alike(disparity, texture.prior))
         covariance = self._through(seen, texture)
         covariance += np.diag(np.broadcast_to(variance, self.readings))
-        solved = cho_solve(cho_factor(covariance), np.asarray(readings, dtype=np.float64))
+        wanted = np.asarray(readings, dtype=np.float64)
+        solved = cho_solve(cho_factor(covariance), wanted.reshape(-1, self.readings).T).T
         found = [
             size * solved @ near[:, self.middle]
             for size, near in zip(texture.variances, seen, strict=True)
         ]
-        return np.stack(found, axis=1) @ OPPONENT
+        rays = np.stack(found, axis=-1) @ OPPONENT
+        return rays.reshape(*wanted.shape[:-1], len(self.middle), 3)
