@@ -44,6 +44,7 @@ SAME_DB, FEW_DB = 0.1, 3.0
 TV_STEPS = 20
 SCALES = (1e-6, 1e-3, 1e-1, 1e1, 1e3, 1e6)
 QUICK_SCALES = (1e-6, 1e6)
+OPAQUE = 0.02
 STEP_FACTORS = (1e-6, 1e-3, 1e3, 1e6)
 
 
@@ -200,7 +201,7 @@ def _dimmed(trial: Trial, factor: float) -> Trial:
 
 
 def _opaque(trial: Trial) -> Trial:
-    psi = replace(trial.psi, weights=trial.psi.weights * np.float32(1e-3))
+    psi = replace(trial.psi, weights=trial.psi.weights * np.float32(OPAQUE))
     noise = trial.readings - trial.psi.forward(trial.truth)
     return replace(trial, psi=psi, readings=psi.forward(trial.truth) + noise)
 
@@ -248,7 +249,7 @@ CONDITIONS = (
     ),
     _Condition(
         "nearly opaque mask", 1, _opaque, False,
-        "a thousandth of the light under the same noise: nothing is seen, nothing may break",
+        "a fiftieth of the light under the same noise: what is seen is hardly more than the noise",
     ),
     _Condition(
         "5 % of the rows are 0", 1, _blind_rows, False, "readings that see nothing, not told",

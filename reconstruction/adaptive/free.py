@@ -61,7 +61,8 @@ def freed(
 ) -> NDArray[np.float32]:
     """Return the light field (v, u, y, x, c), free where the variance (pixel_y, pixel_x) is large.
 
-    light_field: of the surfaces. scale: of its values, 1 where they are of order 1. The weight of total variation is chosen as always (`choices`).
+    light_field: of the surfaces. scale: of its values, 1 where they are of order 1. The weight of
+    total variation is chosen as always (`choices`).
     """
     k = psi.binning
     noise = max(noise_sigma, LEAST_NOISE * scale)
