@@ -45,7 +45,7 @@ Array = NDArray[np.floating]
 POINTS = "theory.jsonl"
 REVISION = 1
 """Of what a point's figures are."""
-CAMERA, SCENE = "rgbw-bayer-1shot", "deep-occlusions"
+CAMERA, SCENE = "rgbw-bayer-3shots", "deep-occlusions"
 SWEPT = (
     "exposure", "read-noise", "masked-pixels", "contrast", "disparity-range", "mask-distance",
     "mask-cell", "shots", "r",

@@ -17,6 +17,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from emmc_rig.model.sensing import ImagingMatrix
@@ -149,15 +150,19 @@ class PatchModel:
         """Return Psi K Psi^T of rays so correlated, (reading, reading)."""
         return self._through(self._seen(alike), texture)
 
-    def _seen(self, alike: Array) -> NDArray[np.float64]:
-        """Return Psi times the correlation of rays (ray, n), (opponent colour, reading, n)."""
-        flat = self.opponent.reshape(-1, self.opponent.shape[2]) @ alike
-        return flat.reshape(3, self.readings, -1)
+    @cached_property
+    def _sparse(self) -> list[sparse.csr_array]:
+        """Psi in each opponent colour: a reading sums few of the rays."""
+        return [sparse.csr_array(axis) for axis in self.opponent]
 
-    def _through(self, seen: Array, texture: Texture) -> NDArray[np.float64]:
+    def _seen(self, alike: Array) -> list[NDArray[np.float64]]:
+        """Return Psi times the correlation of rays, (reading, ray) for each opponent colour."""
+        return [np.asarray(axis @ alike) for axis in self._sparse]
+
+    def _through(self, seen: list[NDArray[np.float64]], texture: Texture) -> NDArray[np.float64]:
         each = (
-            size * near @ axis.T
-            for size, near, axis in zip(texture.variances, seen, self.opponent, strict=True)
+            size * (axis @ near.T)
+            for size, near, axis in zip(texture.variances, seen, self._sparse, strict=True)
         )
         return np.sum(list(each), axis=0)
 
