@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
+from reconstruction.neighbour_kernels import neighbour_range
 
 Array = NDArray[np.floating]
 DARK_SHARE = 0.02
@@ -24,13 +24,17 @@ ALIKE = 0.25
 LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
 GAIN_STEPS = 4
-WELL_LIT = 0.2
-"""Share of the mean prediction that a pixel must reach to judge a shot's brightness."""
-BAD = 6.0
-"""Robust deviations from the neighbours beyond which a pixel is called bad: see `bad_pixels`."""
-NEIGHBOURS_PX = 5
-BAD_STEPS = 2
-SMALLEST_PX = 2 * NEIGHBOURS_PX
+WELL_LIT, FEWEST_LIT = 0.2, 100
+"""Share of the mean prediction that a pixel must reach to judge a shot's brightness; how many."""
+ALIKE_PX = 5
+"""Side of the patch whose readings err alike."""
+NEIGHBOURS_PX, TAIL, FEWEST = 3, 0.1, 6
+BAD_WIDTHS, LEAST_WIDTHS = 1.5, 0.5
+"""Of the neighbours' range beyond it, from which on a pixel is called bad."""
+FEW_BAD, EASIER = 1e-3, 0.5
+"""The share of bad pixels above which it takes less, and by how much for ten times as many."""
+BAD_STEPS = 3
+LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,14 +138,14 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
         flat = frames / gains[:, None, None]
         predicted = _predicted(psi, flat, usable)[kept]
         lit = (usable[kept] & (predicted > WELL_LIT * predicted.mean())).all(axis=0)
-        if lit.sum() < SMALLEST_PX**2:
+        if lit.sum() < FEWEST_LIT:
             return even
         ratio = flat[kept][:, lit] / predicted[:, lit]
         ratio /= np.maximum(ratio.mean(axis=0), 1e-6)
         middle = np.median(ratio, axis=1)
         spread = 1.4826 * np.median(np.abs(ratio - middle[:, None]), axis=1).max()
-        # Neighbours within a patch err alike.
-        error = 1.2533 * spread / np.sqrt(lit.sum() / NEIGHBOURS_PX**2)
+        # Neighbours err alike.
+        error = 1.2533 * spread / np.sqrt(lit.sum() / ALIKE_PX**2)
         gains[kept] *= middle
         gains[kept] /= gains[kept].mean()
     if np.abs(gains[kept] - 1).max() < max(LEAST_FLICKER, SURE * error):
@@ -150,33 +154,42 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
 
 
 def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pixels (pixel_y, pixel_x) that read much more or less than neighbours suggest.
+    """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
 
-    What a pixel reads over what a smooth picture predicts is compared with the median of its
-    neighbours, in deviations of what is usual around it (medians too); averaged over the shots,
-    as a bad pixel is bad in all.
+    What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
+    among the neighbours that see the same colour, a tenth of them left out at both ends: at an edge
+    or in a texture that range is wide. How far beyond it, in widths of the range, is averaged over
+    the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
+    them: to leave out a good pixel costs little, to miss a bad one much.
     """
+    k = psi.binning
     bad = np.zeros(psi.frames_shape[1:], dtype=bool)
-    if min(bad.shape) < SMALLEST_PX:
-        return bad
+    one_colour = np.zeros(bad.shape, dtype=np.uint8)
+    low, high = np.empty((2, *bad.shape), dtype=np.float32)
+    widths = BAD_WIDTHS
     for _ in range(BAD_STEPS):
         kept = usable & ~bad
         if not kept.any():
-            return bad
+            break
         predicted = _predicted(psi, frames, kept)
-        floor = 1e-3 * float(predicted[kept].mean())
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
-        for frame, guess, good, seen in zip(frames, predicted, kept, usable, strict=True):
-            if not good.any():
+        for shot in np.flatnonzero(kept.any(axis=(1, 2))):
+            guess = np.maximum(predicted[shot], LEAST * float(predicted[shot].mean()))
+            ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
+            colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
+            neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
+            known = np.isfinite(low) & usable[shot]
+            if not known.any():
                 continue
-            ratio = np.where(good, frame / np.maximum(guess, floor), 1).astype(np.float32)
-            missed = np.where(seen, frame - guess * _median(ratio), 0)
-            usual = 1.4826 * _median(_median(np.where(good, np.abs(missed), 0).astype(np.float32)))
-            common = 1.4826 * float(np.median(np.abs(missed[good])))
-            score += np.abs(missed) / np.maximum(usual, max(common / 2, 1e-12))
-            count += seen
+            width = np.where(known, (high - low) * guess, 1)
+            beyond = np.where(known, np.maximum(low - ratio, ratio - high) * guess, 0)
+            usual = max(float(np.median(width[known])), 1e-12)
+            score += np.maximum(beyond, 0) / np.maximum(width, usual)
+            count += known
         # Judged anew each time: what a bad neighbour made look bad is good again.
-        bad = (score > BAD * count) & (count > 0)
+        bad = score > widths * count
+        widths = BAD_WIDTHS - EASIER * np.log10(max(float(bad.mean()), FEW_BAD) / FEW_BAD)
+        widths = max(widths, LEAST_WIDTHS)
     return bad
 
 
@@ -184,10 +197,6 @@ def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     """Return what a smooth picture, the same in all views, reads."""
     picture = smooth_guess(psi, frames, usable).astype(psi.weights.dtype)
     return psi.forward(np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape)))
-
-
-def _median(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    return cv2.medianBlur(image, NEIGHBOURS_PX)
 
 
 def _square(difference: Array, where: NDArray[np.bool_]) -> float:
