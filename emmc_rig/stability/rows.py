@@ -13,7 +13,8 @@ from emmc_rig.stability.plan import Point
 
 POINT_COLUMNS = (
     "scene", "fault", "unit", "strength", "method", "screened", "psnr_db", "view_db",
-    "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "failed",
+    "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "screening",
+    "failed",
 )  # fmt: skip
 BREAK_COLUMNS = (
     "scene", "fault", "unit", "repairable", "method", "screened", "best_db",

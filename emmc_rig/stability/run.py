@@ -199,6 +199,7 @@ class StabilityRun:
             "psi_error": made.psi.relative_difference(made.true_psi),
             "status": found.status,
             "advice": found.advice,
+            "screening": "; ".join(found.screening),
         }
 
 
