@@ -603,6 +603,16 @@ def stability(
             help="screen the frames for bad pixels and shots (default: both, where it matters)",
         ),
     ] = None,
+    theory: Annotated[
+        bool, typer.Option("--theory", help="beside it: what Psi alone predicts, and its bounds")
+    ] = False,
+    numerics: Annotated[
+        bool, typer.Option("--numerics", help="beside it: rounding, scale, repeated runs")
+    ] = False,
+    mismatch: Annotated[
+        bool,
+        typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
+    ] = False,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
@@ -610,10 +620,11 @@ def stability(
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
+    from emmc_rig.stability.beside import measure_beside
     from emmc_rig.stability.breaking import told
     from emmc_rig.stability.command import run_stability
     from emmc_rig.stability.faults import FAULTS
-    from emmc_rig.stability.plan import stability_settings
+    from emmc_rig.stability.plan import planned, stability_settings
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
@@ -632,7 +643,11 @@ def stability(
     try:
         with shown_progress() as progress:
             bars = Bars(progress)
-            outcome = run_stability(settings, out, bars)
+            planned(settings)  # raises for wrong names before anything is measured
+            switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
+            wanted = [name for name, on in switches.items() if on]
+            beside = measure_beside(settings, wanted, out, bars)
+            outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
             bars.finish()
     except StabilityStopped as stop:
         _fail(str(stop), INTERRUPTED)
@@ -649,6 +664,8 @@ def stability(
             told(curve.below_view(), curve.strengths),
         )
     Console().print(table)
+    for line in beside.told:
+        typer.echo(line)
     for line in outcome.left_out:
         console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
     typer.echo(f"open {outcome.page}")

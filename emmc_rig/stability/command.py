@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,11 +43,13 @@ def run_stability(
     out: Path,
     watcher: Watcher,
     more: Sequence[Section] = (),
+    figures: Mapping[str, object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Outcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
-    more: sections of the page between the curves and where they came from. Raises
+    more: sections of the page between the curves and where they came from. figures: of them, for
+    metrics.json. Raises
     StabilityStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written, and
     the errors of the layers below; what is done is kept in each case.
     """
@@ -75,7 +77,7 @@ def run_stability(
     ]
     watcher.begin("draw", None)
     try:
-        path = _written(run, found, left_out, more, clock() - started)
+        path = _written(run, found, left_out, more, figures or {}, clock() - started)
     except KeyboardInterrupt as stop:
         raise StabilityStopped(
             f"stopped by Ctrl-C; every point is kept in {folder}: run the same command again"
@@ -93,6 +95,7 @@ def _written(
     found: Sequence[Curve],
     left_out: Sequence[str],
     more: Sequence[Section],
+    figures: Mapping[str, object],
     seconds: float,
 ) -> Path:
     folder, colours = run.folder, colours_of(found)
@@ -118,7 +121,7 @@ def _written(
     write_text(folder / POINTS_CSV, points_csv(run.results))
     write_text(folder / BREAKS_CSV, breaks_csv(found))
     write_text(folder / PAGE, text)
-    write_metrics(folder, _metrics(run, found, left_out, seconds))
+    write_metrics(folder, {**_metrics(run, found, left_out, seconds), **figures})
     return folder / PAGE
 
 
