@@ -1,12 +1,13 @@
 """Theory of Psi: the algebra against draws, dense matrices and estimators that it bounds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import OPPONENT
 from reconstruction.theory.bounds import (
@@ -44,7 +45,7 @@ def bayer_patch(coded_psi):
 def drawn(patch, disparity, count, seed=0, variance=VARIANCE):
     """Light-field patches (draw, ray, c) of the prior, and their noisy readings (draw, reading)."""
     rng = np.random.default_rng(seed)
-    alike = patch.alike(disparity, TEXTURE.prior)
+    alike = patch.alike(disparity, TEXTURE)
     root = np.linalg.cholesky(alike + 1e-10 * np.eye(len(alike)))
     white = rng.standard_normal((count, 3, len(alike)))
     opponent = np.sqrt(TEXTURE.variances)[None, :, None] * (white @ root.T)
@@ -98,10 +99,22 @@ def test_a_reading_of_endless_noise_is_one_not_used(bayer_patch):
 
 def test_the_slope_of_the_covariance_is_its_derivative(patch):
     step = 1e-4
-    prior = TexturePrior()
-    ahead, behind = (patch.alike(DISPARITY + move, prior) for move in (step, -step))
-    slope = patch.alike_slope(DISPARITY, prior)
-    np.testing.assert_allclose((ahead - behind) / (2 * step), slope, atol=1e-6)
+    for texture in (TEXTURE, replace(TEXTURE, mean_known=True)):
+        ahead, behind = (patch.alike(DISPARITY + move, texture) for move in (step, -step))
+        slope = patch.alike_slope(DISPARITY, texture)
+        np.testing.assert_allclose((ahead - behind) / (2 * step), slope, atol=1e-6)
+
+
+def test_a_known_mean_leaves_only_what_departs_from_it(bayer_patch):
+    known = replace(TEXTURE, mean_known=True)
+    rays = drawn(bayer_patch, DISPARITY, 2000)[0]
+    rest = rays - rays.mean(axis=1, keepdims=True)
+    flat = (rest @ OPPONENT.T)[:, :, 0]
+    expected = TEXTURE.amplitude * bayer_patch.alike(DISPARITY, known)
+    assert np.abs(flat.T @ flat / 2000 - expected).max() < 0.2 * TEXTURE.amplitude
+    found, usual = (bayer_patch.expected(DISPARITY, one, VARIANCE) for one in (known, TEXTURE))
+    assert found.prior < usual.prior
+    assert found.error < usual.error
 
 
 def test_fisher_information_is_the_variance_of_the_score(bayer_patch):
@@ -110,7 +123,7 @@ def test_fisher_information_is_the_variance_of_the_score(bayer_patch):
     likelihood = [
         multivariate_normal(
             np.zeros(bayer_patch.readings),
-            bayer_patch.signal(bayer_patch.alike(d, TEXTURE.prior), TEXTURE)
+            bayer_patch.signal(bayer_patch.alike(d, TEXTURE), TEXTURE)
             + VARIANCE * np.eye(bayer_patch.readings),
         ).logpdf(readings)
         for d in (DISPARITY + step, DISPARITY - step)
@@ -130,7 +143,7 @@ def test_no_estimate_of_the_disparity_beats_the_bounds(bayer_patch, variance):
     def surprise(d, reading):
         key = round(float(d), 3)
         if key not in inverses:
-            covariance = bayer_patch.signal(bayer_patch.alike(key, TEXTURE.prior), TEXTURE)
+            covariance = bayer_patch.signal(bayer_patch.alike(key, TEXTURE), TEXTURE)
             covariance += variance * np.eye(len(covariance))
             inverses[key] = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
         inverse, log_det = inverses[key]

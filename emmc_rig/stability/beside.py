@@ -10,7 +10,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from emmc_rig.demo import Watcher
@@ -59,8 +59,9 @@ def _theory(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Besi
     chosen = TheorySettings(
         settings.fast, settings.scenes, settings.camera, settings.size or DEFAULT_SIZE,
         settings.zoom, seed=settings.seed,
-        **({"patches": QUICK_PATCHES, "conditioned": QUICK_CONDITIONED} if settings.fast else {}),
     )  # fmt: skip
+    if settings.fast:
+        chosen = replace(chosen, patches=QUICK_PATCHES, conditioned=QUICK_CONDITIONED)
     points = measure_theory(chosen, folder, watcher)
     rows = [
         {"scene": one.scene, "fault": one.fault, "strength": one.strength, **one.figures}

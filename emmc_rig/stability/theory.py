@@ -43,7 +43,7 @@ from reconstruction.theory.patch import SIDE, PatchModel, Texture
 
 Array = NDArray[np.floating]
 POINTS = "theory.jsonl"
-REVISION = 1
+REVISION = 2
 """Of what a point's figures are."""
 CAMERA, SCENE = "rgbw-bayer-3shots", "deep-occlusions"
 SWEPT = (
@@ -51,6 +51,7 @@ SWEPT = (
     "mask-cell", "shots", "r",
 )  # fmt: skip
 """Faults that leave Psi true."""
+QUICK_SWEPT = tuple(name for name in SWEPT if name not in ("masked-pixels", "contrast"))
 LAGS_PX = (1, 2, 3)
 """Of the variogram that sets a patch's texture."""
 LEAST_AMPLITUDE, LEAST_CHROMA = 1e-7, 1e-3
@@ -109,7 +110,9 @@ def patch_texture(picture: Array, prior: TexturePrior) -> Texture:
             expected += 1 - float(prior.covariance(np.array(float(lag**2))))
     luminance, *chrominance = np.maximum(seen / expected, 0)
     amplitude = max(float(luminance), LEAST_AMPLITUDE)
-    return Texture(amplitude, max(float(np.mean(chrominance)) / amplitude, LEAST_CHROMA), prior)
+    return Texture(
+        amplitude, max(float(np.mean(chrominance)) / amplitude, LEAST_CHROMA), True, prior
+    )
 
 
 def places_of(light_field: Array, disparity_px: Array, binning: int, count: int) -> list[Place]:
@@ -298,7 +301,7 @@ def measure_theory(settings: TheorySettings, folder: Path, watcher: Watcher) -> 
     wanted = [
         (scene, FAULTS[name], strength)
         for scene in settings.scenes
-        for name in SWEPT
+        for name in (QUICK_SWEPT if settings.fast else SWEPT)
         for strength in settings.strengths(FAULTS[name])
     ]
     watcher.begin("theory beside the sweeps", len(wanted))

@@ -78,9 +78,9 @@ def rank_correlation(one: Sequence[float | None], other: Sequence[float | None])
     """
     pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
     first, second = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
-    if len(pairs) < 3 or np.ptp(first) == 0 or np.ptp(second) == 0:
+    if len(pairs) < 3 or min(len(set(first)), len(set(second))) < 2:
         return None
-    return float(spearmanr(first, second).statistic)
+    return float(spearmanr(first, second)[0])  # pyright: ignore[reportArgumentType]
 
 
 def _place(span: Span | None) -> tuple[float | None, float | None]:
@@ -167,7 +167,7 @@ def theory_sections(
         picture = draw_theory(some, folder / f"theory-{scene}.svg")
         body = (
             '<p class="lead">Bound: the expected error of the posterior mean of Gaussian textures '
-            "with each patch's own variance, at its true disparity, from Psi and noise alone; "
+            "with each patch's own mean and variance, at its true disparity, from Psi and noise; "
             "dotted: with an error of the disparity by the Cramer-Rao bound. Oracle: that "
             "estimator on the noisy frames. Methods are told neither disparity nor variance, and "
             "may know more of natural textures than their variance: they can exceed the bound. "

@@ -36,9 +36,9 @@ def disparity_information(
 
     variance: of the readings, (reading,) or one.
     """
-    covariance = patch.signal(patch.alike(disparity, texture.prior), texture)
+    covariance = patch.signal(patch.alike(disparity, texture), texture)
     covariance += np.diag(np.broadcast_to(variance, patch.readings))
-    slope = patch.signal(patch.alike_slope(disparity, texture.prior), texture)
+    slope = patch.signal(patch.alike_slope(disparity, texture), texture)
     moved = cho_solve(cho_factor(covariance), slope)
     return 0.5 * float(np.sum(moved * moved.T))
 
@@ -49,7 +49,7 @@ def distances(
     """Return the Bhattacharyya distances -log rho of the readings' distributions, (d, d)."""
     noise = np.diag(np.broadcast_to(variance, patch.readings))
     covariances = [
-        patch.signal(patch.alike(float(d), texture.prior), texture) + noise for d in disparities
+        patch.signal(patch.alike(float(d), texture), texture) + noise for d in disparities
     ]
     halves = [_log_det(one) / 2 for one in covariances]
     found = np.zeros((len(disparities), len(disparities)))

@@ -92,7 +92,7 @@ class Subspace:
 
 def subspace(patch: PatchModel, disparity: float, texture: Texture, modes: int = MODES) -> Subspace:
     """Return the leading principal components of patches of a texture at a disparity."""
-    alike = patch.alike(disparity, texture.prior)
+    alike = patch.alike(disparity, texture)
     begin = np.random.default_rng(0).standard_normal(len(alike))
     values, vectors = eigsh(alike, k=min(modes, len(alike) - 1), v0=begin)
     values, vectors = values[::-1], vectors[:, ::-1]

@@ -33,10 +33,14 @@ TARGETS = 4
 
 @dataclass(frozen=True)
 class Texture:
-    """amplitude: variance of luminance. chroma: that of a chrominance over it."""
+    """amplitude: variance of luminance. chroma: that of a chrominance over it.
+
+    mean_known: what is told of a patch then is how it departs from its own mean colour.
+    """
 
     amplitude: float
     chroma: float
+    mean_known: bool = False
     prior: TexturePrior = field(default_factory=TexturePrior)
 
     @property
@@ -78,6 +82,14 @@ def _separations(
         number = number * np.int32(spans[axis]) + apart.astype(np.int32)
     kinds = np.stack([axis.ravel() for axis in np.indices(tuple(spans))], axis=1) - reach
     return rays, number, kinds
+
+
+def _about(texture: Texture, correlation: Array) -> NDArray[np.float64]:
+    """Return a correlation of rays, or that of their departures from their mean, (ray, ray)."""
+    if not texture.mean_known:
+        return np.asarray(correlation, np.float64)
+    rows = correlation.mean(axis=1)
+    return np.asarray(correlation - rows[:, None] - rows + rows.mean(), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,18 +145,19 @@ class PatchModel:
         inner = (rays[:, :2] >= first).all(axis=1) & (rays[:, :2] < first + TARGETS).all(axis=1)
         return np.flatnonzero(inner)
 
-    def alike(self, disparity: float, prior: TexturePrior) -> NDArray[np.float64]:
+    def alike(self, disparity: float, texture: Texture) -> NDArray[np.float64]:
         """Return the correlation of the rays at a disparity, (ray, ray)."""
         _, number, kinds = _separations(self.views, self.side)
         apart = kinds[:, :2] - disparity * kinds[:, 2:]
-        return np.asarray(prior.covariance(np.square(apart).sum(axis=1))[number], np.float64)
+        return _about(texture, texture.prior.covariance(np.square(apart).sum(axis=1))[number])
 
-    def alike_slope(self, disparity: float, prior: TexturePrior) -> NDArray[np.float64]:
+    def alike_slope(self, disparity: float, texture: Texture) -> NDArray[np.float64]:
         """Return the derivative of `alike` by the disparity, (ray, ray)."""
         _, number, kinds = _separations(self.views, self.side)
         apart = kinds[:, :2] - disparity * kinds[:, 2:]
         faster = -2 * (apart * kinds[:, 2:]).sum(axis=1)
-        return (prior.slope(np.square(apart).sum(axis=1)) * faster)[number]
+        slope = texture.prior.slope(np.square(apart).sum(axis=1)) * faster
+        return _about(texture, slope[number])
 
     def signal(self, alike: Array, texture: Texture) -> NDArray[np.float64]:
         """Return Psi K Psi^T of rays so correlated, (reading, reading)."""
@@ -168,7 +181,8 @@ class PatchModel:
 
     def expected(self, disparity: float, texture: Texture, variance: Array | float) -> Expected:
         """Return what to expect of the middle. variance: of the readings, (reading,) or one."""
-        seen = self._seen(self.alike(disparity, texture.prior))
+        alike = self.alike(disparity, texture)
+        seen = self._seen(alike)
         signal = self._through(seen, texture)
         factor = cho_factor(signal + np.diag(np.broadcast_to(variance, self.readings)))
         explained = gain = 0.0
@@ -177,7 +191,7 @@ class PatchModel:
             weights = cho_solve(factor, cross)
             explained += float(np.mean(np.sum(cross * weights, axis=0)))
             gain += float(np.mean(np.sum(np.square(weights), axis=0)))
-        prior = float(texture.variances.sum())
+        prior = float(texture.variances.sum() * np.diag(alike)[self.middle].mean())
         told = float(np.trace(cho_solve(factor, signal)))
         return Expected((prior - explained) / 3, prior / 3, (gain / 3) ** 0.5, told)
 
@@ -188,7 +202,7 @@ class PatchModel:
 
         readings: (..., reading).
         """
-        seen = self._seen(self.alike(disparity, texture.prior))
+        seen = self._seen(self.alike(disparity, texture))
         covariance = self._through(seen, texture)
         covariance += np.diag(np.broadcast_to(variance, self.readings))
         wanted = np.asarray(readings, dtype=np.float64)
