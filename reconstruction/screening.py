@@ -137,7 +137,7 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     for _ in range(GAIN_STEPS):
         flat = frames / gains[:, None, None]
         predicted = _predicted(psi, flat, usable)[kept]
-        lit = (usable[kept] & (predicted > WELL_LIT * predicted.mean())).all(axis=0)
+        lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
         if lit.sum() < FEWEST_LIT:
             return even
         ratio = flat[kept][:, lit] / predicted[:, lit]
@@ -174,7 +174,8 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
         predicted = _predicted(psi, frames, kept)
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
         for shot in np.flatnonzero(kept.any(axis=(1, 2))):
-            guess = np.maximum(predicted[shot], LEAST * float(predicted[shot].mean()))
+            least = max(LEAST * float(predicted[shot].mean()), 1e-12)
+            guess = np.maximum(predicted[shot], least)
             ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
             colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
             neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
