@@ -621,10 +621,10 @@ def stability(
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
     from emmc_rig.stability.beside import measure_beside
-    from emmc_rig.stability.breaking import told
     from emmc_rig.stability.command import run_stability
     from emmc_rig.stability.faults import FAULTS
     from emmc_rig.stability.plan import planned, stability_settings
+    from emmc_rig.stability.rows import breaking_rows
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
@@ -651,18 +651,13 @@ def stability(
             bars.finish()
     except StabilityStopped as stop:
         _fail(str(stop), INTERRUPTED)
-    first = [curve for curve in outcome.curves if curve.scene == outcome.curves[0].scene]
+    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     table = Table(
-        "fault", "method", "3 dB below its best", "below the copied view", box=SIMPLE,
-        title=f"where methods break, {first[0].scene}",
+        "fault", *methods, box=SIMPLE,
+        title=f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view",
     )  # fmt: skip
-    for curve in sorted(first, key=lambda curve: list(FAULTS).index(curve.fault.name)):
-        table.add_row(
-            f"{curve.fault.title}, {curve.fault.unit}",
-            curve.label,
-            told(curve.below_best(), curve.strengths),
-            told(curve.below_view(), curve.strengths),
-        )
+    for row in rows:
+        table.add_row(f"{row.title}, {row.unit}", *row.cells)
     Console().print(table)
     for line in beside.told:
         typer.echo(line)

@@ -29,10 +29,12 @@ WELL_LIT, FEWEST_LIT = 0.2, 100
 ALIKE_PX = 5
 """Side of the patch whose readings err alike."""
 NEIGHBOURS_PX, TAIL, FEWEST = 3, 0.1, 6
-BAD_WIDTHS, LEAST_WIDTHS = 1.5, 0.5
+BAD_WIDTHS, LEAST_WIDTHS = 3.0, 0.5
 """Of the neighbours' range beyond it, from which on a pixel is called bad."""
-FEW_BAD, EASIER = 1e-3, 0.5
-"""The share of bad pixels above which it takes less, and by how much for ten times as many."""
+FEW_BAD, EASIER = 3e-4, 1.25
+"""The share of bad pixels above which it takes less, and how much less for ten times as many. On
+crops of five scenes, one and three shots: of good pixels alone 0 to 0.2 % are called bad; with 1 %
+of dead and hot ones 0.1 to 0.7 % of the good and 69 to 94 % of the bad that are over 0.08 off."""
 BAD_STEPS = 3
 LEAST = 1e-3
 
@@ -137,12 +139,15 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     for _ in range(GAIN_STEPS):
         flat = frames / gains[:, None, None]
         predicted = _predicted(psi, flat, usable)[kept]
-        lit = (usable[kept] & (predicted > WELL_LIT * predicted.mean())).all(axis=0)
+        lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
         if lit.sum() < FEWEST_LIT:
             return even
         ratio = flat[kept][:, lit] / predicted[:, lit]
         ratio /= np.maximum(ratio.mean(axis=0), 1e-6)
         middle = np.median(ratio, axis=1)
+        if not (middle > 0).all():
+            # So little light that most pixels read nothing: no gain can be told.
+            return even
         spread = 1.4826 * np.median(np.abs(ratio - middle[:, None]), axis=1).max()
         # Neighbours err alike.
         error = 1.2533 * spread / np.sqrt(lit.sum() / ALIKE_PX**2)
@@ -174,7 +179,8 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
         predicted = _predicted(psi, frames, kept)
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
         for shot in np.flatnonzero(kept.any(axis=(1, 2))):
-            guess = np.maximum(predicted[shot], LEAST * float(predicted[shot].mean()))
+            least = max(LEAST * float(predicted[shot].mean()), 1e-12)
+            guess = np.maximum(predicted[shot], least)
             ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
             colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
             neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
