@@ -142,3 +142,9 @@ def test_nothing_is_found_where_nothing_is_to_be_seen():
     one = made("flicker", 0)
     dark = dataclasses.replace(one, readings=np.zeros_like(one.readings))
     assert screen(dark).told == ()
+
+
+def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():
+    seen = screen(made("exposure", 5, scene="deep-occlusions"))
+    assert np.isfinite(seen.frames).all()
+    assert (seen.gains == 1).all()
