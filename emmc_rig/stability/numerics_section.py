@@ -65,7 +65,7 @@ def numerics_section(found: Numerics, folder: Path) -> Section:
         '<p class="lead">Small captures of a built-in scene. What should change nothing must '
         "change nothing; what cannot be solved must be refused in words, or come out finite.</p>"
         f'<div class="scroll"><table class="findings">{heads}<tbody>{rows}</tbody></table></div>'
-        f'<img alt="PSNR by the scale of the data" src="{embedded(picture)}">'
+        f'<img class="shown" alt="PSNR by the scale of the data" src="{embedded(picture)}">'
         "<h3>Every method, dB</h3>"
         f'<div class="scroll"><table class="breaks">{table_head(("Method", *every))}'
         f"<tbody>{cells}</tbody></table></div>"

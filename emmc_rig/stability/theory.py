@@ -55,7 +55,9 @@ QUICK_SWEPT = tuple(name for name in SWEPT if name not in ("masked-pixels", "con
 LAGS_PX = (1, 2, 3)
 """Of the variogram that sets a patch's texture."""
 LEAST_AMPLITUDE, LEAST_CHROMA = 1e-7, 1e-3
+"""Of a patch without texture."""
 DISPARITIES = 9
+"""Between which the Ziv-Zakai bound decides: it sees no finer than their steps."""
 APART_PX = 1.0
 """Between the disparities whose patches are told apart."""
 WIDEST_PX = 10.0
