@@ -70,7 +70,8 @@ def mismatch_sections(rows: Sequence[Mismatch], folder: Path) -> list[Section]:
             "alone suggest. Protocol of InverseNet (arXiv 2603.04538).</p>"
             f"<p>Over all of it, blind mending recovers {_percent(share)} of what was lost against "
             f"the ideal, {_percent(of_oracle)} of what knowing Psi recovers.</p>"
-            f'<img class="shown" alt="Mismatch on {text(scene)}" src="{embedded(picture)}">{_table(some)}'
+            f'<img class="shown" alt="Mismatch on {text(scene)}" src="{embedded(picture)}">'
+            f"{_table(some)}"
         )
         title = f"Mismatch of Psi, {scene}"
         sections.append(Section(f"mismatch-{scene}", title, title, body))

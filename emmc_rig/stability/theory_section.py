@@ -172,7 +172,8 @@ def theory_sections(
             "estimator on the noisy frames. Methods are told neither disparity nor variance, and "
             "may know more of natural textures than their variance: they can exceed the bound. "
             "All on the same samples.</p>"
-            f'<img class="shown" alt="Predicted and measured PSNR on {text(scene)}" src="{embedded(picture)}">'
+            f'<img class="shown" alt="Predicted and measured PSNR on {text(scene)}" '
+            f'src="{embedded(picture)}">'
             f"<h3>Does theory predict the break?</h3>{_breaks_table(some)}"
             f"{_summary(some)}"
             f"<h3>Which figure of Psi tells how a method does?</h3>{_ranks_table(some)}"
