@@ -103,10 +103,9 @@ def _numerics(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Be
     found = measure_numerics(watcher, settings.fast)
     rows = [asdict(one) for one in found.findings]
     write_text(folder / "numerics.csv", _csv(rows))
-    counts = dict.fromkeys((WEAK, BROKEN), 0)
-    for one in found.findings:
-        counts[one.verdict] = counts.get(one.verdict, 0) + 1
-    line = f"numerics: {len(rows)} checks, {counts[WEAK]} weak, {counts[BROKEN]} broken"
+    verdicts = [one.verdict for one in found.findings]
+    weak, broken = verdicts.count(WEAK), verdicts.count(BROKEN)
+    line = f"numerics: {len(rows)} checks, {weak} weak, {broken} broken"
     return Beside([numerics_section(found, folder / DRAWN)], {"numerics": rows}, [line])
 
 
