@@ -124,10 +124,10 @@ def _mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Be
         for one in found
     ]
     write_text(folder / "mismatch.csv", _csv(rows))
-    share = recovered_share(found)
+    share = recovered_share(found, of_oracle=True)
     line = "mismatch: next to nothing is lost"
     if share is not None:
-        line = f"mismatch: blind mending recovers {share:.0%} of what a moved mask loses"
+        line = f"mismatch: blind mending gives back {share:.0%} of what knowing Psi gives back"
     return Beside(mismatch_sections(found, folder / DRAWN), {"mismatch": rows}, [line])
 
 

@@ -13,10 +13,10 @@ from emmc_rig.stability.draw import PNG_DPI
 from emmc_rig.stability.mismatch import SCENARIOS, Mismatch
 
 MARKS = {
-    "ideal": ("o", INK, "none"),
-    "mismatched": ("X", "#b42318", "#b42318"),
-    "oracle": ("D", COLOURS[0], "none"),
-    "blind": ("o", COLOURS[0], COLOURS[0]),
+    "ideal": ("o", INK, "none", 10),
+    "mismatched": ("X", "#b42318", "#b42318", 7),
+    "oracle": ("D", COLOURS[0], "none", 7),
+    "blind": ("o", COLOURS[0], COLOURS[0], 4),
 }
 
 
@@ -30,10 +30,10 @@ def draw_mismatch(rows: Sequence[Mismatch], path: Path) -> Path:
             ends = row.mismatched, row.blind
             panel.plot([place, place], ends, color=COLOURS[0], linewidth=1, alpha=0.5)
             for kind in SCENARIOS:
-                mark, edge, face = MARKS[kind]
+                mark, edge, face, size = MARKS[kind]
                 panel.plot(
                     place, getattr(row, kind), mark, color=edge, markerfacecolor=face,
-                    markersize=6, label=kind if place == 0 else None,
+                    markersize=size, label=kind if place == 0 else None,
                 )  # fmt: skip
         panel.set_xticks(range(len(some)), [row.method for row in some], rotation=20)
         panel.tick_params(labelsize=7.5)
