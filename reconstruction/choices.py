@@ -13,9 +13,14 @@ from reconstruction.patch_term import PatchTerm
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5
 DARK = 0.1
-"""Share of the light that a mask passes, below which mu follows from that of a brighter one."""
+"""Share of the light that a mask passes, below which settings follow from those of a brighter."""
 BLUR_SAMPLES = 4.0
 """Deviation of the blur of the smooth guess, times the binning."""
+
+
+def darkness(psi: ImagingMatrix) -> float:
+    """Return how much darker Psi is than the darkest for which settings were fitted; else 1."""
+    return min(1.0, max(psi.light_efficiency(), 1e-12) / DARK)
 
 
 def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int = 1) -> float:
@@ -28,7 +33,7 @@ def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int 
     brightness = max(float(np.mean(frames)) / max(passed, 1e-12), 1e-12)
     views_v, views_u = psi.light_field_shape[:2]
     spread = np.sqrt(psi.shots) / (views_v * views_u * psi.binning)
-    dark = min(1.0, max(passed, 1e-12) / DARK)
+    dark = darkness(psi)
     return brightness * dark**2 * relative_mu(noise_sigma / dark / brightness, spread, order)
 
 

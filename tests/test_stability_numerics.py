@@ -109,6 +109,13 @@ def test_how_dim_a_scene_is_does_not_matter_to_the_adaptive_method(capture):
     assert dim > usual - 0.1
 
 
+def test_how_dark_a_mask_is_does_not_matter_to_the_adaptive_method(capture):
+    usual = outcome_of(capture, "adaptive-fast").db
+    for factor in (1e-2, 1e-6):
+        dark = outcome_of(numerics._dimmed(capture, factor), "adaptive-fast").db
+        assert dark == pytest.approx(usual, abs=0.2)
+
+
 def test_a_deviation_is_as_dim_as_its_scene():
     twice = example(shots=2)
     dim, dimmer = (

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -29,7 +30,7 @@ from reconstruction.adaptive.free import freed, misfit
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.uncertainty import deviation, held_out
-from reconstruction.choices import smooth_guess
+from reconstruction.choices import darkness, smooth_guess
 from reconstruction.inputs import checked_inputs
 from reconstruction.result import Progress, Reconstruction
 
@@ -107,6 +108,11 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
+    noise_told, dark = noise_sigma, darkness(psi)
+    if dark < 1:
+        # Psi, frames and noise so many times larger are the same problem.
+        psi = replace(psi, weights=psi.weights / psi.weights.dtype.type(dark))
+        frames, noise_sigma = frames / frames.dtype.type(dark), noise_sigma / dark
     given, noise_given = frames, noise_sigma
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
     scale = min(1.0, max(float(picture.mean()), TINY) / DIM)
@@ -183,7 +189,7 @@ def reconstruct_adaptive(
         objective=(),
         seconds=clock() - started,
         parameters={
-            "noise_sigma": noise_given,
+            "noise_sigma": noise_told,
             "lowest_px": float(found.centre.min()),
             "highest_px": float(found.centre.max()),
             "disparities": len(volume.disparities),
