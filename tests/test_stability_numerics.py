@@ -5,22 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emmc_rig.stability import numerics
-from emmc_rig.stability.numerics import (
+from emmc_rig.stability import conditions, numerics
+from emmc_rig.stability import rounding as rounding_checks
+from emmc_rig.stability.checks import (
+    BROKEN,
     SOUND,
+    WEAK,
     Finding,
     Outcome,
     example,
-    identical,
-    measure_numerics,
     outcome_of,
-    relative,
-    rounding,
     solved,
-    step_sizes,
 )
+from emmc_rig.stability.numerics import identical, measure_numerics
 from emmc_rig.stability.numerics_section import numerics_section
 from emmc_rig.stability.reference import Reference
+from emmc_rig.stability.rounding import relative, rounding, step_sizes
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.methods import METHODS, MethodSettings
 from reconstruction.problem import colour_metric
@@ -73,7 +73,7 @@ def test_a_kernel_that_is_wrong_is_found(capture, monkeypatch):
 
     monkeypatch.setattr("emmc_rig.model.kernels.project", forgetful)
     verdicts = {one.name: one.verdict for one in rounding([capture])}
-    assert verdicts["float32 against float64: Psi"] == numerics.BROKEN
+    assert verdicts["float32 against float64: Psi"] == BROKEN
     assert verdicts["float32 against float64: Psi^T"] == SOUND
 
 
@@ -95,14 +95,14 @@ def test_results_that_differ_in_a_bit_are_not_identical(capture):
 @pytest.mark.parametrize("factor", [1e-6, 1e-2])
 def test_a_dimmer_scene_gives_the_same_light_field_but_dimmer(capture, method, factor):
     usual = outcome_of(capture, method).db
-    dim = outcome_of(numerics._scaled(capture, factor), method, factor)
+    dim = outcome_of(conditions.scaled(capture, factor), method, factor)
     assert dim.db == pytest.approx(usual, abs=0.1)
 
 
 def test_how_dim_a_scene_is_does_not_matter_to_the_adaptive_method(capture):
     usual = outcome_of(capture, "adaptive-fast").db
     dim, dimmer = (
-        outcome_of(numerics._scaled(capture, factor), "adaptive-fast", factor).db
+        outcome_of(conditions.scaled(capture, factor), "adaptive-fast", factor).db
         for factor in (1e-2, 1e-6)
     )
     assert dimmer == pytest.approx(dim, abs=0.05)
@@ -112,14 +112,14 @@ def test_how_dim_a_scene_is_does_not_matter_to_the_adaptive_method(capture):
 def test_how_dark_a_mask_is_does_not_matter_to_the_adaptive_method(capture):
     usual = outcome_of(capture, "adaptive-fast").db
     for factor in (1e-2, 1e-6):
-        dark = outcome_of(numerics._dimmed(capture, factor), "adaptive-fast").db
+        dark = outcome_of(conditions.dimmed(capture, factor), "adaptive-fast").db
         assert dark == pytest.approx(usual, abs=0.2)
 
 
 def test_a_deviation_is_as_dim_as_its_scene():
     twice = example(shots=2)
     dim, dimmer = (
-        solved(numerics._scaled(twice, factor), "adaptive-fast").maps["sigma"] / factor
+        solved(conditions.scaled(twice, factor), "adaptive-fast").maps["sigma"] / factor
         for factor in (1e-2, 1e-4)
     )
     np.testing.assert_allclose(dimmer, dim, rtol=0.05)
@@ -127,12 +127,12 @@ def test_a_deviation_is_as_dim_as_its_scene():
 
 @pytest.mark.parametrize("method", ["tv", "dict-omp", "adaptive-fast"])
 def test_readings_brighter_than_white_are_refused_in_one_line(capture, method):
-    found = outcome_of(numerics._scaled(capture, 1e6), method, 1e6)
+    found = outcome_of(conditions.scaled(capture, 1e6), method, 1e6)
     assert "normalise" in found.refused
     assert "\n" not in found.refused
 
 
-@pytest.mark.parametrize("condition", numerics.CONDITIONS, ids=lambda one: one.name)
+@pytest.mark.parametrize("condition", conditions.CONDITIONS, ids=lambda one: one.name)
 def test_no_condition_of_psi_breaks_total_variation(capture, condition):
     trial = condition.change(capture if condition.shots == 1 else example(shots=condition.shots))
     found = outcome_of(trial, "tv")
@@ -145,7 +145,7 @@ def test_no_condition_of_psi_breaks_total_variation(capture, condition):
 
 def test_absurd_steps_stay_finite_and_are_told(capture):
     findings = step_sizes(capture)
-    assert len(findings) == len(numerics.STEP_FACTORS) + 2
+    assert len(findings) == len(rounding_checks.STEP_FACTORS) + 2
     assert {one.verdict for one in findings} == {SOUND}
     assert any("step limit reached" in one.figure for one in findings)
 
@@ -153,13 +153,13 @@ def test_absurd_steps_stay_finite_and_are_told(capture):
 def test_the_worst_method_is_named():
     outcomes = {"tv": Outcome(20.0), "adaptive": Outcome(17.5), "dict-omp": Outcome(np.nan, "no")}
     wanted = dict.fromkeys(outcomes, 20.0)
-    figure, verdict = numerics._told(outcomes, wanted, True)
+    figure, verdict = numerics.told(outcomes, wanted, True)
     assert figure == "refused: dict-omp; at most 2.5 dB apart (adaptive)"
-    assert verdict == numerics.WEAK
+    assert verdict == WEAK
     outcomes["tv"] = Outcome(np.nan)
-    figure, verdict = numerics._told(outcomes, wanted, True)
+    figure, verdict = numerics.told(outcomes, wanted, True)
     assert figure.startswith("not finite: tv")
-    assert verdict == numerics.BROKEN
+    assert verdict == BROKEN
     assert relative(np.ones(3, np.float32), np.ones(3)) == 0
 
 

@@ -19,6 +19,7 @@ from emmc_rig.journal import open_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.page import Section
 from emmc_rig.stability.breaking import below_best, told
+from emmc_rig.stability.checks import BROKEN, WEAK
 from emmc_rig.stability.mismatch import (
     METHODS_JUDGED,
     QUICK_METHODS,
@@ -26,7 +27,7 @@ from emmc_rig.stability.mismatch import (
     measure_mismatch,
 )
 from emmc_rig.stability.mismatch_section import mismatch_sections, recovered_share
-from emmc_rig.stability.numerics import BROKEN, WEAK, measure_numerics
+from emmc_rig.stability.numerics import measure_numerics
 from emmc_rig.stability.numerics_section import numerics_section
 from emmc_rig.stability.plan import StabilitySettings
 from emmc_rig.stability.run import POINTS, StabilityStopped

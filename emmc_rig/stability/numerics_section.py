@@ -9,8 +9,9 @@ from pathlib import Path
 from emmc_rig.chart.draw import COLOURS
 from emmc_rig.drawing import FAINT, INK, save_svg, sheet, titled
 from emmc_rig.page import Section, embedded, table_head, text
+from emmc_rig.stability.checks import Outcome
 from emmc_rig.stability.draw import PNG_DPI
-from emmc_rig.stability.numerics import Numerics, Outcome
+from emmc_rig.stability.numerics import Numerics
 
 
 def draw_numerics(found: Numerics, path: Path) -> Path:
