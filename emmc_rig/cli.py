@@ -18,7 +18,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
@@ -617,7 +617,9 @@ def stability(
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
-        table = Table("fault", "unit", "strengths", "what happens", box=SIMPLE)
+        table = Table(
+            Column("fault", no_wrap=True), "unit", "strengths", "what happens", box=SIMPLE
+        )
         for one in FAULTS.values():
             table.add_row(
                 one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained
