@@ -365,6 +365,8 @@ def reconstruct(
             lambda step: bars.advance(step), why,
         )  # fmt: skip
         bars.finish()
+    for line in metrics["screening"]:
+        console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
