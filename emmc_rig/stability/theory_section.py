@@ -205,7 +205,7 @@ def _breaks_table(some: Sequence[Compared]) -> str:
     methods = some[0].methods
     heads = ["Fault", "Unit", "Bound", "Oracle"]
     for method in methods:
-        heads += [method, "Judged", "Rank correlation"]
+        heads += [method, "judged", "rank correlation"]
     rows = []
     for one in some:
         row = [one.fault.title, one.fault.unit]
@@ -252,26 +252,37 @@ def _summary(some: Sequence[Compared]) -> str:
     return "".join(f"<p>{text(line)}</p>" for line in lines)
 
 
+def _ranks(some: Sequence[Compared], key: str, method: str) -> list[float | None]:
+    """Return the rank correlation of a figure with a method's PSNR, for each fault."""
+    found = []
+    for one in some:
+        levels = one.levels[f"{method}_db"]
+        known = [level for level in levels if level is not None]
+        varied = len(known) > 2 and max(known) - min(known) > LEAST_SPREAD_DB
+        values = [math.inf if value is None else value for value in one.levels[key]]
+        found.append(rank_correlation(values, levels) if varied else None)
+    return found
+
+
+def _mean(ranks: Sequence[float | None], more: bool) -> float | None:
+    known = [rank if more else -rank for rank in ranks if rank is not None]
+    return float(np.mean(known)) if known else None
+
+
 def _ranks_table(some: Sequence[Compared]) -> str:
-    heads = ["Figure", "better is", *(one.fault.title for one in some)]
     methods = some[0].methods
+    heads = ["Figure", "better is", "on the whole", *(one.fault.title for one in some)]
     rows = []
     for key, (title, more) in FIGURES.items():
-        cells = []
-        for one in some:
-            ranks = []
-            for method in methods:
-                levels = one.levels[f"{method}_db"]
-                known = [level for level in levels if level is not None]
-                varied = len(known) > 2 and np.ptp(known) > LEAST_SPREAD_DB
-                values = [math.inf if v is None else v for v in one.levels[key]]
-                ranks.append(_rho(rank_correlation(values, levels) if varied else None))
-            cells.append(" / ".join(ranks))
-        rows.append([title, "more" if more else "less", *cells])
+        ranks = [_ranks(some, key, method) for method in methods]
+        means = " / ".join(_rho(_mean(one, more)) for one in ranks)
+        cells = [" / ".join(_rho(rank) for rank in both) for both in zip(*ranks, strict=True)]
+        rows.append([title, "more" if more else "less", means, *cells])
     lead = (
         f"<p>Rank correlation (Spearman) of the figure with the PSNR of {' / '.join(methods)} "
-        "over the strengths of each fault: near +1 or -1, by the sign that is better, the figure "
-        "orders the cameras as the method does; –: it does not vary.</p>"
+        "over the strengths of each fault; –: it does not vary. On the whole: the mean, turned so "
+        "that +1 is a figure that orders all cameras as the method does, 0 one that says "
+        "nothing.</p>"
     )
     return lead + _table(heads, rows)
 
