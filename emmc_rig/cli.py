@@ -19,7 +19,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
@@ -364,6 +364,8 @@ def reconstruct(
             lambda step: bars.advance(step), why,
         )  # fmt: skip
         bars.finish()
+    for line in metrics["screening"]:
+        console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
@@ -577,6 +579,98 @@ def tables(
         for part in shown(outcome.grids, outcome.findings):
             Console().print(part)
         typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
+
+
+@app.command()
+def stability(
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"
+        ),
+    ] = None,
+    camera: Annotated[
+        str, typer.Option("--camera", help="a shipped camera or a YAML file")
+    ] = "rgbw-bayer-3shots",
+    fault: Annotated[
+        list[str] | None, typer.Option("--fault", help="only this one; may repeat")
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option("--method", help="only this one; may repeat")
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
+    ] = False,
+    screening: Annotated[
+        bool | None,
+        typer.Option(
+            "--screening/--no-screening",
+            help="screen the frames for bad pixels and shots (default: both, where it matters)",
+        ),
+    ] = None,
+    theory: Annotated[
+        bool, typer.Option("--theory", help="beside it: what Psi alone predicts, and its bounds")
+    ] = False,
+    numerics: Annotated[
+        bool, typer.Option("--numerics", help="beside it: rounding, scale, repeated runs")
+    ] = False,
+    mismatch: Annotated[
+        bool,
+        typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
+    ] = False,
+    faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
+    dictionary: DictionaryOption = None,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
+) -> None:
+    """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
+    from emmc_rig.stability.beside import measure_beside
+    from emmc_rig.stability.command import run_stability
+    from emmc_rig.stability.faults import FAULTS
+    from emmc_rig.stability.plan import planned, stability_settings
+    from emmc_rig.stability.rows import breaking_rows
+    from emmc_rig.stability.run import StabilityStopped
+
+    if faults:
+        table = Table(
+            Column("fault", no_wrap=True), "unit", "strengths", "what happens", box=SIMPLE
+        )
+        for one in FAULTS.values():
+            table.add_row(
+                one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained
+            )
+        Console().print(table)
+        return
+    settings = stability_settings(
+        fast, scene or [], _size(size), camera=camera, faults=tuple(fault or []),
+        methods=tuple(method or []), dictionary=dictionary, seed=seed,
+        screening={None: "both", True: "on", False: "off"}[screening],
+    )  # fmt: skip
+    try:
+        with shown_progress() as progress:
+            bars = Bars(progress)
+            planned(settings)  # raises for wrong names before anything is measured
+            switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
+            wanted = [name for name, on in switches.items() if on]
+            beside = measure_beside(settings, wanted, out, bars)
+            outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
+            bars.finish()
+    except StabilityStopped as stop:
+        _fail(str(stop), INTERRUPTED)
+    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
+    table = Table(
+        "fault", *methods, box=SIMPLE,
+        title=f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view",
+    )  # fmt: skip
+    for row in rows:
+        table.add_row(f"{row.title}, {row.unit}", *row.cells)
+    Console().print(table)
+    for line in beside.told:
+        typer.echo(line)
+    for line in outcome.left_out:
+        console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
+    typer.echo(f"open {outcome.page}")
 
 
 def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:

@@ -176,6 +176,7 @@ def run_reconstruct(
         "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
+        "screening": list(result.screening),
         "steps": result.steps,
         "seconds": result.seconds,
         "parameters": result.parameters,

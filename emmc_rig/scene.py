@@ -4,6 +4,7 @@ A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
 import difflib
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
@@ -13,6 +14,7 @@ import numpy as np
 
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import load_hdf5, load_views, shifted
+from simulators.raycaster import World
 from simulators.scenes import SCENES, render
 
 _DEFAULT_VIEWS, _DEFAULT_SIZE_PX = (5, 5), (192, 256)
@@ -74,6 +76,38 @@ def open_scene(
     light_field, kept = _measured(spec)
     light_field, cut = _middle(light_field, size, views, spec)
     return Scene(Path(spec).resolve().stem, light_field, None, f"{kept}{cut}")
+
+
+def zoomed_scene(
+    spec: str,
+    size: tuple[int, int] | None,
+    views: tuple[int, int],
+    seed: int = 0,
+    zoom: int = 1,
+    change: Callable[[World], World] | None = None,
+) -> Scene:
+    """Open the middle of a scene, a built-in one rendered `zoom` times larger before it is cut.
+
+    That makes its disparities as many times larger. size: rows and columns of what is returned;
+    None takes all of a measured scene, and no zoom. change: of a built-in scene's world, see
+    `simulators.changes`. Raises what `open_scene` does, and SceneError for a measured scene that
+    is to be changed.
+    """
+    if spec not in SCENES:
+        if change is not None:
+            raise SceneError(f"{spec}: only built-in scenes can be changed")
+        return open_scene(spec, size, views, seed)
+    rows, columns = size or _DEFAULT_SIZE_PX
+    zoom = zoom if size is not None else 1
+    rendered = render(spec, views, (rows * zoom, columns * zoom), seed, change)
+    top, left = rows * (zoom - 1) // 2, columns * (zoom - 1) // 2
+    cut = slice(top, top + rows), slice(left, left + columns)
+    return Scene(
+        spec,
+        np.ascontiguousarray(rendered.light_field[:, :, *cut]),
+        rendered.disparity_px[cut],
+        _described(spec, views, (rows, columns), seed),
+    )
 
 
 def fine_scene(

@@ -42,10 +42,22 @@ def exposed(
     rng: np.random.Generator,
 ) -> Exposed:
     """Return the frames of a light field (v, u, y, x, c), with the sensor's noise."""
+    return exposed_readings(camera, psi.size, psi.forward(light_field), rng)
+
+
+def exposed_readings(
+    camera: Camera,
+    size: tuple[int, int],
+    clean: NDArray[np.floating],
+    rng: np.random.Generator,
+) -> Exposed:
+    """Return the frames whose noise-free readings (shot, pixel_y, pixel_x) are `clean`.
+
+    size: rows and columns of the light field.
+    """
     noise = camera.sensor.noise
-    light = pixel_light(camera, psi.size)
+    light = pixel_light(camera, size)
     exposures_s = camera.exposures_s()[:, None, None]
-    clean = psi.forward(light_field)
     frames_dn = noise.expose_dn(clean, exposures_s, light, rng)
     readings = noise.normalise(frames_dn, exposures_s, light)
     deviation = np.sqrt(noise.variance(readings, exposures_s, light))

@@ -12,16 +12,29 @@ from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5
+DARK = 0.1
+"""Share of the light that a mask passes, below which settings follow from those of a brighter."""
 BLUR_SAMPLES = 4.0
 """Deviation of the blur of the smooth guess, times the binning."""
 
 
+def darkness(psi: ImagingMatrix) -> float:
+    """Return how much darker Psi is than the darkest for which settings were fitted; else 1."""
+    return min(1.0, max(psi.light_efficiency(), 1e-12) / DARK)
+
+
 def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int = 1) -> float:
-    """Return mu for frames (of usable pixels), see `relative_mu`."""
-    brightness = max(float(np.mean(frames)) / max(psi.light_efficiency(), 1e-12), 1e-12)
+    """Return mu for frames (of usable pixels), see `relative_mu`.
+
+    That was fitted where masks pass half the light. Psi, frames and noise c times as small are the
+    same problem with mu c^2 times as small: so it is taken for masks darker than DARK.
+    """
+    passed = psi.light_efficiency()
+    brightness = max(float(np.mean(frames)) / max(passed, 1e-12), 1e-12)
     views_v, views_u = psi.light_field_shape[:2]
     spread = np.sqrt(psi.shots) / (views_v * views_u * psi.binning)
-    return brightness * relative_mu(noise_sigma / brightness, spread, order)
+    dark = darkness(psi)
+    return brightness * dark**2 * relative_mu(noise_sigma / dark / brightness, spread, order)
 
 
 def relative_mu(noise: float, spread: float, order: int) -> float:

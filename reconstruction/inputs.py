@@ -10,6 +10,8 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
+WHITER = 2.0
+"""Times the readings of a white scene, on average, that no light field in [0, 1] makes."""
 
 
 def checked_inputs(
@@ -18,8 +20,8 @@ def checked_inputs(
     """Return the frames in Psi's type, 0 where not usable, and the mask of usable pixels.
 
     frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError for frames that do not
-    fit Psi or are not finite where usable, for a noise level that is negative or not finite, and
-    when no pixel is usable.
+    fit Psi or are not finite where usable, that are far brighter than a white scene, for a noise
+    level that is negative or not finite, and when no pixel is usable.
     """
     if not 0 <= noise_sigma < np.inf:
         raise ReconstructionError(
@@ -38,6 +40,12 @@ def checked_inputs(
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
     if not np.isfinite(frames[usable]).all():
         raise ReconstructionError("the frames hold values that are not finite: exclude them")
+    typical, white = float(np.mean(frames[usable], dtype=np.float64)), psi.light_efficiency()
+    if typical > WHITER * white + noise_sigma:
+        raise ReconstructionError(
+            f"readings of {typical:.3g} on average, where Psi makes {white:.3g} of a white scene: "
+            "normalise the frames so that a white board without masks reads 1"
+        )
     return np.where(usable, frames, 0).astype(psi.weights.dtype), usable
 
 

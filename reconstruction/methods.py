@@ -23,6 +23,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.patch_term import PatchTerm
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.screening import screened
 from reconstruction.sparse import (
     PatchEstimates,
     SparseSettings,
@@ -35,8 +36,12 @@ Array = NDArray[np.floating]
 
 
 class MethodSettings(Settings):
-    """Settings of every method; each takes its own part."""
+    """Settings of every method; each takes its own part.
 
+    screening: whether frames are screened first, see `reconstruction.screening`.
+    """
+
+    screening: bool = True
     tv: TVSettings = Field(default_factory=TVSettings)
     sparse: SparseSettings = Field(default_factory=SparseSettings)
     adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)
@@ -173,12 +178,41 @@ def reconstruct(
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each; methods that take one take the root mean square. usable: pixels to fit (default
-    all). estimates: what `estimate_patches` found from
-    the same inputs, for `dict-admm` and `tv-dict` to go on from. Raises ReconstructionError for a
-    method that is not known, a dictionary that is missing, and inputs that do not fit each other.
+    all). estimates: what `estimate_patches` found from the same inputs, for `dict-admm` and
+    `tv-dict` to go on from. Raises ReconstructionError for a method that is not known, a dictionary
+    that is missing, and inputs that do not fit each other.
     """
     method = find_method(name)
     settings = settings or MethodSettings()
+    if settings.screening:
+        started = clock()
+        typical, _ = checked_noise(psi, noise_sigma, usable)
+        frames, usable = checked_inputs(psi, frames, typical, usable)
+        seen = screened(psi, frames, usable)
+        took = clock() - started
+        result = _solved(
+            method, psi, seen.frames, noise_sigma, dictionary, settings, seen.usable, on_step,
+            clock, estimates,
+        )  # fmt: skip
+        return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.told)
+    return _solved(
+        method, psi, frames, noise_sigma, dictionary, settings, usable, on_step, clock, estimates
+    )
+
+
+def _solved(
+    method: Method,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float | Array,
+    dictionary: Dictionary | None,
+    settings: MethodSettings,
+    usable: NDArray[np.bool_] | None,
+    on_step: Callable[[Progress], None] | None,
+    clock: Callable[[], float],
+    estimates: PatchEstimates | None,
+) -> Reconstruction:
+    name = method.name
     if name.startswith("adaptive"):
         chosen = fast(settings.adaptive) if name == "adaptive-fast" else settings.adaptive
         result = reconstruct_adaptive(psi, frames, noise_sigma, chosen, usable, on_step, clock)

@@ -28,7 +28,8 @@ class Reconstruction:
 
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
     it found, by name: `disparity` (y, x) in pixels per view step, ... left_out: what of the model
-    the whole scene did not need, in words, with what that may cost.
+    the whole scene did not need, in words, with what that may cost. screening: what was done to
+    the frames before, in words.
     """
 
     method: str
@@ -41,6 +42,7 @@ class Reconstruction:
     parameters: dict[str, float]
     maps: Mapping[str, NDArray] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+    screening: tuple[str, ...] = ()
 
     def without_light_field(self) -> Reconstruction:
         """Return the result with an empty light field and no maps, to keep many."""

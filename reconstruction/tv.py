@@ -67,7 +67,9 @@ class TVSettings(Settings):
     )
     relaxation: float = Field(default=1.9, ge=1, lt=2)
     rtol: float = Field(
-        default=3e-4, gt=0, description="relative change of the light field per step"
+        default=3e-4,
+        gt=0,
+        description="relative change of the light field per step; less for a lesser primal_step",
     )
     max_steps: int = Field(default=200, ge=1)
     objective_every: int = Field(default=10, ge=1)
@@ -113,9 +115,10 @@ def reconstruct_tv(
     dtype = psi.weights.dtype.type
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
-    gamma = settings.primal_step or choose_primal_step(
-        contrast(guess), mu, settings.chroma_weight, settings.order
-    )
+    usual = choose_primal_step(contrast(guess), mu, settings.chroma_weight, settings.order)
+    gamma = settings.primal_step or usual
+    # A step that small moves little however far there is to go.
+    rtol = settings.rtol * min(1.0, gamma / usual)
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
@@ -126,7 +129,7 @@ def reconstruct_tv(
     history: list[tuple[int, float]] = []
     change, step = np.inf, 0
     with ThreadPoolExecutor(len(bands)) as pool:
-        while step < settings.max_steps and change > settings.rtol:
+        while step < settings.max_steps and change > rtol:
             sweep(bands, moved, pool.map)
             step += 1
             change = float(np.sqrt(moved[:, 0].sum() / max(moved[:, 1].sum(), 1e-300)))
@@ -136,7 +139,7 @@ def reconstruct_tv(
                 history.append((step, value))
             if on_step is not None:
                 on_step(Progress(step, change, value))
-    converged = change <= settings.rtol
+    converged = change <= rtol
     result = np.ascontiguousarray(np.moveaxis(light_field, -2, -1), dtype=np.float32)
     return Reconstruction(
         method=method_name(settings.order, patch_term is not None),

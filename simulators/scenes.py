@@ -48,6 +48,7 @@ def render(
     views: tuple[int, int] = (5, 5),
     size: tuple[int, int] = (192, 256),
     seed: int = 0,
+    change: Callable[[World], World] | None = None,
 ) -> RenderedScene:
     """Render a built-in scene.
 
@@ -56,6 +57,7 @@ def render(
         views: rows and columns of views, 1 or more.
         size: rows and columns of pixels, 16 or more.
         seed: chooses the random textures and places; equal seeds give equal scenes on every grid.
+        change: what becomes of the scene's world before it is rendered; see `simulators.changes`.
 
     Returns:
         light_field (v, u, y, x, 3) float32 in [0, 1]; disparity_px (y, x) float32.
@@ -73,7 +75,7 @@ def render(
         raise SceneError(f"{size[0]}x{size[1]} pixels: needs {_SMALLEST_PX}x{_SMALLEST_PX} or more")
     if seed < 0:
         raise SceneError(f"seed {seed}: needs 0 or more")
-    tables = _tables(name, seed)
+    tables = _tables(name, seed) if change is None else tabulated(change(_world(name, seed)))
     steps = max(views)
     apertures = [
         ((v - (views[0] - 1) / 2) / steps, (u - (views[1] - 1) / 2) / steps)
@@ -97,7 +99,12 @@ def render(
 @lru_cache(maxsize=2)
 def _tables(name: str, seed: int) -> Tables:
     """Build a scene into tables; its textures take longer to make than a small view to render."""
-    return tabulated(SCENES[name].build(np.random.default_rng([seed, *name.encode()])))
+    return tabulated(_world(name, seed))
+
+
+@lru_cache(maxsize=2)
+def _world(name: str, seed: int) -> World:
+    return SCENES[name].build(np.random.default_rng([seed, *name.encode()]))
 
 
 def _frame(s: float, t: float, width: float, height: float, turn_deg: float = 0.0) -> np.ndarray:

@@ -19,7 +19,7 @@ from emmc_rig.journal import digest_of
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.scene import open_scene
+from emmc_rig.scene import zoomed_scene
 from emmc_rig.simulate import exposed
 from simulators.scenes import SCENES
 
@@ -69,16 +69,8 @@ class Capture:
             raise AppError(
                 f"--size {self.size[0]}x{self.size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more"
             )
-        views, size = self.described().views, self.size
-        if self.scene not in SCENES or self.zoom == 1 or size is None:
-            scene = open_scene(self.scene, size, views, seed)
-            return scene.light_field, scene.disparity_px
-        rows, columns = size
-        scene = open_scene(self.scene, (rows * self.zoom, columns * self.zoom), views, seed)
-        top, left = rows * (self.zoom - 1) // 2, columns * (self.zoom - 1) // 2
-        cut = slice(top, top + rows), slice(left, left + columns)
-        assert scene.disparity_px is not None
-        return np.ascontiguousarray(scene.light_field[:, :, *cut]), scene.disparity_px[cut]
+        scene = zoomed_scene(self.scene, self.size, self.described().views, seed, self.zoom)
+        return scene.light_field, scene.disparity_px
 
 
 @dataclass(frozen=True, eq=False)

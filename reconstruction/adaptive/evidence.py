@@ -55,6 +55,11 @@ class TexturePrior:
         blur = self.blur_px
         return np.exp((blur - np.sqrt(square_px + blur**2)) / self.length_px)
 
+    def slope(self, square_px: Array) -> Array:
+        """Return the derivative of `covariance` by the squared distance (any shape)."""
+        apart = np.sqrt(square_px + self.blur_px**2)
+        return -self.covariance(square_px) / (2 * self.length_px * apart)
+
 
 @dataclass(frozen=True)
 class EvidencePatches:

@@ -72,14 +72,16 @@ def freed(
     usable: NDArray[np.bool_],
     light_field: NDArray[np.float32],
     variance: NDArray[np.float32],
+    scale: float = 1.0,
 ) -> NDArray[np.float32]:
     """Return the light field (v, u, y, x, c), free where the variance (pixel_y, pixel_x) is large.
 
-    light_field: of the surfaces. The weight of total variation is chosen as always (`choices`).
+    light_field: of the surfaces. scale: of its values, 1 where they are of order 1. The weight of
+    total variation is chosen as always (`choices`).
     """
     k = psi.binning
-    noise = max(noise_sigma, LEAST_NOISE)
-    share = noise**2 / (SURE**2 + ALIKE * variance.repeat(k, axis=0).repeat(k, axis=1))
+    noise = max(noise_sigma, LEAST_NOISE * scale)
+    share = noise**2 / ((SURE * scale) ** 2 + ALIKE * variance.repeat(k, axis=0).repeat(k, axis=1))
     rho = float(share.max())
     term = PatchTerm(light_field, (share / rho).astype(np.float32))
     settings = TVSettings(rho=rho, max_steps=STEPS)

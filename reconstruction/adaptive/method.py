@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -41,7 +42,7 @@ from reconstruction.adaptive.parsimony import (
     plane_bound_db,
 )
 from reconstruction.adaptive.uncertainty import FEWEST, deviation, held_out
-from reconstruction.choices import smooth_guess
+from reconstruction.choices import darkness, smooth_guess
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.tv import TVSettings, reconstruct_tv
@@ -50,6 +51,9 @@ Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
 COARSE_LENGTH_PX = 8.0
+DIM, TINY = 0.1, 1e-12
+"""Mean brightness below which a scene is reconstructed as if it were so bright: what the settings
+call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
 TRIAL_STEPS = 4
 """Of the fits, with colour and without, that tell whether the scene has any."""
 EXPLAINED = 0.7
@@ -126,59 +130,40 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
-    variance = noise + np.float32(settings.misfit**2)
-    flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
+    given = Given(psi, frames, typical, noise, usable).over(darkness(psi), of_psi=True)
+    picture = np.asarray(smooth_guess(given.psi, given.frames, usable), dtype=np.float32)
+    scale = min(1.0, max(float(picture.mean()), TINY) / DIM)
+    bright = given.over(scale)
+    data = _unexplained_by(picture / np.float32(scale), bright, settings)
+    volume = _searched(data, settings, lambda: tell(1))
     k = psi.binning
-    grey = picture.mean(axis=-1)
-    brightness = grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3))
-    data = search.Data(psi, frames - psi.forward(flat), variance, usable, brightness)
-    rough = search.coarse(
-        data,
-        TexturePrior(length_px=COARSE_LENGTH_PX, freedom=settings.freedom),
-        settings.furthest_px,
-        settings.slope_px,
-        settings.jump,
-    )
-    tell(1)
-    volume = search.fine(
-        data,
-        TexturePrior(freedom=settings.freedom),
-        rough,
-        settings.stride,
-        settings.step_px,
-        settings.slope_px,
-        settings.jump,
-    )
     centre = search.per_pixel(volume, psi.size, k)
     searched_s = clock() - started
     tell(2)
     held = held_out(usable)
     # Total variation is what surfaces must beat on the readings kept from both, and their begin.
-    plain = reconstruct_tv(
-        psi, frames, typical, TVSettings(max_steps=settings.start_steps), usable & ~held
-    ).light_field
-    precision = np.where(usable & ~held, 1 / variance, 0).astype(np.float32)
+    start = TVSettings(max_steps=settings.start_steps)
+    plain = reconstruct_tv(given.psi, given.frames, given.typical, start, usable & ~held)
+    precision = np.where(usable & ~held, 1 / data.variance, 0).astype(np.float32)
     nearer = 1 if settings.nearer == "larger" else -1
-    needed = psi, centre, centre_view(plain), settings.texture
+    begun = centre_view(plain.light_field) / np.float32(scale)
+    needed = Needed(given.psi, centre, begun, settings.texture)
     left_out: list[str] = []
     if settings.parsimony:
-        needed, left_out = _needed(needed, volume, frames, precision, held, nearer, settings)
+        needed, left_out = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
     found = solve(
-        needed[0],
-        needed[1],
+        needed.psi,
+        needed.centre,
         nearer,
-        frames,
+        bright.frames,
         precision,
-        needed[2],
-        needed[3],
+        needed.picture,
+        needed.texture,
         settings.layers,
         on_step=lambda step: tell(2 + step),
     )
-    light_field = found.surfaces.light_field(found.texture)
-    light_field = np.broadcast_to(np.clip(light_field, 0, 1), psi.light_field_shape)
-    missed = frames - found.surfaces.forward(found.texture)
-    unexplained = misfit(psi, missed, noise, usable)
+    missed = bright.frames - found.surfaces.forward(found.texture)
+    off = misfit(given.psi, missed, bright.noise, usable)
     kinds = texture_map(volume, psi.size, k)
     doubt = search.variance_per_pixel(volume, psi.size, k)
     maps = {
@@ -186,29 +171,33 @@ def reconstruct_adaptive(
         "disparity_sigma": np.sqrt(doubt),
         "texture": kinds,
         "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
-        "model": model_map(kinds, found, unexplained, k),
+        "model": model_map(kinds, found, off, k),
     }
-    explained = _explained(missed, data.readings, noise, held)
+    explained = _explained(missed, data.readings, bright.noise, held)
     judged = _judgement(settings, volume, explained)
-    plainly = (frames - psi.forward(plain))[held]
-    if held.sum() >= FEWEST and np.square(plainly).mean() < np.square(missed[held]).mean():
+    plainly = (given.frames - given.psi.forward(plain.light_field))[held]
+    surely = missed[held] * scale
+    if held.sum() >= FEWEST and np.square(plainly).mean() < np.square(surely).mean():
         judged.append(
             "readings kept from the fit speak against surfaces: total variation is returned"
         )
-        settled = reconstruct_tv(psi, frames, typical, TVSettings(), usable, start=plain)
-        light_field = settled.light_field
+        light_field = reconstruct_tv(
+            given.psi, given.frames, given.typical, usable=usable, start=plain.light_field
+        ).light_field
         maps["model"][:] = MODELS.index("free")
-        spread = missed_variance(psi, plainly, noise, held)
+        spread = missed_variance(given.psi, plainly, given.noise, held)
         maps["sigma"] = np.full(light_field.shape[:4], np.sqrt(spread), dtype=np.float32)
     else:
-        surface = light_field
+        seen = found.surfaces.light_field(found.texture) * np.float32(scale)
+        surface = light_field = np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape)
         if settings.free:
-            light_field = freed(psi, frames, typical, usable, surface, unexplained)
-        sure = deviation(found, doubt, frames, noise, held)
+            off *= np.float32(scale**2)
+            light_field = freed(given.psi, given.frames, given.typical, usable, surface, off, scale)
+        sure = deviation(found, doubt, bright.frames, bright.noise, held)
         if sure is not None:
             # What total variation moved is in doubt by as much.
             moved = np.square(light_field - surface).mean(axis=-1)
-            maps["sigma"] = np.sqrt(np.square(sure.sigma) + moved)
+            maps["sigma"] = np.sqrt(np.square(sure.sigma * np.float32(scale)) + moved)
     tell(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     return Reconstruction(
@@ -237,7 +226,61 @@ def reconstruct_adaptive(
     )
 
 
-Needed = tuple[ImagingMatrix, Array, Array, TextureSettings]
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Psi, the frames, their typical deviation, the variance `noise` of each reading, and which are
+    usable, all but Psi (shot, pixel_y, pixel_x)."""
+
+    psi: ImagingMatrix
+    frames: Array
+    typical: float
+    noise: Array
+    usable: NDArray[np.bool_]
+
+    def over(self, scale: float, of_psi: bool = False) -> Given:
+        """Return the same with readings divided by a scale: of a scene, or of Psi, so much dimmer.
+
+        Psi, frames and noise so many times larger are the same problem.
+        """
+        if scale == 1:
+            return self
+        part = self.frames.dtype.type(scale)
+        psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
+        noise = (self.noise / scale**2).astype(np.float32)
+        return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+
+def _unexplained_by(picture: Array, given: Given, settings: AdaptiveSettings) -> search.Data:
+    """Return what a smooth picture (y, x, c), the same in all views, leaves to be explained."""
+    psi, k = given.psi, given.psi.binning
+    flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
+    grey = picture.mean(axis=-1)
+    brightness = grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3))
+    variance = given.noise + np.float32(settings.misfit**2)
+    return search.Data(psi, given.frames - psi.forward(flat), variance, given.usable, brightness)
+
+
+def _searched(
+    data: search.Data, settings: AdaptiveSettings, on_rough: Callable[[], None]
+) -> search.Volume:
+    """Return the disparities that patches and their neighbours agree on, coarse to fine."""
+    wide = TexturePrior(length_px=COARSE_LENGTH_PX, freedom=settings.freedom)
+    smooth = settings.slope_px, settings.jump
+    rough = search.coarse(data, wide, settings.furthest_px, *smooth)
+    on_rough()
+    prior = TexturePrior(freedom=settings.freedom)
+    return search.fine(data, prior, rough, settings.stride, settings.step_px, *smooth)
+
+
+@dataclass(frozen=True, eq=False)
+class Needed:
+    """What is modelled: Psi, the centre view's disparity (y, x), the picture to begin with
+    (y, x, c), and the steps of the fit."""
+
+    psi: ImagingMatrix
+    centre: Array
+    picture: Array
+    texture: TextureSettings
 
 
 def _needed(
@@ -253,7 +296,7 @@ def _needed(
 
     asked: what is taken if the scene needs all.
     """
-    psi, centre, picture, texture = asked
+    psi, centre, picture, texture = asked.psi, asked.centre, asked.picture, asked.texture
     left_out = []
     pixels = psi.frames_shape[1:]
     plane = one_plane(volume, pixels)
@@ -273,7 +316,7 @@ def _needed(
         if not colour_is_needed(*missed):
             left_out.append(f"colour: one for all (at best {grey_bound_db(picture):.0f} dB)")
             psi, picture = both[1]
-    return (psi, centre, picture, texture), left_out
+    return Needed(psi, centre, picture, texture), left_out
 
 
 def _explained(missed: Array, plain: Array, noise: Array, held: NDArray[np.bool_]) -> float | None:

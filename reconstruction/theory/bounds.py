@@ -1,0 +1,87 @@
+"""How well any estimator can tell the disparity of a patch from its readings.
+
+The readings are N(0, S_d) (see `patch`), the texture integrated out. About a disparity the Fisher
+information of d is 1/2 trace(S^-1 S' S^-1 S'), S' = dS/dd (Kay 1993, Estimation Theory, eq. 3.32);
+no unbiased estimator varies less than its inverse (Cramer-Rao). That bound is local: it knows
+nothing of other disparities that explain the readings as well, which decide where an estimator
+breaks. Those enter the Ziv-Zakai bound of an estimator that knows the prior of d, uniform in
+[0, R] (Bell, Steinberg, Ephraim & Van Trees 1997, "Extended Ziv-Zakai Lower Bound for Vector
+Parameter Estimation", eq. 1 for a uniform prior, without the valley filling):
+
+    E (d' - d)^2 >= integral over h from 0 to R of  h  integral over d from 0 to R - h of
+                    P(d, d + h) / R,
+
+P the least probability of error of deciding between two disparities equally likely, at least
+(1 - sqrt(1 - rho^2)) / 2, rho the Bhattacharyya coefficient of the two normal distributions
+(Kailath 1967, "The Divergence and Bhattacharyya Distance Measures in Signal Selection").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from reconstruction.theory.patch import PatchModel, Texture
+
+Array = NDArray[np.floating]
+
+
+def disparity_information(
+    patch: PatchModel, disparity: float, texture: Texture, variance: Array | float
+) -> float:
+    """Return the Fisher information of a patch's disparity, 1 / px^2.
+
+    variance: of the readings, (reading,) or one.
+    """
+    covariance = patch.signal(patch.alike(disparity, texture), texture)
+    covariance += np.diag(np.broadcast_to(variance, patch.readings))
+    slope = patch.signal(patch.alike_slope(disparity, texture), texture)
+    moved = cho_solve(cho_factor(covariance), slope)
+    return 0.5 * float(np.sum(moved * moved.T))
+
+
+def distances(
+    patch: PatchModel, disparities: Array, texture: Texture, variance: Array | float
+) -> NDArray[np.float64]:
+    """Return the Bhattacharyya distances -log rho of the readings' distributions, (d, d)."""
+    noise = np.diag(np.broadcast_to(variance, patch.readings))
+    covariances = [
+        patch.signal(patch.alike(float(d), texture), texture) + noise for d in disparities
+    ]
+    halves = [_log_det(one) / 2 for one in covariances]
+    found = np.zeros((len(disparities), len(disparities)))
+    for i in range(len(disparities)):
+        for j in range(i):
+            both = _log_det((covariances[i] + covariances[j]) / 2) / 2
+            found[i, j] = found[j, i] = max(both - (halves[i] + halves[j]) / 2, 0.0)
+    return found
+
+
+def _log_det(matrix: Array) -> float:
+    return 2 * float(np.log(np.diag(np.linalg.cholesky(matrix))).sum())
+
+
+def ziv_zakai(disparities: Array, apart: Array) -> float:
+    """Return the least mean squared error of a disparity uniform between the ends of a grid, px^2.
+
+    disparities: evenly spaced (d,), at least 2. apart: their `distances`. The integrals are
+    lower sums: of P, which falls as disparities part, each step of h takes the value at its end,
+    and of the pairs of disparities those on the grid stand for all.
+    """
+    step = float(disparities[1] - disparities[0])
+    count = len(disparities)
+    errors = -0.5 * np.expm1(0.5 * np.log1p(-np.minimum(np.exp(-2 * apart), 1 - 1e-15)))
+    bound = 0.0
+    for lag in range(1, count):
+        inner = float(np.diagonal(errors, lag).mean()) * (count - 1 - lag) / (count - 1)
+        # The integral of h over the step that ends here.
+        bound += inner * step**2 * (lag - 0.5)
+    return bound
+
+
+def uniform_variance(disparities: Sequence[float] | Array) -> float:
+    """Return the variance of a disparity that is uniform between the ends, px^2: of no reading."""
+    return float(disparities[-1] - disparities[0]) ** 2 / 12
