@@ -316,6 +316,9 @@ def reconstruct(
         Path | None,
         typer.Option("--chart", help="of `emmc-rig chart`, to choose by (default: the shipped)"),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
+    ] = False,
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
@@ -377,6 +380,22 @@ def reconstruct(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'pictures'}")
+    _show_verdict(metrics["verdict"])
+    if strict and metrics["verdict"]["level"] == "do not use":
+        raise typer.Exit(1)
+
+
+VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
+
+
+def _show_verdict(verdict: dict) -> None:
+    """Print a verdict: its level, and a line for each reason with its remedy."""
+    colour = VERDICT_COLOURS[verdict["level"]]
+    if not verdict["reasons"]:
+        typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
+    for reason in verdict["reasons"]:
+        what, remedy = reason["what"], reason["remedy"]
+        typer.secho(f"{reason['level']}: {what}; {remedy}", fg=VERDICT_COLOURS[reason["level"]])
 
 
 @app.command()

@@ -41,9 +41,10 @@ from emmc_rig.scene import open_scene
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
-from reconstruction.methods import MethodSettings, find_method, reconstruct
+from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Progress
 from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
+from reconstruction.verdict.run import reconstruct_judged
 
 FRAMES, PSI, LIGHT_FIELD, MAPS = "frames.h5", "psi.h5", "light_field.h5", "maps.h5"
 
@@ -167,7 +168,7 @@ def run_reconstruct(
     psi = ImagingMatrix.load(psi_path)
     views = psi.light_field_shape[:2]
     dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
-    result = reconstruct(
+    result, verdict = reconstruct_judged(
         method,
         psi,
         capture.readings,
@@ -182,6 +183,7 @@ def run_reconstruct(
         "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
+        "verdict": verdict.as_dict(),
         "steps": result.steps,
         "seconds": result.seconds,
         "parameters": result.parameters,

@@ -1,0 +1,116 @@
+"""Everything that speaks for or against a light field, as plain figures."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.inputs import checked_inputs
+from reconstruction.result import Reconstruction
+from reconstruction.verdict.displaced import displaced
+from reconstruction.verdict.kept import foretold
+from reconstruction.verdict.pixels import judged_pixels
+from reconstruction.verdict.shadow import relief, shadow
+from reconstruction.verdict.shots import compared
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Figures of a capture and of a light field found from it; None where there is nothing to say.
+
+    method: that found it; status: what it said. views: of the light field. noise: the readings'
+    deviation over their mean.
+    """
+
+    method: str
+    status: str
+    noise: float
+    relief: float
+    strengths: tuple[float, ...]
+    strength_errors: tuple[float, ...]
+    lowest_strength: float
+    lowest_at: tuple[int, int]
+    other_strengths: tuple[tuple[float, ...], ...]
+    displaced_px: float | None
+    shift_px: tuple[float, float] | None
+    changes: dict[str, tuple[float, float, float]]
+    brightness: tuple[float, ...]
+    motion_px: float | None
+    moved_at: tuple[int, int, int]
+    off: float
+    unusable: float
+    blind: float
+    hole_px: float
+    hole_at: tuple[int, int]
+    kept: int
+    missed: float | None
+    plain: float | None
+    explained: float | None
+    noise_share: float | None
+    beyond: float | None
+    parameters: dict[str, float]
+
+
+TOLD = ("decided", "at_end", "furthest_px", "share_free")
+"""Parameters of a result that bear on whether it can be trusted."""
+
+
+def gathered(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
+    result: Reconstruction,
+) -> Evidence:
+    """Return what there is to say of a light field that was fitted without the readings `kept`.
+
+    frames, usable, kept: (shot, pixel_y, pixel_x). Raises ReconstructionError for inputs that do
+    not fit each other.
+    """
+    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    found = relief(psi, frames, noise_sigma, usable)
+    masks = shadow(found)
+    off = displaced(psi, found)
+    shots = compared(psi, found)
+    pixels = judged_pixels(psi, found, noise_sigma, usable)
+    fits = foretold(psi, frames, noise_sigma, kept & usable, result.light_field, found)
+    mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
+    return Evidence(
+        method=result.method,
+        status=result.status,
+        noise=noise_sigma / mean,
+        relief=masks.relief,
+        strengths=_plain(masks.strength),
+        strength_errors=_plain(masks.error),
+        lowest_strength=masks.lowest,
+        lowest_at=masks.where,
+        other_strengths=tuple(_plain(row) for row in shots.masks),
+        displaced_px=None if off is None else off.size_px,
+        shift_px=None if off is None else off.shift,
+        changes={} if off is None else {k: astuple(one) for k, one in off.changes.items()},
+        brightness=_plain(shots.brightness),
+        motion_px=None if np.isnan(shots.motion_px) else shots.motion_px,
+        moved_at=shots.moved,
+        off=pixels.off,
+        unusable=pixels.unusable,
+        blind=pixels.blind,
+        hole_px=pixels.hole_px,
+        hole_at=pixels.hole,
+        kept=0 if fits is None else fits.readings,
+        missed=None if fits is None else fits.missed,
+        plain=None if fits is None else fits.plain,
+        explained=None if fits is None else fits.explained,
+        noise_share=None if fits is None else fits.noise,
+        beyond=None if fits is None else fits.beyond,
+        parameters={key: result.parameters[key] for key in TOLD if key in result.parameters},
+    )
+
+
+def _plain(values: NDArray) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
