@@ -102,6 +102,7 @@ def _tables(name: str, seed: int) -> Tables:
     return tabulated(_world(name, seed))
 
 
+@lru_cache(maxsize=2)
 def _world(name: str, seed: int) -> World:
     return SCENES[name].build(np.random.default_rng([seed, *name.encode()]))
 

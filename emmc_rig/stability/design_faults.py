@@ -59,8 +59,11 @@ def views(setup: Setup, count: float) -> Trial:
 
 def pixel_size(setup: Setup, r: float) -> Trial:
     """One pixel sums k x k samples, r = 1 / k^2."""
-    k = round(r**-0.5)
-    sensor = setup.camera.sensor.model_copy(update={"binning": k})
+    k, own = round(r**-0.5), setup.camera.sensor
+    # A larger pixel holds more electrons: white stays within the range.
+    gain = own.noise.gain_dn_per_electron * (own.binning / k) ** 2
+    noise = own.noise.model_copy(update={"gain_dn_per_electron": gain})
+    sensor = own.model_copy(update={"binning": k, "noise": noise})
     try:
         return taken(setup.with_camera(sensor=sensor))
     except CameraError as fault:

@@ -107,7 +107,6 @@ def taken(
     scene: instead of the setup's. true_psi: makes the readings, instead of the assumed one.
     shot_scenes: the light field before each shot, where it changes. change_clean: what becomes of
     the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels that the method is told of.
-    Light that a sensor cannot tell from none (below zero) is none.
     """
     scene = scene or setup.scene_seen()
     truth = scene.light_field
@@ -119,7 +118,9 @@ def taken(
     else:
         clean = np.stack([real.forward(seen)[shot] for shot, seen in enumerate(shot_scenes)])
     if change_clean is not None:
-        clean = np.maximum(change_clean(clean), 0)
+        clean = change_clean(clean)
+    # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
+    clean = np.maximum(clean, 0)
     shots = exposed_readings(setup.camera, size, clean, np.random.default_rng(setup.seed))
     usable = shots.usable if unusable is None else shots.usable & ~unusable
     return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
