@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.shadow import Relief, channels, relief_of, tiles
+from reconstruction.verdict.shadow import Relief, relief_of, tiles
 
 Array = NDArray[np.floating]
 STEP_PX = 0.25
@@ -44,8 +44,8 @@ class Displaced:
     """shifts: (tile, 2), by which the shadow lies off Psi's (y, x), in pixels.
 
     errors: (tile, 2), their deviations. centres: (tile, 2), (y, x) in pixels. shift: their
-    weighted mean. size_px: their root mean square beyond what the deviations make. changes:
-    `distance`, relative; `blur`, variance in px^2; `vignetting`, share that the outermost rays lose.
+    weighted mean. size_px: their root mean square beyond what the deviations make. changes: of
+    `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost rays lose.
     """
 
     shifts: NDArray[np.float64]
@@ -110,8 +110,6 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
     if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
         return None
     shift_y, shift_x = (up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)
-    # A blur of variance s adds s/2 times the second derivatives.
-    blurred = (up + down + right + left - 4 * own) / (2 * STEP_PX**2)
     darker = relief_of(_vignetted(psi, VIGNETTING_STEP), found.picture)[1]
     changes = {
         "distance": (further - own) / DISTANCE_STEP,

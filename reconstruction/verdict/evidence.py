@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,19 +33,20 @@ class Evidence:
     status: str
     noise: float
     relief: float
-    strengths: tuple[float, ...]
-    strength_errors: tuple[float, ...]
-    lowest_strength: float
+    strengths: tuple[float | None, ...]
+    strength_errors: tuple[float | None, ...]
+    lowest_strength: float | None
     lowest_at: tuple[int, int]
-    other_strengths: tuple[tuple[float, ...], ...]
+    other_strengths: tuple[tuple[float | None, ...], ...]
     displaced_px: float | None
     shift_px: tuple[float, float] | None
-    changes: dict[str, tuple[float, float, float]]
-    brightness: tuple[float, ...]
+    changes: dict[str, tuple[float | None, ...]]
+    brightness: tuple[float | None, ...]
     motion_px: float | None
     moved_at: tuple[int, int, int]
     off: float
     unusable: float
+    saturated: float
     blind: float
     hole_px: float
     hole_at: tuple[int, int]
@@ -54,6 +57,15 @@ class Evidence:
     noise_share: float | None
     beyond: float | None
     parameters: dict[str, float]
+
+    def as_dict(self) -> dict:
+        """Return the figures as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, figures: Mapping[str, Any]) -> Evidence:
+        """Return evidence from what `as_dict` gave, also after a way through JSON."""
+        return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
 TOLD = ("decided", "at_end", "furthest_px", "share_free")
@@ -73,12 +85,13 @@ def gathered(
     frames, usable, kept: (shot, pixel_y, pixel_x). Raises ReconstructionError for inputs that do
     not fit each other.
     """
+    read = frames
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
     found = relief(psi, frames, noise_sigma, usable)
     masks = shadow(found)
     off = displaced(psi, found)
     shots = compared(psi, found)
-    pixels = judged_pixels(psi, found, noise_sigma, usable)
+    pixels = judged_pixels(psi, read, found, noise_sigma, usable)
     fits = foretold(psi, frames, noise_sigma, kept & usable, result.light_field, found)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     return Evidence(
@@ -88,17 +101,18 @@ def gathered(
         relief=masks.relief,
         strengths=_plain(masks.strength),
         strength_errors=_plain(masks.error),
-        lowest_strength=masks.lowest,
+        lowest_strength=_plain([masks.lowest])[0],
         lowest_at=masks.where,
         other_strengths=tuple(_plain(row) for row in shots.masks),
         displaced_px=None if off is None else off.size_px,
         shift_px=None if off is None else off.shift,
-        changes={} if off is None else {k: astuple(one) for k, one in off.changes.items()},
+        changes={} if off is None else {k: _plain(astuple(one)) for k, one in off.changes.items()},
         brightness=_plain(shots.brightness),
         motion_px=None if np.isnan(shots.motion_px) else shots.motion_px,
         moved_at=shots.moved,
         off=pixels.off,
         unusable=pixels.unusable,
+        saturated=pixels.saturated,
         blind=pixels.blind,
         hole_px=pixels.hole_px,
         hole_at=pixels.hole,
@@ -112,5 +126,12 @@ def gathered(
     )
 
 
-def _plain(values: NDArray) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
+def _plain(values: Iterable[float]) -> tuple[float | None, ...]:
+    """Return plain numbers; None for those that are not finite."""
+    return tuple(float(value) if np.isfinite(value) else None for value in values)
+
+
+def _tupled(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tupled(item) for key, item in value.items()}
+    return tuple(map(_tupled, value)) if isinstance(value, (list, tuple)) else value

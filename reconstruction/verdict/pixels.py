@@ -12,43 +12,51 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
+BLIND_PX = 1.9
 SMOOTH = 0.5
 """Of the neighbours' typical value: they must lie within so much for a pixel to be judged."""
+ENOUGH = 6
+"""Neighbours, of eight, that must be usable."""
 SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
 """Times the neighbours' spread, their typical value, and the noise, that a pixel is off by."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """off: share that are far off all around, of readings whose neighbours agree. unusable: share of readings.
+    """off: share that are far off all around, of readings whose neighbours agree.
 
-    hole_px: radius of the largest hole that no shot sees; hole: its centre (y, x).
-    blind: share of pixels that no shot sees.
+    unusable, saturated: shares of the readings. blind: share of the pixels that lie BLIND_PX or
+    further from any that a shot sees. hole_px: radius of the largest hole; hole: its centre (y, x).
     """
 
     off: float
     unusable: float
+    saturated: float
+    blind: float
     hole_px: float
     hole: tuple[int, int]
-    blind: float
 
 
 def judged_pixels(
-    psi: ImagingMatrix, found: Relief, noise_sigma: float, usable: NDArray[np.bool_]
+    psi: ImagingMatrix,
+    frames: Array,
+    found: Relief,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
 ) -> Pixels:
-    """Return what is wrong with single pixels."""
+    """Return what is wrong with single pixels. frames: as read, at unusable pixels too."""
     step = 1 if psi.colour is None else 2
     off, told = 0, 0
     for shot in range(psi.shots):
         detail = (1 + found.read[shot]) / np.maximum(1 + found.masks[shot], 0.05)
-        around = np.sort(_neighbours(detail, found.good[shot], step), axis=0)
-        low, high = around[1], around[-2]
+        around, known = _neighbours(detail, found.good[shot], step)
+        low, high, typical = around[1], around[-2], np.abs(around[3:5].mean(axis=0))
         spread = high - low
-        smooth = found.good[shot] & (spread < SMOOTH * np.abs(around[3:5].mean(axis=0)))
+        smooth = found.good[shot] & (known >= ENOUGH) & (spread < SMOOTH * typical)
         apart = np.where(detail > high, detail - high, np.maximum(low - detail, 0))
         light = found.level[shot] * np.maximum(1 + found.masks[shot], 0.05)
         wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
-        wild &= apart > LEAST * np.abs(around[3:5].mean(axis=0))
+        wild &= apart > LEAST * typical
         off += int((wild & smooth).sum())
         told += int(smooth.sum())
     seen = usable.any(axis=0)
@@ -57,19 +65,37 @@ def judged_pixels(
     return Pixels(
         off / max(told, 1),
         float(1 - usable.mean()),
+        _saturated(frames, usable),
+        float((radius >= BLIND_PX).mean()),
         float(radius.max()),
         (int(hole[0]), int(hole[1])),
-        float(1 - seen.mean()),
     )
 
 
-def _neighbours(values: Array, good: NDArray[np.bool_], step: int) -> NDArray[np.float32]:
-    """Return the eight neighbours at a step, (8, y, x); those not good take the good ones' mean."""
+def _saturated(frames: Array, usable: NDArray[np.bool_]) -> float:
+    """Return the share of readings that are not usable and above nearly all that are."""
+    above = 0
+    for read, good in zip(frames, usable, strict=True):
+        if good.any():
+            above += int((read[~good] >= np.quantile(read[good], 0.99)).sum())
+        else:
+            above += read.size
+    return above / usable.size
+
+
+def _neighbours(
+    values: Array, good: NDArray[np.bool_], step: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the eight neighbours at a step in order, (8, y, x), and how many are good, (y, x).
+
+    Those not good take the others' mean.
+    """
     rows, columns = values.shape
     padded = np.pad(np.where(good, values, np.nan), step, mode="reflect")
     places = [(i, j) for i in (0, step, 2 * step) for j in (0, step, 2 * step)]
     places.remove((step, step))
     found = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
     known = np.isfinite(found)
-    mean = np.where(known, found, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(known, found, mean).astype(np.float32)
+    count = known.sum(axis=0)
+    mean = np.where(known, found, 0).sum(axis=0) / np.maximum(count, 1)
+    return np.sort(np.where(known, found, mean), axis=0).astype(np.float32), count

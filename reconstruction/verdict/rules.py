@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -23,20 +23,31 @@ class Limits:
         """Return what a figure speaks for; larger is worse."""
         return LEVELS[(figure > self.doubt) + (figure > self.refuse)]
 
+    def of_shots(self, count: int) -> Limits:
+        """Return the limits for several shots, which an error of Psi sets against one another."""
+        return Limits(self.doubt / count**0.6, self.refuse / count**0.6)
 
-DISPLACED_PX = Limits(0.15, 0.4)
-DISTANCE_PX = Limits(0.15, 0.4)
-WEAKER = Limits(0.12, 0.3)
-"""What is missing of the masks' shadow, or too much of it."""
-FLICKER = Limits(0.02, 0.1)
-MOTION_PX = Limits(0.3, 1.0)
-OFF = Limits(0.002, 0.02)
-HOLE_PX = Limits(4.0, 12.0)
-UNUSABLE = Limits(0.15, 0.5)
-NOISE_SHARE = Limits(0.6, 0.9)
+
+DISPLACED_PX = Limits(0.28, 0.6)
+STRENGTH_LOST = Limits(0.15, 0.35)
+"""Of the masks' shadow, as a share of what Psi says."""
+VIGNETTING = Limits(0.2, 0.5)
+FLICKER = Limits(0.04, 0.15)
+MOTION_PX = Limits(0.4, 1.5)
+OFF = Limits(0.015, 0.05)
+SATURATED = Limits(0.14, 0.35)
+BLIND = Limits(0.05, 0.25)
+NOISE_SHARE = Limits(0.61, 0.9)
+NOISE = Limits(0.3, 0.8)
+"""Deviation of the readings over their mean."""
 UNEXPLAINED = Limits(0.6, 1.0)
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
+ANOTHERS = 0.5
+"""Strength of another shot's masks above which, and of its own below which, shots are confused."""
+LEAST_STRENGTH = 0.25
+"""Displacements are told by first differences, which fade with the shadow: divided by its strength,
+but not by less than this."""
 
 
 @dataclass(frozen=True)
@@ -88,33 +99,34 @@ def judged(evidence: Evidence) -> Verdict:
 def _shots(e: Evidence) -> Iterator[Reason]:
     if len(e.brightness) < 2:
         return
-    for shot, bright in enumerate(e.brightness, 1):
-        if bright < DARK:
-            yield Reason(
-                f"shot {shot} is dark",
-                bright,
-                "take it again, or leave it out",
-                "do not use",
-            )
-            return
-    apart = max(abs(bright - 1) for bright in e.brightness)
-    shot = max(range(len(e.brightness)), key=lambda s: abs(e.brightness[s] - 1)) + 1
-    yield Reason(
-        f"shot {shot} differs in brightness by {apart:.1%}",
-        apart,
-        "steady the lamp, or normalise the frames by a reference",
-        FLICKER.level(apart),
-    )
+    bright = [one or 0.0 for one in e.brightness]
+    dark = [shot for shot, one in enumerate(bright, 1) if one < DARK]
+    if dark:
+        yield Reason(
+            f"shot {dark[0]} is dark", bright[dark[0] - 1], "take it again, or leave it out",
+            "do not use",
+        )  # fmt: skip
+        return
     for shot, row in enumerate(e.other_strengths):
-        other = max((t for t in range(len(row)) if t != shot), key=lambda t: row[t])
-        if row[other] > 0.5 and row[shot] < 0.5:
+        own = row[shot] or 0.0
+        others = [(one or 0.0, t) for t, one in enumerate(row) if t != shot]
+        other, t = max(others)
+        if other > ANOTHERS and own < ANOTHERS:
             yield Reason(
-                f"shot {shot + 1} shows the masks of shot {other + 1}",
-                row[other],
-                "the stage did not move, or the order of frames is wrong: take it again",
+                f"shot {shot + 1} shows the masks of shot {t + 1}",
+                other,
+                "the stage did not move, or frames are out of order: take it again",
                 "do not use",
             )
             return
+    apart = [abs(one - 1) for one in bright]
+    worst = apart.index(max(apart))
+    yield Reason(
+        f"shot {worst + 1} differs in brightness by {apart[worst]:.1%}",
+        apart[worst],
+        "steady the lamp, or normalise the frames by a reference",
+        FLICKER.level(apart[worst]),
+    )
     if e.motion_px is not None and _masks_fit(e):
         shot, y, x = e.moved_at
         yield Reason(
@@ -126,64 +138,107 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         )
 
 
+def _strength(e: Evidence) -> tuple[float, float] | None:
+    """Return the masks' weakest strength among the shots, and its deviation; None if untold."""
+    told = [
+        (one, error)
+        for one, error in zip(e.strengths, e.strength_errors, strict=True)
+        if one is not None and error is not None
+    ]
+    return min(told) if told else None
+
+
 def _masks_fit(e: Evidence) -> bool:
-    return all(abs(1 - one) < WEAKER.refuse for one in e.strengths)
+    weakest = _strength(e)
+    return weakest is not None and weakest[0] > 1 - STRENGTH_LOST.refuse
 
 
 def _masks(e: Evidence) -> Iterator[Reason]:
-    drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
-    if e.displaced_px is not None:
-        yield Reason(
-            f"the masks' shadow lies {e.displaced_px:.2f} pixels from where Psi says",
-            e.displaced_px,
-            drift,
-            DISPLACED_PX.level(e.displaced_px),
-        )
-    weakest = min(zip(e.strengths, e.strength_errors, strict=True), key=lambda one: one[0])
+    """Of all that may be wrong with the masks, the one reason that the readings speak most for."""
+    weakest = _strength(e)
+    if weakest is None:
+        return
     lost = 1 - weakest[0] - 2 * weakest[1]
-    if lost > 0:
+    moved = (e.displaced_px or 0.0) / max(weakest[0], LEAST_STRENGTH)
+    changes = {name: one for name, one in e.changes.items() if None not in one}
+    likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
+    drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
+    shots = len(e.strengths)
+    weak = STRENGTH_LOST.of_shots(shots).level(lost)
+    displaced = DISPLACED_PX.of_shots(shots).level(moved)
+    if displaced != "trust":
         yield Reason(
-            f"the masks show at {weakest[0]:.0%} of the strength that Psi says",
-            weakest[0],
-            "Psi is not that of these frames, or the shadow is blurred: " + drift,
-            WEAKER.level(lost),
+            f"the masks' shadow lies about {moved:.2f} pixels from where Psi says",
+            moved,
+            drift,
+            max(displaced, weak, key=LEVELS.index),
         )
+    elif weak != "trust":
+        yield Reason(_weakness(weakest[0], likeliest, changes), weakest[0], drift, weak)
+    elif likeliest == "vignetting":
+        darker, deviation, _ = changes[likeliest]
+        assert darker is not None
+        assert deviation is not None
+        yield Reason(
+            f"the outermost rays seem to lose {min(darker, 1):.0%} more than Psi says",
+            darker,
+            "measure Psi with whiteboards at this aperture, or close the aperture",
+            VIGNETTING.of_shots(shots).level(darker - 2 * deviation),
+        )
+
+
+def _weakness(strength: float, likeliest: str, changes: Mapping[str, Sequence]) -> str:
+    told = f"the masks show at {strength:.0%} of the strength that Psi says"
+    if strength < 1 - STRENGTH_LOST.refuse or not likeliest or changes[likeliest][0] <= 0:
+        return told + ", as if they were others"
+    value = changes[likeliest][0]
+    if likeliest == "distance":
+        return told + f", as if they stood {value:.0%} further from the sensor"
+    return told + f", as if their edges were blurred by {value**0.5:.1f} pixels more"
 
 
 def _pixels(e: Evidence) -> Iterator[Reason]:
+    # A shadow elsewhere makes readings differ from their neighbours, too.
+    weakest = _strength(e)
+    if weakest is None or weakest[0] > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
+        yield Reason(
+            f"{e.off:.1%} of the readings are far off all around them",
+            e.off,
+            "list dead and hot pixels (a dark and a reference frame tell them), or expose less",
+            OFF.level(e.off),
+        )
     yield Reason(
-        f"{e.off:.1%} of the readings are far off all around them",
-        e.off,
-        "list dead and hot pixels (a dark and a reference frame tell them), or expose less",
-        OFF.level(e.off),
+        f"{e.saturated:.0%} of the readings are saturated",
+        e.saturated,
+        "expose less, or bracket",
+        SATURATED.level(e.saturated),
     )
     yield Reason(
-        f"no shot sees anything in a hole {2 * e.hole_px:.0f} pixels wide at row {e.hole_at[0]}, "
-        f"column {e.hole_at[1]}",
-        e.hole_px,
-        "expose less, or bracket",
-        HOLE_PX.level(e.hole_px),
-    )
-    yield Reason(
-        f"{e.unusable:.0%} of the readings are saturated or excluded",
-        e.unusable,
-        "expose less, or bracket",
-        UNUSABLE.level(e.unusable),
+        f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "
+        f"{2 * e.hole_px:.0f} pixels wide at row {e.hole_at[0]}, column {e.hole_at[1]}",
+        e.blind,
+        "expose less, bracket, or replace the sensor's dead area by another shot",
+        BLIND.level(e.blind),
     )
 
 
 def _noise(e: Evidence) -> Iterator[Reason]:
-    if e.noise_share is not None:
+    light = "more light, longer exposure or more shots"
+    if NOISE.level(e.noise) != "trust":
+        yield Reason(
+            f"noise is {e.noise:.0%} of the mean reading", e.noise, light, NOISE.level(e.noise)
+        )
+    elif e.noise_share is not None:
         yield Reason(
             f"noise makes {e.noise_share:.0%} of what readings kept from the fit are missed by",
             e.noise_share,
-            "more light or longer exposure",
+            light,
             NOISE_SHARE.level(e.noise_share),
         )
 
 
 def _fit(e: Evidence) -> Iterator[Reason]:
-    if e.explained is not None:
+    if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
             f"only {max(e.explained, 0):.0%} of what readings kept from the fit show is explained",
             e.explained,

@@ -33,7 +33,7 @@ def reconstruct_judged(
 
     The light field is that of all readings but the few kept, which costs it next to nothing.
     """
-    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    _, usable = checked_inputs(psi, frames, noise_sigma, usable)
     kept = kept_readings(usable)
     result = reconstruct(
         name, psi, frames, noise_sigma, dictionary, settings, usable & ~kept, on_step

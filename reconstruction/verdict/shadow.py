@@ -33,8 +33,8 @@ class Relief:
     """Readings and masks around the smooth picture, (shot, pixel_y, pixel_x) each.
 
     level: what is expected of evenly grey masks. masks: what the masks add, as a share of it.
-    read: what the readings add; seen: that, without its local mean. good: where both are known. weight: the texture's inverse variance.
-    picture: the smooth picture, (y, x, c).
+    read: what the readings add; seen: that, without its local mean. good: where both are known.
+    weight: the texture's inverse variance. picture: the smooth picture, (y, x, c).
     """
 
     level: NDArray[np.float32]
@@ -174,10 +174,10 @@ def cross_strength(found: Relief) -> NDArray[np.float64]:
 
 
 def _slope(masks: Array, seen: Array, weight: Array) -> tuple[float, float]:
-    """Return the weighted regression of seen on masks and its deviation; (1, inf) if untold."""
+    """Return the weighted regression of seen on masks and its deviation; NaN if untold."""
     square = float((weight * np.square(masks, dtype=np.float64)).sum())
     if square <= 0:
-        return 1.0, np.inf
+        return np.nan, np.nan
     slope = float((weight * masks * seen).sum(dtype=np.float64)) / square
     left = np.square(weight * masks * (seen - slope * masks), dtype=np.float64)
     return slope, float(np.sqrt(left.sum())) / square

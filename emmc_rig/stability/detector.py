@@ -1,0 +1,207 @@
+"""How well verdicts tell broken results from good ones: captures with every fault, each judged.
+
+A result is broken when it lost more than 3 dB against that of the same capture without the fault,
+good when it lost 1 dB or less. What lies between may be flagged or not. Rows keep the evidence,
+from which verdicts are made anew: changed rules need no new measurement.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from pydantic import Field
+
+from emmc_rig import __version__
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.demo import Watcher
+from emmc_rig.errors import AppError
+from emmc_rig.journal import Journal, digest_of, open_folder
+from emmc_rig.model.errors import ModelError
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruct import open_dictionary
+from emmc_rig.stability.faults import FAULTS, Fault, trial
+from emmc_rig.stability.trial import NotApplicableError, Trial
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import METHODS
+from reconstruction.verdict.evidence import Evidence
+from reconstruction.verdict.rules import Verdict, judged
+from reconstruction.verdict.run import reconstruct_judged
+
+ROWS = "verdicts.jsonl"
+REVISION = 1
+BROKEN_DB, GOOD_DB = 3.0, 1.0
+KINDS = ("Light and sensor", "Mask and lens", "Between shots")
+"""Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
+
+
+class DetectorSettings(Settings):
+    """What to judge. faults: names; empty takes those that befall a capture."""
+
+    scenes: tuple[str, ...]
+    cameras: tuple[str, ...] = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
+    methods: tuple[str, ...] = ("tv", "adaptive-fast")
+    seeds: tuple[int, ...] = (1,)
+    faults: tuple[str, ...] = ()
+    fast: bool = False
+    size: tuple[int, int] = (64, 80)
+    zoom: int = Field(default=3, ge=1)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One result to judge. fault None: nothing is wrong."""
+
+    scene: str
+    camera: str
+    seed: int
+    method: str
+    fault: str | None
+    strength: float
+
+    @property
+    def harmless(self) -> Case:
+        """The same capture without its fault."""
+        if self.fault is None:
+            return self
+        return replace(self, **_named(FAULTS[self.fault], FAULTS[self.fault].strengths[0]))
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        told = "nothing wrong"
+        if self.fault is not None:
+            fault = FAULTS[self.fault]
+            told = f"{fault.title} {self.strength:g} {fault.unit}"
+        return f"{Path(self.scene).stem}, {Path(self.camera).stem}, {told}, {self.method}"
+
+
+def _named(fault: Fault, strength: float) -> dict:
+    return {"fault": None if fault.is_clean(strength) else fault.name, "strength": strength}
+
+
+def cases(settings: DetectorSettings) -> list[Case]:
+    """Return what to judge; those of one trial together."""
+    names = settings.faults or tuple(f.name for f in FAULTS.values() if f.kind in KINDS)
+    found = []
+    for scene in settings.scenes:
+        for camera in settings.cameras:
+            shots = len(find_camera(camera).shots)
+            for seed in settings.seeds:
+                for fault in (FAULTS[name] for name in names):
+                    if fault.shots > shots:
+                        continue
+                    for strength in fault.quick if settings.fast else fault.strengths:
+                        for method in settings.methods:
+                            case = Case(scene, camera, seed, method, **_named(fault, strength))
+                            found += [case.harmless, case]
+    return list(dict.fromkeys(found))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A case with its PSNR, what it lost against its harmless end, and its verdict."""
+
+    case: Case
+    psnr_db: float
+    lost_db: float
+    verdict: Verdict
+
+    @property
+    def broken(self) -> bool:
+        """Whether it lost more than 3 dB."""
+        return self.lost_db > BROKEN_DB
+
+    @property
+    def good(self) -> bool:
+        """Whether it lost 1 dB or less."""
+        return self.lost_db <= GOOD_DB
+
+    @property
+    def flagged(self) -> bool:
+        """Whether the verdict is not trust."""
+        return self.verdict.level != "trust"
+
+
+def measure(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
+    """Judge all cases into a folder that outlives interruptions.
+
+    Raises AppError for a folder that cannot be written, and what the layers below do.
+    """
+    folder = open_folder(out, ROWS, "earlier verdicts")
+    journal, rows = Journal(folder / ROWS), {}
+    wanted = cases(settings)
+    watcher.begin("judge", len(wanted))
+    made: tuple[object, Trial] | None = None
+    for case in wanted:
+        inputs = {"version": __version__, "revision": REVISION, **_inputs(case, settings)}
+        digest = digest_of(inputs)
+        row = journal.get(digest)
+        if row is None:
+            same = replace(case, method="")
+            try:
+                if made is None or made[0] != same:
+                    made = (same, _trial(case, settings))
+                row = _row(case.method, made[1])
+            except NotApplicableError:
+                watcher.step(f"left out: {case.label}")
+                continue
+            try:
+                journal.add(digest, inputs, row)
+            except OSError as fault:
+                raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+        rows[case] = row
+        watcher.step(case.label)
+    return judged_rows(rows)
+
+
+def _inputs(case: Case, settings: DetectorSettings) -> dict[str, object]:
+    return {
+        **asdict(case),
+        "camera": find_camera(case.camera).model_dump(mode="json"),
+        "size": settings.size,
+        "zoom": settings.zoom,
+    }
+
+
+def _trial(case: Case, settings: DetectorSettings) -> Trial:
+    camera = find_camera(case.camera)
+    # Without a fault, any that can be absent will do.
+    fault = FAULTS[case.fault or "mask-shift"]
+    return trial(fault, case.strength, case.scene, camera, settings.size, case.seed, settings.zoom)
+
+
+def _row(method: str, given: Trial) -> dict:
+    dictionary = None
+    if METHODS[method].needs_dictionary:
+        dictionary = _dictionary(given.psi.light_field_shape[:2], given.psi.binning)
+    try:
+        found, verdict = reconstruct_judged(
+            method, given.psi, given.readings, given.noise_sigma, dictionary, None, given.usable
+        )
+    except (ReconstructionError, ModelError) as fault:
+        return {"refused": str(fault)}
+    level = psnr_db(found.light_field, given.truth) + 20 * math.log10(given.peak)
+    return {"psnr_db": level, "evidence": verdict.evidence.as_dict()}
+
+
+@lru_cache(maxsize=4)
+def _dictionary(views: tuple[int, int], binning: int) -> Dictionary:
+    return open_dictionary(None, views, binning)
+
+
+def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
+    """Return the rows judged by today's rules; those that a method refused are left out."""
+    found = []
+    for case, row in rows.items():
+        harmless = rows.get(case.harmless, {})
+        if "evidence" in row and "psnr_db" in harmless:
+            lost = harmless["psnr_db"] - row["psnr_db"]
+            verdict = judged(Evidence.from_dict(row["evidence"]))
+            found.append(Judged(case, row["psnr_db"], lost, verdict))
+    return found
