@@ -595,6 +595,84 @@ def tables(
         typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
 
 
+@app.command()
+def stability(
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"
+        ),
+    ] = None,
+    camera: Annotated[
+        str, typer.Option("--camera", help="a shipped camera or a YAML file")
+    ] = "rgbw-bayer-3shots",
+    fault: Annotated[
+        list[str] | None, typer.Option("--fault", help="only this one; may repeat")
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option("--method", help="only this one; may repeat")
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
+    ] = False,
+    screening: Annotated[
+        bool | None,
+        typer.Option(
+            "--screening/--no-screening",
+            help="screen the frames for bad pixels and shots (default: both, where it matters)",
+        ),
+    ] = None,
+    faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
+    dictionary: DictionaryOption = None,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
+) -> None:
+    """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
+    from emmc_rig.stability.breaking import told
+    from emmc_rig.stability.command import run_stability
+    from emmc_rig.stability.faults import FAULTS
+    from emmc_rig.stability.plan import stability_settings
+    from emmc_rig.stability.run import StabilityStopped
+
+    if faults:
+        table = Table("fault", "unit", "strengths", "what happens", box=SIMPLE)
+        for one in FAULTS.values():
+            table.add_row(
+                one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained
+            )
+        Console().print(table)
+        return
+    settings = stability_settings(
+        fast, scene or [], _size(size), camera=camera, faults=tuple(fault or []),
+        methods=tuple(method or []), dictionary=dictionary, seed=seed,
+        screening={None: "both", True: "on", False: "off"}[screening],
+    )  # fmt: skip
+    try:
+        with shown_progress() as progress:
+            bars = Bars(progress)
+            outcome = run_stability(settings, out, bars)
+            bars.finish()
+    except StabilityStopped as stop:
+        _fail(str(stop), INTERRUPTED)
+    first = [curve for curve in outcome.curves if curve.scene == outcome.curves[0].scene]
+    table = Table(
+        "fault", "method", "3 dB below its best", "below the copied view", box=SIMPLE,
+        title=f"where methods break, {first[0].scene}",
+    )  # fmt: skip
+    for curve in sorted(first, key=lambda curve: list(FAULTS).index(curve.fault.name)):
+        table.add_row(
+            f"{curve.fault.title}, {curve.fault.unit}",
+            curve.label,
+            told(curve.below_best(), curve.strengths),
+            told(curve.below_view(), curve.strengths),
+        )
+    Console().print(table)
+    for line in outcome.left_out:
+        console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
+    typer.echo(f"open {outcome.page}")
+
+
 def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:
     from emmc_rig.ablation import ablations
     from emmc_rig.camera_sheet import find_camera

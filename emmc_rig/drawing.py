@@ -13,18 +13,28 @@ SALT = "emmc-rig"
 
 
 def sheet(
-    panels: int, wide: float = 4.6, high: float = 3.5, label: str = "PSNR, dB"
+    panels: int,
+    wide: float = 4.6,
+    high: float = 3.5,
+    label: str = "PSNR, dB",
+    columns: int | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure of panels side by side, each `wide` x `high` inches; label: of the y axis."""
-    figure = Figure(figsize=(wide * panels, high), layout="constrained")
-    axes = [figure.add_subplot(1, panels, i + 1) for i in range(panels)]
+    """Return a figure of panels, each `wide` x `high` inches, side by side or in so many columns.
+
+    label: of the y axes that are leftmost.
+    """
+    columns = columns or panels
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(wide * columns, high * rows), layout="constrained")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
     for one in axes:
         one.spines[["top", "right"]].set_visible(False)
         one.spines[["left", "bottom"]].set_color(LINE)
         one.tick_params(colors=FAINT, labelsize=9)
         one.grid(axis="y", color=LINE, linewidth=0.7)
         one.set_axisbelow(True)
-    axes[0].set_ylabel(label, color=FAINT, fontsize=9)
+    for one in axes[::columns]:
+        one.set_ylabel(label, color=FAINT, fontsize=9)
     return figure, axes
 
 

@@ -35,8 +35,12 @@ Array = NDArray[np.floating]
 
 
 class MethodSettings(Settings):
-    """Settings of every method; each takes its own part."""
+    """Settings of every method; each takes its own part.
 
+    screening: whether frames are screened first, see `reconstruction.screening`.
+    """
+
+    screening: bool = True
     tv: TVSettings = Field(default_factory=TVSettings)
     sparse: SparseSettings = Field(default_factory=SparseSettings)
     adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)

@@ -15,7 +15,6 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
@@ -29,9 +28,9 @@ from emmc_rig.chart.reference import reference
 from emmc_rig.chart.scores import scored
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
-from emmc_rig.model.files import whole_file
-from emmc_rig.pictures import pictures_of, telling_lines
+from emmc_rig.pictures import telling_lines
 from emmc_rig.reconstruct import open_dictionary
+from emmc_rig.thumbnails import save_thumbnail
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct
@@ -39,7 +38,6 @@ from reconstruction.result import Reconstruction
 
 FAILED = 3
 WARM_UP_PX = 27
-LARGEST_PICTURE_PX = 256
 KNOWN = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
 
 
@@ -140,30 +138,7 @@ def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
     truth_path = path.with_name(f"{path.stem.partition('-')[0]}-truth.webp")
     for light_field, where in ((estimate, path), (truth, truth_path)):
         if not where.exists() or where == path:
-            shown = _composed(light_field, lines)
-            done, data = cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, 90])
-            assert done
-            with whole_file(where) as partial:
-                partial.write_bytes(data.tobytes())
-
-
-def _composed(light_field: NDArray, lines: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return the centre view over the epipolar image of its most telling row, as 8-bit BGR.
-
-    Light is shown with the display's gamma; pixels are repeated, never blurred.
-    """
-    pictures = pictures_of(light_field, lines)
-    height, width = pictures.centre.shape[:2]
-    left = max(0, (width - LARGEST_PICTURE_PX) // 2)
-    top = min(max(0, lines[0] - LARGEST_PICTURE_PX // 2), max(0, height - LARGEST_PICTURE_PX))
-    across = slice(left, left + LARGEST_PICTURE_PX)
-    view = pictures.centre[top : top + LARGEST_PICTURE_PX, across]
-    scale = max(1, round(320 / view.shape[1]))
-    view = view.repeat(scale, axis=0).repeat(scale, axis=1)
-    epi = pictures.across[:, across].repeat(8, axis=0).repeat(scale, axis=1)
-    gap = np.ones((6, view.shape[1], 3), dtype=view.dtype)
-    stacked = np.clip(np.concatenate([view, gap, epi]), 0, 1) ** (1 / 2.2)
-    return np.ascontiguousarray(np.rint(stacked[..., ::-1] * 255).astype(np.uint8))
+            save_thumbnail(where, light_field, lines)
 
 
 def _plain(value: object) -> object:

@@ -50,8 +50,6 @@ def _roomy(camera: Camera, size: tuple[int, int], placement: Placement) -> Camer
 
 
 def _misplaced(setup: Setup, **changed: float) -> Trial:
-    if not any(changed.values()):
-        return taken(setup)
     if "scale" in changed:
         changed["scale"] += 1
     truth = setup.scene_seen().light_field
@@ -96,8 +94,6 @@ def edge_blur(setup: Setup, px: float) -> Trial:
 
 def vignetting(setup: Setup, percent: float) -> Trial:
     """The outermost ray loses so many percent, the others less, by a power of the cos^4 law."""
-    if percent == 0:
-        return taken(setup)
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     lens = setup.camera.lens

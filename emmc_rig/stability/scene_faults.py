@@ -24,8 +24,6 @@ def disparity_range(setup: Setup, px: float) -> Trial:
 def occlusion(setup: Setup, percent: float) -> Trial:
     """Leaves nearer than everything hide so many percent of every view."""
     setup.need_built_in()
-    if percent == 0:
-        return taken(setup)
     nearest = SCENES[setup.scene].disparity_px[1]
     rng = np.random.default_rng([setup.seed, 7])
     changed = setup.scene_seen(
@@ -37,8 +35,6 @@ def occlusion(setup: Setup, percent: float) -> Trial:
 def specularity(setup: Setup, percent: float) -> Trial:
     """Every surface mirrors a lively room, which makes so many percent of its light."""
     setup.need_built_in()
-    if percent == 0:
-        return taken(setup)
     rng = np.random.default_rng([setup.seed, 8])
     changed = setup.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
     return taken(setup, scene=changed)

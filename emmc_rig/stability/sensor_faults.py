@@ -42,8 +42,6 @@ def read_noise(setup: Setup, electrons: float) -> Trial:
 
 def saturation(setup: Setup, percent: float) -> Trial:
     """The white level lies so low that so many percent of the readings reach it."""
-    if percent == 0:
-        return taken(setup)
     camera, noise = setup.camera, setup.camera.sensor.noise
     truth = setup.scene_seen().light_field
     size = (truth.shape[2], truth.shape[3])
@@ -73,8 +71,6 @@ def masked_pixels(setup: Setup, percent: float) -> Trial:
 
 
 def _bad(setup: Setup, percent: float, told: bool) -> Trial:
-    if percent == 0:
-        return taken(setup)
     camera = setup.camera
     truth = setup.scene_seen().light_field
     k = camera.sensor.binning

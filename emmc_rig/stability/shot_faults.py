@@ -27,8 +27,6 @@ def flicker_gains(shots: int, percent: float, seed: int) -> Array:
 
 def flicker(setup: Setup, percent: float) -> Trial:
     """The lamp's brightness differs from shot to shot."""
-    if percent == 0:
-        return taken(setup)
     gains = flicker_gains(len(setup.camera.shots), percent, setup.seed)
     return taken(setup, change_clean=lambda clean: clean * gains[:, None, None])
 
@@ -46,8 +44,6 @@ def camera_motion(setup: Setup, px: float) -> Trial:
     """
     if setup.is_built_in:
         return _moving(setup, px, background=True)
-    if px == 0:
-        return taken(setup)
     truth = setup.scene_seen()
     rows, columns = truth.light_field.shape[2:4]
     shots = len(setup.camera.shots)
@@ -74,8 +70,6 @@ DIRECTION = (np.cos(np.pi / 6), np.sin(np.pi / 6))
 
 
 def _moving(setup: Setup, px: float, background: bool) -> Trial:
-    if px == 0:
-        return taken(setup)
     truth = setup.scene_seen()
     width = truth.light_field.shape[3] * (setup.zoom if setup.size is not None else 1)
     across, down = DIRECTION if background else (1.0, 0.0)
@@ -99,13 +93,11 @@ def missing_shot(setup: Setup, count: float) -> Trial:
         kept[dark:] = 0
         return kept
 
-    return taken(setup, change_clean=lost if count else None)
+    return taken(setup, change_clean=lost)
 
 
 def repeated_shot(setup: Setup, count: float) -> Trial:
     """The mask stage stays where it is before so many of the last shots."""
-    if not _count(setup, count):
-        return taken(setup)
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     weights = psi.weights.copy()
