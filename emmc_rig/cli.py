@@ -604,8 +604,11 @@ def stability(
         ),
     ] = None,
     camera: Annotated[
-        str, typer.Option("--camera", help="a shipped camera or a YAML file")
-    ] = "rgbw-bayer-3shots",
+        str | None,
+        typer.Option(
+            "--camera", help="a shipped camera or a YAML file (default: rgbw-bayer-3shots)"
+        ),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
@@ -622,6 +625,9 @@ def stability(
             help="screen the frames for bad pixels and shots (default: both, where it matters)",
         ),
     ] = None,
+    verdicts: Annotated[
+        bool, typer.Option("--verdicts", help="instead: how well verdicts tell broken results")
+    ] = False,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
@@ -632,7 +638,7 @@ def stability(
     from emmc_rig.stability.breaking import told
     from emmc_rig.stability.command import run_stability
     from emmc_rig.stability.faults import FAULTS
-    from emmc_rig.stability.plan import stability_settings
+    from emmc_rig.stability.plan import CAMERA, stability_settings
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
@@ -643,8 +649,11 @@ def stability(
             )
         Console().print(table)
         return
+    if verdicts:
+        _stability_verdicts(fast, scene, camera, fault, method, _size(size), seed, out)
+        return
     settings = stability_settings(
-        fast, scene or [], _size(size), camera=camera, faults=tuple(fault or []),
+        fast, scene or [], _size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
         screening={None: "both", True: "on", False: "off"}[screening],
     )  # fmt: skip
@@ -671,6 +680,44 @@ def stability(
     for line in outcome.left_out:
         console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
     typer.echo(f"open {outcome.page}")
+
+
+def _stability_verdicts(
+    fast: bool,
+    scenes: list[str] | None,
+    camera: str | None,
+    faults: list[str] | None,
+    methods: list[str] | None,
+    size: tuple[int, int] | None,
+    seed: int,
+    out: Path,
+) -> None:
+    from emmc_rig.stability.detector import detector_settings, run_detector, tables, told, wrong
+
+    settings = detector_settings(
+        fast, scenes or [], camera, faults or [], methods or [], size, seed
+    )
+    try:
+        with shown_progress() as progress:
+            bars = Bars(progress)
+            results = run_detector(settings, out, bars)
+            bars.finish()
+    except KeyboardInterrupt:
+        _fail(f"stopped by Ctrl-C; what is judged is kept in {out}: run it again", INTERRUPTED)
+    table = Table("fault", "method", "broken, flagged", "good, flagged", "between", box=SIMPLE)
+    for (name, method), tally in tables(results).items():
+        table.add_row(
+            name,
+            method,
+            f"{tally.broken_flagged} of {tally.broken}",
+            f"{tally.good_flagged} of {tally.good}",
+            f"{tally.between_flagged} of {tally.between}",
+        )
+    Console().print(table)
+    for one in wrong(results):
+        kind = "missed" if one.broken else "false alarm"
+        console.print(f"[yellow]{kind}:[/] {told(one)}", highlight=False, soft_wrap=True)
+    typer.echo(f"open {out / 'verdicts.csv'}")
 
 
 def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:

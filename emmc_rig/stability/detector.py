@@ -8,7 +8,7 @@ from which verdicts are made anew: changed rules need no new measurement.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,22 +21,26 @@ from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of, open_folder
 from emmc_rig.model.errors import ModelError
+from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
+from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.reconstruct import open_dictionary
-from emmc_rig.stability.faults import FAULTS, Fault, trial
+from emmc_rig.stability.faults import FAULTS, MASK, SENSOR, SHOTS, Fault, find_fault, trial
 from emmc_rig.stability.trial import NotApplicableError, Trial
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS
+from reconstruction.methods import METHODS, find_method
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, judged
 from reconstruction.verdict.run import reconstruct_judged
+from simulators.scenes import SCENES
 
-ROWS = "verdicts.jsonl"
+ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
+NONE, ALL = "none", "all"
 REVISION = 1
 BROKEN_DB, GOOD_DB = 3.0, 1.0
-KINDS = ("Light and sensor", "Mask and lens", "Between shots")
+KINDS = (SENSOR, MASK, SHOTS)
 """Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
 
 
@@ -51,6 +55,35 @@ class DetectorSettings(Settings):
     fast: bool = False
     size: tuple[int, int] = (64, 80)
     zoom: int = Field(default=3, ge=1)
+
+
+def detector_settings(
+    fast: bool,
+    scenes: Sequence[str],
+    camera: str | None,
+    faults: Sequence[str],
+    methods: Sequence[str],
+    size: tuple[int, int] | None,
+    seed: int,
+) -> DetectorSettings:
+    """Return the settings; what is not given is the default. fast: fewer strengths.
+
+    Raises AppError and ReconstructionError naming the nearest for names that are not known.
+    """
+    for name in faults:
+        find_fault(name)
+    for name in methods:
+        find_method(name)
+    given = {
+        "cameras": (camera,) if camera else (),
+        "faults": tuple(faults),
+        "methods": tuple(methods),
+        "size": size,
+    }
+    chosen = {key: value for key, value in given.items() if value}
+    return DetectorSettings.model_validate(
+        {"fast": fast, "scenes": tuple(scenes) or tuple(SCENES), "seeds": (seed,), **chosen}
+    )
 
 
 @dataclass(frozen=True)
@@ -205,3 +238,105 @@ def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
             verdict = judged(Evidence.from_dict(row["evidence"]))
             found.append(Judged(case, row["psnr_db"], lost, verdict))
     return found
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many results were broken, between, and good, and how many of each were flagged."""
+
+    broken: int = 0
+    broken_flagged: int = 0
+    between: int = 0
+    between_flagged: int = 0
+    good: int = 0
+    good_flagged: int = 0
+
+    @property
+    def found(self) -> float | None:
+        """Share of the broken ones that were flagged; None without any."""
+        return self.broken_flagged / self.broken if self.broken else None
+
+    @property
+    def false_alarms(self) -> float | None:
+        """Share of the good ones that were flagged; None without any."""
+        return self.good_flagged / self.good if self.good else None
+
+
+def tallied(results: Iterable[Judged]) -> Tally:
+    """Return the counts."""
+    counts = dict.fromkeys(Tally.__dataclass_fields__, 0)
+    for one in results:
+        kind = "broken" if one.broken else "good" if one.good else "between"
+        counts[kind] += 1
+        counts[f"{kind}_flagged"] += one.flagged
+    return Tally(**counts)
+
+
+def tables(results: Sequence[Judged]) -> dict[tuple[str, str], Tally]:
+    """Return the counts by fault and method, then by method, then of all; ALL names the sums."""
+    faults = list(dict.fromkeys(one.case.fault or NONE for one in results))
+    methods = list(dict.fromkeys(one.case.method for one in results))
+    keys = [(fault, method) for fault in faults for method in methods]
+    keys += [*((ALL, method) for method in methods), (ALL, ALL)]
+    return {
+        (fault, method): tallied(
+            one
+            for one in results
+            if fault in (ALL, one.case.fault or NONE) and method in (ALL, one.case.method)
+        )
+        for fault, method in keys
+    }
+
+
+def wrong(results: Iterable[Judged]) -> list[Judged]:
+    """Return the broken results that were trusted and the good ones that were not."""
+    return [
+        one for one in results if (one.broken and not one.flagged) or (one.good and one.flagged)
+    ]
+
+
+def told(one: Judged) -> str:
+    """Return a judged result in words."""
+    reasons = "; ".join(reason.what for reason in one.verdict.reasons) or "nothing against it"
+    return f"{one.case.label}: lost {one.lost_db:.1f} dB, {one.verdict.level} ({reasons})"
+
+
+def csv_text(results: Iterable[Judged]) -> str:
+    """Return one line for each result."""
+    lines = ["scene,camera,seed,method,fault,strength,psnr_db,lost_db,verdict,reasons"]
+    for one in results:
+        case = one.case
+        reasons = " | ".join(reason.what for reason in one.verdict.reasons).replace('"', "'")
+        lines.append(
+            f"{Path(case.scene).stem},{Path(case.camera).stem},{case.seed},{case.method},"
+            f"{case.fault or NONE},{case.strength:g},{one.psnr_db:.3f},{one.lost_db:.3f},"
+            f'{one.verdict.level},"{reasons}"'
+        )
+    return "\n".join(lines) + "\n"
+
+
+def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
+    """Judge all cases; write verdicts.csv and metrics.json beside the rows.
+
+    Raises what `measure` does.
+    """
+    results = measure(settings, out, watcher)
+    if not results:
+        raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
+    write_text(out / CSV, csv_text(results))
+    found = {
+        f"{fault}, {method}": {**asdict(tally), "found": tally.found, "alarms": tally.false_alarms}
+        for (fault, method), tally in tables(results).items()
+    }
+    write_metrics(
+        out,
+        {
+            "results": len(results),
+            "tallies": found,
+            "wrong": [told(one) for one in wrong(results)],
+            "settings": settings.model_dump(mode="json"),
+            "command": command_line(),
+            "versions": versions(),
+        },
+    )
+    return results

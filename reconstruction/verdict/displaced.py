@@ -6,6 +6,7 @@ the readings do beyond Psi's own relief is regressed on these changes, tile by t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,7 +170,7 @@ class _Fit:
     gain: float
 
 
-def _regressed(base: list[Array], seen: Array, weight: Array) -> _Fit | None:
+def _regressed(base: Sequence[Array], seen: Array, weight: Array) -> _Fit | None:
     """Return the weighted regression of what is seen on the base; None where it is not told."""
     good = weight > 0
     if good.sum() < 20 * len(base):

@@ -43,7 +43,8 @@ class Evidence:
     changes: dict[str, tuple[float | None, ...]]
     brightness: tuple[float | None, ...]
     motion_px: float | None
-    moved_at: tuple[int, int, int]
+    motion_effect: float | None
+    moved_at: tuple[int, int, int] | None
     off: float
     unusable: float
     saturated: float
@@ -91,6 +92,7 @@ def gathered(
     masks = shadow(found)
     off = displaced(psi, found)
     shots = compared(psi, found)
+    moved = shots.motion
     pixels = judged_pixels(psi, read, found, noise_sigma, usable)
     fits = foretold(psi, frames, noise_sigma, kept & usable, result.light_field, found)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
@@ -108,8 +110,9 @@ def gathered(
         shift_px=None if off is None else off.shift,
         changes={} if off is None else {k: _plain(astuple(one)) for k, one in off.changes.items()},
         brightness=_plain(shots.brightness),
-        motion_px=None if np.isnan(shots.motion_px) else shots.motion_px,
-        moved_at=shots.moved,
+        motion_px=None if moved is None else moved.size_px,
+        motion_effect=None if moved is None else moved.effect,
+        moved_at=None if moved is None else (moved.shot, *moved.place),
         off=pixels.off,
         unusable=pixels.unusable,
         saturated=pixels.saturated,

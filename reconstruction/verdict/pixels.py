@@ -15,6 +15,8 @@ Array = NDArray[np.floating]
 BLIND_PX = 1.9
 SMOOTH = 0.5
 """Of the neighbours' typical value: they must lie within so much for a pixel to be judged."""
+DIMMEST = 0.2
+"""Of the light expected without masks: pixels behind dark cells tell nothing of their neighbours."""
 ENOUGH = 6
 """Neighbours, of eight, that must be usable."""
 SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
@@ -48,19 +50,22 @@ def judged_pixels(
     step = 1 if psi.colour is None else 2
     off, told = 0, 0
     for shot in range(psi.shots):
-        detail = (1 + found.read[shot]) / np.maximum(1 + found.masks[shot], 0.05)
-        around, known = _neighbours(detail, found.good[shot], step)
+        passed = 1 + found.masks[shot]
+        detail = (1 + found.read[shot]) / np.maximum(passed, DIMMEST)
+        good = found.good[shot] & (passed > DIMMEST)
+        around, known = _neighbours(detail, good, step)
         low, high, typical = around[1], around[-2], np.abs(around[3:5].mean(axis=0))
         spread = high - low
-        smooth = found.good[shot] & (known >= ENOUGH) & (spread < SMOOTH * typical)
+        smooth = good & (known >= ENOUGH) & (spread < SMOOTH * typical)
         apart = np.where(detail > high, detail - high, np.maximum(low - detail, 0))
-        light = found.level[shot] * np.maximum(1 + found.masks[shot], 0.05)
+        light = found.level[shot] * passed
         wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
         wild &= apart > LEAST * typical
         off += int((wild & smooth).sum())
         told += int(smooth.sum())
     seen = usable.any(axis=0)
-    radius = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 3)
+    unseen = np.asarray(~seen, dtype=np.uint8)
+    radius = cv2.distanceTransform(unseen, cv2.DIST_L2, 3)
     hole = np.unravel_index(int(radius.argmax()), radius.shape)
     return Pixels(
         off / max(told, 1),

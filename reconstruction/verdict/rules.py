@@ -31,16 +31,21 @@ class Limits:
 DISPLACED_PX = Limits(0.28, 0.6)
 STRENGTH_LOST = Limits(0.15, 0.35)
 """Of the masks' shadow, as a share of what Psi says."""
-VIGNETTING = Limits(0.2, 0.5)
+VIGNETTING = Limits(0.06, 0.3)
 FLICKER = Limits(0.04, 0.15)
-MOTION_PX = Limits(0.4, 1.5)
+MOTION = Limits(0.075, 0.3)
+"""What motion between shots changes, over the mean reading."""
 OFF = Limits(0.015, 0.05)
 SATURATED = Limits(0.14, 0.35)
 BLIND = Limits(0.05, 0.25)
 NOISE_SHARE = Limits(0.61, 0.9)
+LEAST_NOISE = 0.1
+"""Of an even scene noise is all there is to miss, and does no harm."""
 NOISE = Limits(0.3, 0.8)
 """Deviation of the readings over their mean."""
-UNEXPLAINED = Limits(0.6, 1.0)
+UNEXPLAINED = Limits(0.97, 1.2)
+UNDECIDED = Limits(0.75, 1.0)
+AT_END = Limits(0.01, 1.0)
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
@@ -88,7 +93,7 @@ def judged(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     found = [
         reason
-        for rule in (_shots, _masks, _pixels, _noise, _fit)
+        for rule in (_shots, _masks, _pixels, _noise, _search, _fit)
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
@@ -127,14 +132,14 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         "steady the lamp, or normalise the frames by a reference",
         FLICKER.level(apart[worst]),
     )
-    if e.motion_px is not None and _masks_fit(e):
+    if e.motion_px is not None and e.motion_effect is not None and e.moved_at and _masks_fit(e):
         shot, y, x = e.moved_at
         yield Reason(
             f"between shots 1 and {shot + 1} the picture moves by {e.motion_px:.1f} pixels at row "
             f"{y}, column {x}",
             e.motion_px,
             "hold scene and camera still, or reconstruct one shot by adaptive",
-            MOTION_PX.level(e.motion_px),
+            MOTION.level(e.motion_effect),
         )
 
 
@@ -166,12 +171,12 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     shots = len(e.strengths)
     weak = STRENGTH_LOST.of_shots(shots).level(lost)
     displaced = DISPLACED_PX.of_shots(shots).level(moved)
-    if displaced != "trust":
+    if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
         yield Reason(
             f"the masks' shadow lies about {moved:.2f} pixels from where Psi says",
             moved,
             drift,
-            max(displaced, weak, key=LEVELS.index),
+            displaced if LEVELS.index(displaced) > LEVELS.index(weak) else weak,
         )
     elif weak != "trust":
         yield Reason(_weakness(weakest[0], likeliest, changes), weakest[0], drift, weak)
@@ -189,8 +194,10 @@ def _masks(e: Evidence) -> Iterator[Reason]:
 
 def _weakness(strength: float, likeliest: str, changes: Mapping[str, Sequence]) -> str:
     told = f"the masks show at {strength:.0%} of the strength that Psi says"
-    if strength < 1 - STRENGTH_LOST.refuse or not likeliest or changes[likeliest][0] <= 0:
+    if strength < LEAST_STRENGTH:
         return told + ", as if they were others"
+    if not likeliest or changes[likeliest][0] <= 0:
+        return told
     value = changes[likeliest][0]
     if likeliest == "distance":
         return told + f", as if they stood {value:.0%} further from the sensor"
@@ -228,13 +235,31 @@ def _noise(e: Evidence) -> Iterator[Reason]:
         yield Reason(
             f"noise is {e.noise:.0%} of the mean reading", e.noise, light, NOISE.level(e.noise)
         )
-    elif e.noise_share is not None:
+    elif e.noise_share is not None and e.noise > LEAST_NOISE:
         yield Reason(
             f"noise makes {e.noise_share:.0%} of what readings kept from the fit are missed by",
             e.noise_share,
             light,
             NOISE_SHARE.level(e.noise_share),
         )
+
+
+def _search(e: Evidence) -> Iterator[Reason]:
+    """What methods that look for disparities say of them."""
+    decided, at_end = e.parameters.get("decided"), e.parameters.get("at_end", 0.0)
+    if decided is not None:
+        yield Reason(
+            f"{1 - decided:.0%} of the textured patches prefer no disparity",
+            decided,
+            "use a mask that differs from view to view, or more shots",
+            UNDECIDED.level(1 - decided),
+        )
+    yield Reason(
+        f"{at_end:.0%} of the patches want disparities beyond the range searched",
+        at_end,
+        "raise furthest_px, or focus nearer to the scene",
+        AT_END.level(at_end),
+    )
 
 
 def _fit(e: Evidence) -> Iterator[Reason]:

@@ -16,40 +16,52 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.verdict.shadow import Relief, cross_strength, tiles
 
 Array = NDArray[np.floating]
-BLURS_PX = (1.5, 4.0)
+BLURS_PX = (0.8, 1.5, 4.0)
 """Of the pictures that are compared: fine ones tell small motions, coarse ones large."""
 SAME_VIEWPOINT = 0.1
 """View steps between the mean viewpoints of two shots beyond which parallax passes for motion."""
 
 
+@dataclass(frozen=True)
+class Motion:
+    """The worst in any tile between a shot and the first, beyond two deviations.
+
+    size_px: how far. effect: what it changes, over the mean reading. shot; place: (y, x).
+    """
+
+    size_px: float = 0.0
+    effect: float = 0.0
+    shot: int = 0
+    place: tuple[int, int] = (0, 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Shots:
     """brightness: of every shot over their mean. masks: (read, said), how strongly each shot's
-    readings show each shot's masks. motion_px: the largest in any tile between a shot and the
-    first, beyond two deviations; NaN where it cannot be told. moved: (shot, y, x) where that is.
+    readings show each shot's masks. motion: None where it cannot be told.
     """
 
     brightness: NDArray[np.float64]
     masks: NDArray[np.float64]
-    motion_px: float
-    moved: tuple[int, int, int]
+    motion: Motion | None
 
 
 def compared(psi: ImagingMatrix, found: Relief) -> Shots:
     """Return how the shots agree."""
     common = found.good.all(axis=0)
     ratio = np.ones(psi.shots)
-    detail = np.where(found.good, (1 + found.read) / np.maximum(1 + found.masks, 0.05), 1)
     if common.any():
         for shot in range(psi.shots):
             level = found.level[shot][common].astype(np.float64)
             read = level * (1 + found.read[shot][common])
             said = level * (1 + found.masks[shot][common])
-            ratio[shot] = read.sum() / said.sum()
-    motion, place = (np.nan, (0, 0, 0))
+            ratio[shot] = read.sum() / max(said.sum(), 1e-12)
+    motion = None
     if psi.shots > 1 and common.any() and _viewpoints_apart(psi) < SAME_VIEWPOINT:
-        motion, place = _motion(detail / ratio[:, None, None], found)
-    return Shots(ratio / ratio.mean(), cross_strength(found), motion, place)
+        detail = (1 + found.read) / np.maximum(1 + found.masks, 0.05)
+        detail = np.where(found.good, detail, 1) / np.maximum(ratio, 1e-3)[:, None, None]
+        motion = _motion(detail, found)
+    return Shots(ratio / ratio.mean(), cross_strength(found), motion)
 
 
 def _viewpoints_apart(psi: ImagingMatrix) -> float:
@@ -64,12 +76,13 @@ def _viewpoints_apart(psi: ImagingMatrix) -> float:
     return float(np.linalg.norm(middle[:, None] - middle[None], axis=-1).max())
 
 
-def _motion(detail: Array, found: Relief) -> tuple[float, tuple[int, int, int]]:
-    """Return the largest motion against the first shot, and its shot and place."""
+def _motion(detail: Array, found: Relief) -> Motion:
+    """Return the worst motion of the detail (shot, y, x) against the first shot."""
     rows, columns = detail.shape[1:]
     grey = found.picture.mean(axis=-1)
     grey = cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA)
-    largest, place = 0.0, (0, 0, 0)
+    mean = max(float(grey.mean()), 1e-12)
+    worst = Motion()
     for blur in BLURS_PX:
         pictures = [
             _blurred(one, good, blur) * grey for one, good in zip(detail, found.good, strict=True)
@@ -78,29 +91,34 @@ def _motion(detail: Array, found: Relief) -> tuple[float, tuple[int, int, int]]:
             slope_y, slope_x = np.gradient((pictures[0] + pictures[shot]) / 2)
             change = pictures[0] - pictures[shot]
             for y, x in tiles((rows, columns)):
-                size = _moved(slope_y[y, x], slope_x[y, x], change[y, x], blur)
-                if size > largest:
-                    largest = size
-                    place = (shot, (y.start + y.stop) // 2, (x.start + x.stop) // 2)
-    return largest, place
+                size, steepness = _moved(slope_y[y, x], slope_x[y, x], change[y, x], blur)
+                if size * steepness / mean > worst.effect:
+                    place = ((y.start + y.stop) // 2, (x.start + x.stop) // 2)
+                    worst = Motion(size, size * steepness / mean, shot, place)
+    return worst
 
 
 def _blurred(values: Array, good: NDArray[np.bool_], blur: float) -> NDArray[np.float32]:
     use = good.astype(np.float32)
     top = cv2.GaussianBlur(use * values.astype(np.float32), (0, 0), blur)
-    return top / np.maximum(cv2.GaussianBlur(use, (0, 0), blur), 1e-6)
+    bottom = np.maximum(cv2.GaussianBlur(use, (0, 0), blur), 1e-6)
+    return np.asarray(top / bottom, dtype=np.float32)
 
 
-def _moved(slope_y: Array, slope_x: Array, change: Array, blur: float) -> float:
-    """Return how far a tile has moved, less two of its deviations."""
+def _moved(slope_y: Array, slope_x: Array, change: Array, blur: float) -> tuple[float, float]:
+    """Return how far a tile has moved, less two of its deviations, and its root mean square slope.
+
+    By least squares (Lucas & Kanade 1981).
+    """
     columns = np.stack([slope_y.ravel(), slope_x.ravel()], axis=1).astype(np.float64)
     matrix = columns.T @ columns
     if np.linalg.cond(matrix) > 1e6:
-        return 0.0
+        return 0.0, 0.0
     inverse = np.linalg.inv(matrix)
     value = inverse @ (columns.T @ change.ravel())
     left = change.ravel() - columns @ value
     # Blurred pixels are alike over 4 pi blur^2 of them.
     alike = 4 * np.pi * blur**2
     deviation = np.sqrt(np.trace(inverse) * np.mean(left**2) * alike)
-    return float(np.linalg.norm(value) - 2 * deviation)
+    steepness = float(np.sqrt(np.mean(np.sum(columns**2, axis=1))))
+    return float(np.linalg.norm(value) - 2 * deviation), steepness
