@@ -635,10 +635,10 @@ def stability(
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
-    from emmc_rig.stability.breaking import told
     from emmc_rig.stability.command import run_stability
     from emmc_rig.stability.faults import FAULTS
     from emmc_rig.stability.plan import CAMERA, stability_settings
+    from emmc_rig.stability.rows import breaking_rows
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
@@ -664,18 +664,13 @@ def stability(
             bars.finish()
     except StabilityStopped as stop:
         _fail(str(stop), INTERRUPTED)
-    first = [curve for curve in outcome.curves if curve.scene == outcome.curves[0].scene]
+    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     table = Table(
-        "fault", "method", "3 dB below its best", "below the copied view", box=SIMPLE,
-        title=f"where methods break, {first[0].scene}",
+        "fault", *methods, box=SIMPLE,
+        title=f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view",
     )  # fmt: skip
-    for curve in sorted(first, key=lambda curve: list(FAULTS).index(curve.fault.name)):
-        table.add_row(
-            f"{curve.fault.title}, {curve.fault.unit}",
-            curve.label,
-            told(curve.below_best(), curve.strengths),
-            told(curve.below_view(), curve.strengths),
-        )
+    for row in rows:
+        table.add_row(f"{row.title}, {row.unit}", *row.cells)
     Console().print(table)
     for line in outcome.left_out:
         console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
@@ -704,7 +699,9 @@ def _stability_verdicts(
             bars.finish()
     except KeyboardInterrupt:
         _fail(f"stopped by Ctrl-C; what is judged is kept in {out}: run it again", INTERRUPTED)
-    table = Table("fault", "method", "broken, flagged", "good, flagged", "between", box=SIMPLE)
+    table = Table(
+        "fault", "method", "broken: flagged", "good: flagged", "between", "poor", box=SIMPLE
+    )
     for (name, method), tally in tables(results).items():
         table.add_row(
             name,
@@ -712,10 +709,11 @@ def _stability_verdicts(
             f"{tally.broken_flagged} of {tally.broken}",
             f"{tally.good_flagged} of {tally.good}",
             f"{tally.between_flagged} of {tally.between}",
+            f"{tally.poor_flagged} of {tally.poor}",
         )
     Console().print(table)
     for one in wrong(results):
-        kind = "missed" if one.broken else "false alarm"
+        kind = "missed" if one.kind == "broken" else "false alarm"
         console.print(f"[yellow]{kind}:[/] {told(one)}", highlight=False, soft_wrap=True)
     typer.echo(f"open {out / 'verdicts.csv'}")
 

@@ -183,6 +183,7 @@ def run_reconstruct(
         "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
+        "screening": list(result.screening),
         "verdict": verdict.as_dict(),
         "steps": result.steps,
         "seconds": result.seconds,

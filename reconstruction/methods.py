@@ -23,6 +23,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs
 from reconstruction.patch_term import PatchTerm
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.screening import screened
 from reconstruction.sparse import (
     PatchEstimates,
     SparseSettings,
@@ -182,6 +183,34 @@ def reconstruct(
     """
     method = find_method(name)
     settings = settings or MethodSettings()
+    if settings.screening:
+        started = clock()
+        frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+        seen = screened(psi, frames, usable)
+        took = clock() - started
+        result = _solved(
+            method, psi, seen.frames, noise_sigma, dictionary, settings, seen.usable, on_step,
+            clock, estimates,
+        )  # fmt: skip
+        return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.told)
+    return _solved(
+        method, psi, frames, noise_sigma, dictionary, settings, usable, on_step, clock, estimates
+    )
+
+
+def _solved(
+    method: Method,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    dictionary: Dictionary | None,
+    settings: MethodSettings,
+    usable: NDArray[np.bool_] | None,
+    on_step: Callable[[Progress], None] | None,
+    clock: Callable[[], float],
+    estimates: PatchEstimates | None,
+) -> Reconstruction:
+    name = method.name
     if name.startswith("adaptive"):
         chosen = fast(settings.adaptive) if name == "adaptive-fast" else settings.adaptive
         result = reconstruct_adaptive(psi, frames, noise_sigma, chosen, usable, on_step, clock)

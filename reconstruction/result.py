@@ -27,7 +27,8 @@ class Reconstruction:
     """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when `status` is converged.
 
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
-    it found, by name: `disparity` (y, x) in pixels per view step, ...
+    it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was done to
+    the frames before, in words.
     """
 
     method: str
@@ -39,6 +40,7 @@ class Reconstruction:
     seconds: float
     parameters: dict[str, float]
     maps: Mapping[str, NDArray] = field(default_factory=dict)
+    screening: tuple[str, ...] = ()
 
     def without_light_field(self) -> Reconstruction:
         """Return the result with an empty light field and no maps, to keep many."""

@@ -17,7 +17,7 @@ from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction
 from reconstruction.tv import TVSettings
 from reconstruction.verdict.displaced import displaced
-from reconstruction.verdict.evidence import Evidence, gathered
+from reconstruction.verdict.evidence import Evidence, Read, gathered
 from reconstruction.verdict.kept import foretold, kept_readings
 from reconstruction.verdict.pixels import judged_pixels
 from reconstruction.verdict.rules import LEVELS, judged
@@ -26,6 +26,8 @@ from reconstruction.verdict.shadow import relief, shadow
 from reconstruction.verdict.shots import compared
 
 SIZE = (48, 64)
+SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
+"""What screening mends before verdicts see it; without it they must tell."""
 QUICK = MethodSettings(tv=TVSettings(max_steps=40))
 
 
@@ -147,10 +149,13 @@ def test_few_readings_are_kept_and_the_same_each_time(three):
     np.testing.assert_array_equal(kept, kept_readings(usable))
 
 
-def judged_trial(fault, strength, camera="rgbw-bayer-3shots", scene="deep-occlusions", seed=0):
+def judged_trial(
+    fault, strength, camera="rgbw-bayer-3shots", scene="deep-occlusions", seed=0, screening=True
+):
     given = trial(FAULTS[fault], strength, scene, find_camera(camera), SIZE, seed, 3)
+    settings = QUICK.model_copy(update={"screening": screening})
     _, verdict = reconstruct_judged(
-        "tv", given.psi, given.readings, given.noise_sigma, None, QUICK, given.usable
+        "tv", given.psi, given.readings, given.noise_sigma, None, settings, given.usable
     )
     return verdict
 
@@ -173,11 +178,17 @@ def judged_trial(fault, strength, camera="rgbw-bayer-3shots", scene="deep-occlus
     ],
 )
 def test_a_fault_is_told_with_its_reason_and_a_remedy(fault, strength, reason):
-    verdict = judged_trial(fault, strength)
+    verdict = judged_trial(fault, strength, screening=fault not in SCREENED)
     assert verdict.level != "trust"
     told = [one for one in verdict.reasons if reason in one.what]
     assert told, verdict.words
     assert told[0].remedy
+
+
+def test_a_shot_that_screening_left_out_is_told():
+    verdict = judged_trial("missing-shot", 1)
+    assert verdict.level == "doubt"
+    assert "shot 3 was left out" in verdict.words
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])
@@ -193,7 +204,8 @@ def clean_evidence(three):
         "tv", np.full(three.light_field_shape, 0.5, np.float32), "converged", "", 1, (), 0.0, {}
     )
     usable = everywhere(three)
-    return gathered(three, grey(three), 1e-3, usable, kept_readings(usable), empty)
+    read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
+    return gathered(three, read, 1e-3, empty)
 
 
 def test_evidence_survives_json(three):

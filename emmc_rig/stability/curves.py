@@ -86,8 +86,11 @@ def _curve(
     points = tuple(tuple(found[s] for found in whole) for s in whole[0])
 
     def mean(key: str) -> tuple[float | None, ...]:
-        rows = [[results[point].get(key) for point in some] for some in points]
-        return tuple(None if None in row else float(np.mean(row)) for row in rows)
+        means = []
+        for some in points:
+            known = [v for v in (results[point].get(key) for point in some) if v is not None]
+            means.append(float(np.mean(known)) if len(known) == len(some) else None)
+        return tuple(means)
 
     return Curve(
         name, FAULTS[fault], method, screened, tuple(whole[0]), mean("psnr_db"), mean("view_db"),

@@ -1,8 +1,10 @@
 """How well verdicts tell broken results from good ones: captures with every fault, each judged.
 
 A result is broken when it lost more than 3 dB against that of the same capture without the fault,
-good when it lost 1 dB or less. What lies between may be flagged or not. Rows keep the evidence,
-from which verdicts are made anew: changed rules need no new measurement.
+good when it lost 1 dB or less. It is poor when it lost 3 dB or less but had little to lose: without
+the fault another method of those measured was 2 dB better. What is poor or between may be flagged
+or not. Rows keep the evidence, from which verdicts are made anew: changed rules need no new
+measurement.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -22,7 +25,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of, open_folder
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
-from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.model.settings import Settings
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.reconstruct import open_dictionary
@@ -39,7 +42,7 @@ from simulators.scenes import SCENES
 ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
 NONE, ALL = "none", "all"
 REVISION = 1
-BROKEN_DB, GOOD_DB = 3.0, 1.0
+BROKEN_DB, GOOD_DB, POOR_DB = 3.0, 1.0, 2.0
 KINDS = (SENSOR, MASK, SHOTS)
 """Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
 
@@ -138,22 +141,30 @@ def cases(settings: DetectorSettings) -> list[Case]:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A case with its PSNR, what it lost against its harmless end, and its verdict."""
+    """A case with its PSNR, what it lost against its harmless end, and its verdict.
+
+    little_to_lose: whether the harmless end is poor already.
+    """
 
     case: Case
     psnr_db: float
     lost_db: float
+    little_to_lose: bool
     verdict: Verdict
 
     @property
-    def broken(self) -> bool:
-        """Whether it lost more than 3 dB."""
-        return self.lost_db > BROKEN_DB
+    def kind(self) -> Literal["broken", "good", "between", "poor"]:
+        """What it is, whatever the verdict."""
+        if self.lost_db > BROKEN_DB:
+            return "broken"
+        if self.little_to_lose:
+            return "poor"
+        return "good" if self.lost_db <= GOOD_DB else "between"
 
     @property
-    def good(self) -> bool:
-        """Whether it lost 1 dB or less."""
-        return self.lost_db <= GOOD_DB
+    def wrong(self) -> bool:
+        """Whether it is broken and trusted, or good and not."""
+        return self.kind in ("broken", "good") and self.flagged != (self.kind == "broken")
 
     @property
     def flagged(self) -> bool:
@@ -220,7 +231,8 @@ def _row(method: str, given: Trial) -> dict:
     except (ReconstructionError, ModelError) as fault:
         return {"refused": str(fault)}
     level = psnr_db(found.light_field, given.truth) + 20 * math.log10(given.peak)
-    return {"psnr_db": level, "evidence": verdict.evidence.as_dict()}
+    view = psnr_db(replicate_centre(given.truth), given.truth) + 20 * math.log10(given.peak)
+    return {"psnr_db": level, "view_db": view, "evidence": verdict.evidence.as_dict()}
 
 
 @lru_cache(maxsize=4)
@@ -230,19 +242,27 @@ def _dictionary(views: tuple[int, int], binning: int) -> Dictionary:
 
 def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
     """Return the rows judged by today's rules; those that a method refused are left out."""
+    best: dict[Case, float] = {}
+    for case, row in rows.items():
+        if "psnr_db" in row:
+            any_method = replace(case, method="")
+            best[any_method] = max(best.get(any_method, -math.inf), row["psnr_db"])
     found = []
     for case, row in rows.items():
         harmless = rows.get(case.harmless, {})
-        if "evidence" in row and "psnr_db" in harmless:
-            lost = harmless["psnr_db"] - row["psnr_db"]
-            verdict = judged(Evidence.from_dict(row["evidence"]))
-            found.append(Judged(case, row["psnr_db"], lost, verdict))
+        if "evidence" not in row or "psnr_db" not in harmless:
+            continue
+        level = harmless["psnr_db"]
+        rival = best[replace(case.harmless, method="")]
+        little = level < rival - POOR_DB
+        verdict = judged(Evidence.from_dict(row["evidence"]))
+        found.append(Judged(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
     return found
 
 
 @dataclass(frozen=True)
 class Tally:
-    """How many results were broken, between, and good, and how many of each were flagged."""
+    """How many results were of each kind, and how many of those were flagged."""
 
     broken: int = 0
     broken_flagged: int = 0
@@ -250,6 +270,8 @@ class Tally:
     between_flagged: int = 0
     good: int = 0
     good_flagged: int = 0
+    poor: int = 0
+    poor_flagged: int = 0
 
     @property
     def found(self) -> float | None:
@@ -266,9 +288,8 @@ def tallied(results: Iterable[Judged]) -> Tally:
     """Return the counts."""
     counts = dict.fromkeys(Tally.__dataclass_fields__, 0)
     for one in results:
-        kind = "broken" if one.broken else "good" if one.good else "between"
-        counts[kind] += 1
-        counts[f"{kind}_flagged"] += one.flagged
+        counts[one.kind] += 1
+        counts[f"{one.kind}_flagged"] += one.flagged
     return Tally(**counts)
 
 
@@ -290,9 +311,7 @@ def tables(results: Sequence[Judged]) -> dict[tuple[str, str], Tally]:
 
 def wrong(results: Iterable[Judged]) -> list[Judged]:
     """Return the broken results that were trusted and the good ones that were not."""
-    return [
-        one for one in results if (one.broken and not one.flagged) or (one.good and one.flagged)
-    ]
+    return [one for one in results if one.wrong]
 
 
 def told(one: Judged) -> str:
@@ -303,14 +322,14 @@ def told(one: Judged) -> str:
 
 def csv_text(results: Iterable[Judged]) -> str:
     """Return one line for each result."""
-    lines = ["scene,camera,seed,method,fault,strength,psnr_db,lost_db,verdict,reasons"]
+    lines = ["scene,camera,seed,method,fault,strength,psnr_db,lost_db,kind,verdict,reasons"]
     for one in results:
         case = one.case
         reasons = " | ".join(reason.what for reason in one.verdict.reasons).replace('"', "'")
         lines.append(
             f"{Path(case.scene).stem},{Path(case.camera).stem},{case.seed},{case.method},"
             f"{case.fault or NONE},{case.strength:g},{one.psnr_db:.3f},{one.lost_db:.3f},"
-            f'{one.verdict.level},"{reasons}"'
+            f'{one.kind},{one.verdict.level},"{reasons}"'
         )
     return "\n".join(lines) + "\n"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from emmc_rig.stability.breaking import LOST_DB
 from emmc_rig.stability.curves import Curve
 
 PNG_DPI = 160
+DASHED = (0, (3, 2))
 PANEL_INCHES = (3.9, 2.75)
 FLOOR_DB = 6.0
 """Below the least of the copied centre view: further down, a curve says nothing more."""
@@ -52,6 +54,7 @@ def gid_of(curve: Curve, index: int) -> str:
 def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None:
     fault, strengths = curves[0].fault, curves[0].strengths
     views = next((c.views for c in curves if None not in c.views), curves[0].views)
+    mixed = _is_mixed(curves)
     seen = [(i, view) for i, view in enumerate(views) if view is not None]
     axes.plot(
         [i for i, _ in seen], [view for _, view in seen],
@@ -62,21 +65,24 @@ def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None
         known = [(i, level) for i, level in enumerate(curve.levels) if level is not None]
         axes.plot(
             [i for i, _ in known], [level for _, level in known],
-            "-" if curve.screened else (0, (3, 2)), color=colour, linewidth=1.5,
-            alpha=1 if curve.screened else 0.75, zorder=2,
+            linestyle=DASHED if mixed and not curve.screened else "-", color=colour, linewidth=1.5,
+            zorder=2,
         )  # fmt: skip
         for i, level in known:
             (dot,) = axes.plot(
                 i, level, "o", markersize=3.6, color=colour, zorder=3,
-                markerfacecolor=colour if curve.screened else "white",
+                markerfacecolor="white" if mixed and not curve.screened else colour,
             )  # fmt: skip
             dot.set_gid(gid_of(curve, i))
+    floor = _limit(axes, curves)
+    for curve in curves:
+        colour = colours[curve.method]
         for place, level, mark in _breaks(curve):
+            level = max(level, floor)
             axes.plot(
                 place, level, mark, color=colour, markersize=9,
-                markerfacecolor="none", markeredgewidth=1.4, zorder=4,
+                markerfacecolor="none", markeredgewidth=1.4, zorder=4, clip_on=False,
             )  # fmt: skip
-    _limit(axes, curves)
     axes.set_xticks(range(len(strengths)), [shown(strength) for strength in strengths])
     axes.set_xlim(-0.25, len(strengths) - 0.75)
     axes.tick_params(labelsize=7.5)
@@ -104,15 +110,23 @@ def _level_at(levels: Sequence[float | None], place: float) -> float | None:
     return first if not part or last is None else first + part * (last - first)
 
 
-def _limit(axes: Axes, curves: Sequence[Curve]) -> None:
-    """End the axis a little below the copied view: what is worse is only worse."""
+def _is_mixed(curves: Sequence[Curve]) -> bool:
+    """Whether some of the curves are of screened frames and some are not."""
+    return len({curve.screened for curve in curves}) > 1
+
+
+def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
+    """End the axis a little below the copied view, as what is worse is only worse; return where."""
     views = [view for curve in curves for view in curve.views if view is not None]
     levels = [level for curve in curves for level in curve.levels if level is not None]
-    if not views or not levels:
-        return
+    if not levels:
+        return -math.inf
+    views = views or levels
     low = max(min(levels), min(min(views), max(levels) - LOST_DB) - FLOOR_DB)
     high = max(*levels, *views)
-    axes.set_ylim(low - 0.06 * (high - low), high + 0.08 * (high - low))
+    bottom = low - 0.06 * (high - low)
+    axes.set_ylim(bottom, high + 0.08 * (high - low))
+    return bottom
 
 
 def shown(strength: float) -> str:
@@ -126,8 +140,8 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     methods = dict.fromkeys(curve.method for curve in curves)
     lines = [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in methods]
     names = list(methods)
-    if not all(curve.screened for curve in curves):
-        lines.append(Line2D([], [], color=INK, linestyle=(0, (3, 2)), marker="o", markersize=4,
+    if _is_mixed(curves):
+        lines.append(Line2D([], [], color=INK, linestyle=DASHED, marker="o", markersize=4,
                             markerfacecolor="white"))  # fmt: skip
         names.append("frames not screened")
     for mark, name in (("x", f"{LOST_DB:g} dB below its best"), ("D", "below the copied view")):

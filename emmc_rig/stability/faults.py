@@ -167,12 +167,12 @@ FAULTS = {
         ),
         Fault(
             "mask-cell", "Mask cell", "px",
-            (0.25, 0.5, 1, 1.5, 2, 3, 4, 8, 16, 32), (0.5, 1.5, 4, 16),
+            (0.1, 0.25, 0.5, 1, 1.5, 2, 3, 4, 8, 16, 32, 64), (0.1, 0.5, 1.5, 6, 32),
             DESIGN, design_faults.mask_cell,
         ),
         Fault(
             "mask-distance", "Mask distance", "px of shadow per view",
-            (0, 0.125, 0.25, 0.5, 1, 2, 4, 8), (0, 0.25, 1, 4),
+            (0, 0.125, 0.25, 0.5, 1, 2, 4, 8, 16), (0, 0.25, 1, 4, 16),
             DESIGN, design_faults.mask_distance, clean=False,
         ),
         Fault(

@@ -9,9 +9,9 @@ from importlib import resources
 from pathlib import Path
 
 from emmc_rig.page import Section, embedded, framed, table_head, text
-from emmc_rig.stability.breaking import told
 from emmc_rig.stability.curves import Curve
 from emmc_rig.stability.draw import gid_of, shown
+from emmc_rig.stability.rows import breaking_rows
 from emmc_rig.stability.run import StabilityRun
 
 CAVEATS = (
@@ -43,44 +43,25 @@ def page(about: Sequence[str], sections: Sequence[Section], data: str = "") -> s
 
 def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     """Return the table of one scene, or of all: method x fault -> breaking point."""
-    labels = list(dict.fromkeys(curve.method for curve in curves))
-    faults = dict.fromkeys(curve.fault for curve in curves)
-    rows = []
-    for fault in faults:
-        for screened in (True, False):
-            some = {
-                curve.method: curve
-                for curve in curves
-                if curve.fault == fault and curve.screened is screened
-            }
-            if some:
-                kind = "can be repaired" if fault.repairable else "limit"
-                title = fault.title + ("" if screened else ", frames not screened")
-                cells = "".join(f"<td>{_cell(some.get(label))}</td>" for label in labels)
-                rows.append(
-                    f'<tr><th scope="row" title="{text(fault.explained)}">{text(title)}</th>'
-                    f"<td>{text(fault.unit)}</td><td>{kind}</td>{cells}</tr>"
-                )
-    head = table_head(("Fault", "Unit", "Kind", *labels))
+    rows, methods = breaking_rows(curves, scene)
+    lines = "".join(
+        f'<tr><th scope="row" title="{text(row.fault.explained)}">{text(row.title)}</th>'
+        f"<td>{text(row.unit)}</td>"
+        f"<td>{'can be repaired' if row.fault.repairable else 'limit'}</td>"
+        + "".join(f"<td>{text(cell)}</td>" for cell in row.cells)
+        + "</tr>"
+        for row in rows
+    )
+    head = table_head(("Fault", "Unit", "Kind", *methods))
     body = (
         '<p class="lead">Each cell: where the method falls 3 dB below its best / where it falls '
         'below the copied centre view. "Never": not within the sweep; two numbers: broken below '
         "the first and beyond the second.</p>"
         f'<div class="scroll"><table class="breaks">{head}'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
+        f"<tbody>{lines}</tbody></table></div>"
     )
     key = "breaking-" + scene.replace(" ", "-")
     return Section(key, f"Breaking points, {scene}", f"Breaking points, {scene}", body)
-
-
-def _cell(curve: Curve | None) -> str:
-    if curve is None:
-        return "–"
-    best, view = (
-        told(curve.below_best(), curve.strengths),
-        told(curve.below_view(), curve.strengths),
-    )
-    return f"{text(best)} / {text(view)}"
 
 
 def curves_section(scene: str, kind: str, curves: Sequence[Curve], svg: Path) -> Section:

@@ -1,19 +1,21 @@
-"""Every measured point, and every breaking point, as rows of two tidy CSV files."""
+"""Measured points and breaking points as rows: of two tidy CSV files, and of the table."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from emmc_rig.stability.breaking import Span, strength_at, told
 from emmc_rig.stability.curves import Curve
-from emmc_rig.stability.faults import FAULTS
+from emmc_rig.stability.faults import FAULTS, Fault
 from emmc_rig.stability.plan import Point
 
 POINT_COLUMNS = (
     "scene", "fault", "unit", "strength", "method", "screened", "psnr_db", "view_db",
-    "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "failed",
+    "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "screening",
+    "failed",
 )  # fmt: skip
 BREAK_COLUMNS = (
     "scene", "fault", "unit", "repairable", "method", "screened", "best_db",
@@ -22,6 +24,44 @@ BREAK_COLUMNS = (
 )  # fmt: skip
 """`..._to`: the strength from which on it is broken, towards the hopeless end; `..._from`: the one
 towards the other end below which it is; empty: not within the sweep. The last says it in words."""
+
+
+@dataclass(frozen=True)
+class BreakingRow:
+    """One line of the table "method x fault -> breaking point"; cells: one per method."""
+
+    fault: Fault
+    title: str
+    unit: str
+    cells: tuple[str, ...]
+
+
+def breaking_rows(curves: Sequence[Curve], scene: str) -> tuple[list[BreakingRow], tuple[str, ...]]:
+    """Return the table of one scene, or of all together, and the methods of its columns.
+
+    A fault that was measured with and without screening has two rows.
+    """
+    of_scene = [curve for curve in curves if curve.scene == scene]
+    methods = tuple(dict.fromkeys(curve.method for curve in of_scene))
+    rows = []
+    for fault in FAULTS.values():
+        kinds = {curve.screened for curve in of_scene if curve.fault == fault}
+        for screened in sorted(kinds, reverse=True):
+            some = {
+                curve.method: curve
+                for curve in of_scene
+                if curve.fault == fault and curve.screened is screened
+            }
+            title = fault.title + (", not screened" if len(kinds) > 1 and not screened else "")
+            cells = tuple(_cell(some[name]) if name in some else "-" for name in methods)
+            rows.append(BreakingRow(fault, title, fault.unit, cells))
+    return rows, methods
+
+
+def _cell(curve: Curve) -> str:
+    return " / ".join(
+        told(span, curve.strengths) for span in (curve.below_best(), curve.below_view())
+    )
 
 
 def points_csv(results: Mapping[Point, dict]) -> str:

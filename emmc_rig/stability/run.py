@@ -30,6 +30,7 @@ from emmc_rig.stability.trial import NotApplicableError, Setup, Trial
 from emmc_rig.thumbnails import save_thumbnail
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.sparse import SparseSettings
 
 POINTS, PICTURES = "points.jsonl", "pictures"
 REVISION = 1
@@ -160,7 +161,7 @@ class StabilityRun:
         needed = METHODS[point.method].needs_dictionary
         return {
             "method": point.method,
-            "settings": MethodSettings(screening=point.screened).model_dump(mode="json"),
+            "settings": _settings(point).model_dump(mode="json"),
             "dictionary": dictionary_identity(self.settings.dictionary) if needed else None,
         }
 
@@ -176,7 +177,7 @@ class StabilityRun:
                 made.readings,
                 made.noise_sigma,
                 dictionary,
-                MethodSettings(screening=point.screened),
+                _settings(point, made.psi.binning),
                 made.usable,
             )
         except MemoryError:
@@ -199,6 +200,7 @@ class StabilityRun:
             "psi_error": made.psi.relative_difference(made.true_psi),
             "status": found.status,
             "advice": found.advice,
+            "screening": "; ".join(found.screening),
         }
 
 
@@ -215,6 +217,13 @@ def _view_db(made: Trial) -> float | None:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _settings(point: Point, binning: int = 1) -> MethodSettings:
+    """Return the settings of a point: the default ones, patches placed on whole pixels."""
+    stride = SparseSettings().stride
+    sparse = SparseSettings(stride=max(stride // binning * binning, binning))
+    return MethodSettings(screening=point.screened, sparse=sparse)
 
 
 @lru_cache(maxsize=4)

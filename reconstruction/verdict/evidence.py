@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.inputs import checked_inputs
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import foretold
@@ -25,12 +24,13 @@ Array = NDArray[np.floating]
 class Evidence:
     """Figures of a capture and of a light field found from it; None where there is nothing to say.
 
-    method: that found it; status: what it said. views: of the light field. noise: the readings'
-    deviation over their mean.
+    method: that found it; status: what it said. left_out: shots that screening left out. noise:
+    the readings' deviation over their mean.
     """
 
     method: str
     status: str
+    left_out: tuple[int, ...]
     noise: float
     relief: float
     strengths: tuple[float | None, ...]
@@ -73,32 +73,38 @@ TOLD = ("decided", "at_end", "furthest_px", "share_free")
 """Parameters of a result that bear on whether it can be trusted."""
 
 
-def gathered(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    result: Reconstruction,
-) -> Evidence:
-    """Return what there is to say of a light field that was fitted without the readings `kept`.
+@dataclass(frozen=True, eq=False)
+class Read:
+    """frames, usable: (shot, pixel_y, pixel_x), as screened. kept: those kept from the fit.
 
-    frames, usable, kept: (shot, pixel_y, pixel_x). Raises ReconstructionError for inputs that do
-    not fit each other.
+    excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
+    that screening left out, for being dark or for repeating others.
     """
-    read = frames
-    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+
+    frames: Array
+    usable: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+    excluded: Array
+    left_out: tuple[int, ...] = ()
+
+
+def gathered(
+    psi: ImagingMatrix, read: Read, noise_sigma: float, result: Reconstruction
+) -> Evidence:
+    """Return what there is to say of a light field that was fitted without the readings kept."""
+    frames, usable = np.where(read.usable, read.frames, 0), read.usable
     found = relief(psi, frames, noise_sigma, usable)
     masks = shadow(found)
     off = displaced(psi, found)
     shots = compared(psi, found)
     moved = shots.motion
-    pixels = judged_pixels(psi, read, found, noise_sigma, usable)
-    fits = foretold(psi, frames, noise_sigma, kept & usable, result.light_field, found)
+    pixels = judged_pixels(psi, read.excluded, found, noise_sigma, usable)
+    fits = foretold(psi, frames, noise_sigma, read.kept & usable, result.light_field, found)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     return Evidence(
         method=result.method,
         status=result.status,
+        left_out=read.left_out,
         noise=noise_sigma / mean,
         relief=masks.relief,
         strengths=_plain(masks.strength),

@@ -16,7 +16,7 @@ BLIND_PX = 1.9
 SMOOTH = 0.5
 """Of the neighbours' typical value: they must lie within so much for a pixel to be judged."""
 DIMMEST = 0.2
-"""Of the light expected without masks: pixels behind dark cells tell nothing of their neighbours."""
+"""Of the light expected without masks: pixels behind dark cells tell nothing of others."""
 ENOUGH = 6
 """Neighbours, of eight, that must be usable."""
 SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
@@ -41,12 +41,12 @@ class Pixels:
 
 def judged_pixels(
     psi: ImagingMatrix,
-    frames: Array,
+    excluded: Array,
     found: Relief,
     noise_sigma: float,
     usable: NDArray[np.bool_],
 ) -> Pixels:
-    """Return what is wrong with single pixels. frames: as read, at unusable pixels too."""
+    """Return what is wrong with single pixels. excluded: what unusable pixels read."""
     step = 1 if psi.colour is None else 2
     off, told = 0, 0
     for shot in range(psi.shots):
@@ -70,21 +70,21 @@ def judged_pixels(
     return Pixels(
         off / max(told, 1),
         float(1 - usable.mean()),
-        _saturated(frames, usable),
+        _saturated(excluded, found, usable),
         float((radius >= BLIND_PX).mean()),
         float(radius.max()),
         (int(hole[0]), int(hole[1])),
     )
 
 
-def _saturated(frames: Array, usable: NDArray[np.bool_]) -> float:
+def _saturated(excluded: Array, found: Relief, usable: NDArray[np.bool_]) -> float:
     """Return the share of readings that are not usable and above nearly all that are."""
     above = 0
-    for read, good in zip(frames, usable, strict=True):
+    for shot, good in enumerate(usable):
         if good.any():
-            above += int((read[~good] >= np.quantile(read[good], 0.99)).sum())
-        else:
-            above += read.size
+            read = found.level[shot] * (1 + found.read[shot])
+            limit = float(np.quantile(read[good], 0.99))
+            above += int((excluded[shot][~good] >= limit).sum())
     return above / usable.size
 
 

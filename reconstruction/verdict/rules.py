@@ -23,16 +23,16 @@ class Limits:
         """Return what a figure speaks for; larger is worse."""
         return LEVELS[(figure > self.doubt) + (figure > self.refuse)]
 
-    def of_shots(self, count: int) -> Limits:
-        """Return the limits for several shots, which an error of Psi sets against one another."""
-        return Limits(self.doubt / count**0.6, self.refuse / count**0.6)
+    def times(self, factor: float) -> Limits:
+        """Return the limits scaled."""
+        return Limits(self.doubt * factor, self.refuse * factor)
 
 
 DISPLACED_PX = Limits(0.28, 0.6)
 STRENGTH_LOST = Limits(0.15, 0.35)
 """Of the masks' shadow, as a share of what Psi says."""
 VIGNETTING = Limits(0.06, 0.3)
-FLICKER = Limits(0.04, 0.15)
+FLICKER = Limits(0.05, 0.15)
 MOTION = Limits(0.075, 0.3)
 """What motion between shots changes, over the mean reading."""
 OFF = Limits(0.015, 0.05)
@@ -43,9 +43,12 @@ LEAST_NOISE = 0.1
 """Of an even scene noise is all there is to miss, and does no harm."""
 NOISE = Limits(0.3, 0.8)
 """Deviation of the readings over their mean."""
-UNEXPLAINED = Limits(0.97, 1.2)
+UNEXPLAINED = Limits(1.1, 1.5)
+"""Beyond 1: the smooth picture alone foretells the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
+ADAPTIVE = 0.7
+"""Of the limits on Psi's errors, for the adaptive methods."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
@@ -104,7 +107,15 @@ def judged(evidence: Evidence) -> Verdict:
 def _shots(e: Evidence) -> Iterator[Reason]:
     if len(e.brightness) < 2:
         return
-    bright = [one or 0.0 for one in e.brightness]
+    for shot in e.left_out:
+        yield Reason(
+            f"shot {shot + 1} was left out: dark, or the same as another",
+            shot + 1,
+            "look at lamp and stage, and take it again",
+            "doubt",
+        )
+    kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
+    bright = [(one or 0.0) if shot in kept else 1.0 for shot, one in enumerate(e.brightness)]
     dark = [shot for shot, one in enumerate(bright, 1) if one < DARK]
     if dark:
         yield Reason(
@@ -112,10 +123,10 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             "do not use",
         )  # fmt: skip
         return
-    for shot, row in enumerate(e.other_strengths):
+    for shot in kept if len(kept) > 1 else []:
+        row = e.other_strengths[shot]
         own = row[shot] or 0.0
-        others = [(one or 0.0, t) for t, one in enumerate(row) if t != shot]
-        other, t = max(others)
+        other, t = max((one or 0.0, t) for t, one in enumerate(row) if t != shot)
         if other > ANOTHERS and own < ANOTHERS:
             yield Reason(
                 f"shot {shot + 1} shows the masks of shot {t + 1}",
@@ -158,6 +169,15 @@ def _masks_fit(e: Evidence) -> bool:
     return weakest is not None and weakest[0] > 1 - STRENGTH_LOST.refuse
 
 
+def _patience(e: Evidence, power: float) -> float:
+    """Return by how much errors of Psi weigh less than on one shot reconstructed by tv.
+
+    They set several shots against one another, and mislead methods that look for disparities.
+    """
+    shots = sum(one is not None for one in e.strengths)
+    return shots**-power * (ADAPTIVE if e.method.startswith("adaptive") else 1)
+
+
 def _masks(e: Evidence) -> Iterator[Reason]:
     """Of all that may be wrong with the masks, the one reason that the readings speak most for."""
     weakest = _strength(e)
@@ -168,9 +188,8 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     changes = {name: one for name, one in e.changes.items() if None not in one}
     likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
     drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
-    shots = len(e.strengths)
-    weak = STRENGTH_LOST.of_shots(shots).level(lost)
-    displaced = DISPLACED_PX.of_shots(shots).level(moved)
+    weak = STRENGTH_LOST.times(_patience(e, 0.4)).level(lost)
+    displaced = DISPLACED_PX.times(_patience(e, 0.6)).level(moved)
     if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
         yield Reason(
             f"the masks' shadow lies about {moved:.2f} pixels from where Psi says",
@@ -188,7 +207,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
             f"the outermost rays seem to lose {min(darker, 1):.0%} more than Psi says",
             darker,
             "measure Psi with whiteboards at this aperture, or close the aperture",
-            VIGNETTING.of_shots(shots).level(darker - 2 * deviation),
+            VIGNETTING.times(_patience(e, 0.6)).level(darker - 2 * deviation),
         )
 
 
@@ -218,7 +237,7 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
         f"{e.saturated:.0%} of the readings are saturated",
         e.saturated,
         "expose less, or bracket",
-        SATURATED.level(e.saturated),
+        SATURATED.level(e.saturated / len(e.strengths) ** 0.25),
     )
     yield Reason(
         f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "
@@ -265,8 +284,8 @@ def _search(e: Evidence) -> Iterator[Reason]:
 def _fit(e: Evidence) -> Iterator[Reason]:
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
-            f"only {max(e.explained, 0):.0%} of what readings kept from the fit show is explained",
+            "readings kept from the fit are foretold worse than by a smooth picture",
             e.explained,
-            "another method, or more shots",
+            "take another method, or more shots",
             UNEXPLAINED.level(1 - e.explained),
         )

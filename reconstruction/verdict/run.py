@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +13,8 @@ from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.evidence import gathered
+from reconstruction.screening import screened
+from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import Verdict, judged
 
@@ -33,9 +35,20 @@ def reconstruct_judged(
 
     The light field is that of all readings but the few kept, which costs it next to nothing.
     """
-    _, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    settings = settings or MethodSettings()
+    fitted, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    told: tuple[str, ...] = ()
+    left_out: tuple[int, ...] = ()
+    saturated = ~usable
+    if settings.screening:
+        seen = screened(psi, fitted, usable)
+        fitted, usable, told = seen.frames, seen.usable, seen.told
+        left_out = tuple(sorted((*seen.dark, *seen.double)))
+        settings = settings.model_copy(update={"screening": False})
     kept = kept_readings(usable)
     result = reconstruct(
-        name, psi, frames, noise_sigma, dictionary, settings, usable & ~kept, on_step
+        name, psi, fitted, noise_sigma, dictionary, settings, usable & ~kept, on_step
     )
-    return result, judged(gathered(psi, frames, noise_sigma, usable, kept, result))
+    result = dataclasses.replace(result, screening=told)
+    read = Read(fitted, usable, kept, np.where(saturated, frames, 0), left_out)
+    return result, judged(gathered(psi, read, noise_sigma, result))

@@ -48,20 +48,21 @@ class Shots:
 
 def compared(psi: ImagingMatrix, found: Relief) -> Shots:
     """Return how the shots agree."""
-    common = found.good.all(axis=0)
+    kept = np.flatnonzero(found.good.any(axis=(1, 2)))
+    common = found.good[kept].all(axis=0)
     ratio = np.ones(psi.shots)
     if common.any():
-        for shot in range(psi.shots):
+        for shot in kept:
             level = found.level[shot][common].astype(np.float64)
             read = level * (1 + found.read[shot][common])
             said = level * (1 + found.masks[shot][common])
             ratio[shot] = read.sum() / max(said.sum(), 1e-12)
     motion = None
-    if psi.shots > 1 and common.any() and _viewpoints_apart(psi) < SAME_VIEWPOINT:
+    if len(kept) > 1 and common.any() and _viewpoints_apart(psi) < SAME_VIEWPOINT:
         detail = (1 + found.read) / np.maximum(1 + found.masks, 0.05)
         detail = np.where(found.good, detail, 1) / np.maximum(ratio, 1e-3)[:, None, None]
-        motion = _motion(detail, found)
-    return Shots(ratio / ratio.mean(), cross_strength(found), motion)
+        motion = _motion(detail, found, kept)
+    return Shots(ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(found), motion)
 
 
 def _viewpoints_apart(psi: ImagingMatrix) -> float:
@@ -76,8 +77,8 @@ def _viewpoints_apart(psi: ImagingMatrix) -> float:
     return float(np.linalg.norm(middle[:, None] - middle[None], axis=-1).max())
 
 
-def _motion(detail: Array, found: Relief) -> Motion:
-    """Return the worst motion of the detail (shot, y, x) against the first shot."""
+def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> Motion:
+    """Return the worst motion of the detail (shot, y, x) against the first of the shots kept."""
     rows, columns = detail.shape[1:]
     grey = found.picture.mean(axis=-1)
     grey = cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -87,9 +88,10 @@ def _motion(detail: Array, found: Relief) -> Motion:
         pictures = [
             _blurred(one, good, blur) * grey for one, good in zip(detail, found.good, strict=True)
         ]
-        for shot in range(1, len(pictures)):
-            slope_y, slope_x = np.gradient((pictures[0] + pictures[shot]) / 2)
-            change = pictures[0] - pictures[shot]
+        first = pictures[kept[0]]
+        for shot in map(int, kept[1:]):
+            slope_y, slope_x = np.gradient((first + pictures[shot]) / 2)
+            change = first - pictures[shot]
             for y, x in tiles((rows, columns)):
                 size, steepness = _moved(slope_y[y, x], slope_x[y, x], change[y, x], blur)
                 if size * steepness / mean > worst.effect:

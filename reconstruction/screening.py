@@ -1,0 +1,217 @@
+"""Frames before they are reconstructed: what does not fit the others is left out or evened.
+
+Needs no more than Psi and the frames: a smooth picture that explains their local means predicts
+every reading but for the scene's fine texture, which is alike in all shots and in neighbouring
+pixels. A dark shot, a shot that is another one again, a lamp that flickers and a bad pixel are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.choices import smooth_guess
+from reconstruction.neighbour_kernels import neighbour_range
+
+Array = NDArray[np.floating]
+DARK_SHARE = 0.02
+"""Of the brightest shot's brightness, below which a shot is called dark."""
+ALIKE = 0.25
+"""Share of the expected squared difference of two shots below which they are called the same."""
+LEAST_FLICKER, SURE = 0.003, 4.0
+"""The least flicker evened, and by how many standard errors it must exceed none."""
+GAIN_STEPS = 4
+WELL_LIT, FEWEST_LIT = 0.2, 100
+"""Share of the mean prediction that a pixel must reach to judge a shot's brightness; how many."""
+ALIKE_PX = 5
+"""Side of the patch whose readings err alike."""
+NEIGHBOURS_PX, TAIL, FEWEST = 3, 0.1, 6
+BAD_WIDTHS, LEAST_WIDTHS = 1.5, 0.5
+"""Of the neighbours' range beyond it, from which on a pixel is called bad."""
+FEW_BAD, EASIER = 1e-3, 0.5
+"""The share of bad pixels above which it takes less, and by how much for ten times as many."""
+BAD_STEPS = 3
+LEAST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """frames, usable: (shot, pixel_y, pixel_x), for any method. told: what was done, in words.
+
+    dark, double: shots left out. gains: (shot,), by which the frames were divided, mean 1. bad:
+    (pixel_y, pixel_x), pixels left out.
+    """
+
+    frames: Array
+    usable: NDArray[np.bool_]
+    told: tuple[str, ...]
+    dark: tuple[int, ...]
+    double: tuple[int, ...]
+    gains: Array
+    bad: NDArray[np.bool_]
+
+
+def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Screened:
+    """Return the frames screened.
+
+    frames, usable: (shot, pixel_y, pixel_x), finite where usable. Where nothing is found they
+    come back as they are.
+    """
+    told = []
+    dark = dark_shots(psi, frames, usable)
+    usable = _without(usable, dark)
+    double = double_shots(psi, frames, usable)
+    usable = _without(usable, double)
+    if dark:
+        told.append(f"left out {_shots(dark)}: dark, while the others are not")
+    if double:
+        told.append(
+            f"left out {_shots(double)}: the same as one before, although the masks should have "
+            "moved; look at the stage"
+        )
+    gains = shot_gains(psi, frames, usable)
+    if (gains != 1).any():
+        frames = (frames / gains[:, None, None]).astype(frames.dtype)
+        spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
+        told.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
+    bad = bad_pixels(psi, frames, usable)
+    if bad.any():
+        usable = usable & ~bad
+        told.append(
+            f"left out {int(bad.sum())} pixels ({bad.mean():.2%}) that differ from their neighbours"
+        )
+    return Screened(frames, usable, tuple(told), dark, double, gains, bad)
+
+
+def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Return the shots that no light of the scene reached, while it reached others."""
+    lit = psi.weights.sum(axis=(1, 2, 4), dtype=np.float64)
+    expected = lit.mean(axis=(1, 2)) * psi.binning**2
+    seen = np.array(
+        [
+            float(frame[kept].mean()) if kept.any() else np.nan
+            for frame, kept in zip(frames, usable, strict=True)
+        ]
+    )
+    brightness = seen / np.maximum(expected, 1e-12)
+    if not np.isfinite(brightness).any() or not np.nanmax(brightness) > 0:
+        return ()
+    dark = brightness < DARK_SHARE * np.nanmax(brightness)
+    return tuple(int(shot) for shot in np.flatnonzero(dark))
+
+
+def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Return the shots that repeat another although Psi says that they differ.
+
+    Of two such the one that fits its part of Psi worse is meant.
+    """
+    kept = [shot for shot in range(psi.shots) if usable[shot].any()]
+    predicted = _predicted(psi, frames, usable)
+    found: list[int] = []
+    for place, shot in enumerate(kept):
+        for other in kept[:place]:
+            both = usable[shot] & usable[other]
+            if other in found or shot in found or not both.any():
+                continue
+            expected = _square(predicted[shot] - predicted[other], both)
+            if _square(frames[shot] - frames[other], both) < ALIKE * expected:
+                misfits = [_square(frames[i] - predicted[i], both) for i in (other, shot)]
+                found.append((other, shot)[int(np.argmax(misfits))])
+    return tuple(sorted(found))
+
+
+def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return the brightness of the light in every shot, mean 1; all 1 where none is sure.
+
+    What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
+    every shot: the scene's texture is in all of them. The median over the pixels tells the light.
+    """
+    even = np.ones(psi.shots)
+    kept = np.flatnonzero(usable.any(axis=(1, 2)))
+    if len(kept) < 2:
+        return even
+    gains, error = even.copy(), np.inf
+    for _ in range(GAIN_STEPS):
+        flat = frames / gains[:, None, None]
+        predicted = _predicted(psi, flat, usable)[kept]
+        lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
+        if lit.sum() < FEWEST_LIT:
+            return even
+        ratio = flat[kept][:, lit] / predicted[:, lit]
+        ratio /= np.maximum(ratio.mean(axis=0), 1e-6)
+        middle = np.median(ratio, axis=1)
+        spread = 1.4826 * np.median(np.abs(ratio - middle[:, None]), axis=1).max()
+        # Neighbours err alike.
+        error = 1.2533 * spread / np.sqrt(lit.sum() / ALIKE_PX**2)
+        gains[kept] *= middle
+        gains[kept] /= gains[kept].mean()
+    if np.abs(gains[kept] - 1).max() < max(LEAST_FLICKER, SURE * error):
+        return even
+    return gains
+
+
+def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
+
+    What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
+    among the neighbours that see the same colour, a tenth of them left out at both ends: at an edge
+    or in a texture that range is wide. How far beyond it, in widths of the range, is averaged over
+    the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
+    them: to leave out a good pixel costs little, to miss a bad one much.
+    """
+    k = psi.binning
+    bad = np.zeros(psi.frames_shape[1:], dtype=bool)
+    one_colour = np.zeros(bad.shape, dtype=np.uint8)
+    low, high = np.empty((2, *bad.shape), dtype=np.float32)
+    widths = BAD_WIDTHS
+    for _ in range(BAD_STEPS):
+        kept = usable & ~bad
+        if not kept.any():
+            break
+        predicted = _predicted(psi, frames, kept)
+        score, count = np.zeros(bad.shape), np.zeros(bad.shape)
+        for shot in np.flatnonzero(kept.any(axis=(1, 2))):
+            least = max(LEAST * float(predicted[shot].mean()), 1e-12)
+            guess = np.maximum(predicted[shot], least)
+            ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
+            colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
+            neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
+            known = np.isfinite(low) & usable[shot]
+            if not known.any():
+                continue
+            width = np.where(known, (high - low) * guess, 1)
+            beyond = np.where(known, np.maximum(low - ratio, ratio - high) * guess, 0)
+            usual = max(float(np.median(width[known])), 1e-12)
+            score += np.maximum(beyond, 0) / np.maximum(width, usual)
+            count += known
+        # Judged anew each time: what a bad neighbour made look bad is good again.
+        bad = score > widths * count
+        widths = BAD_WIDTHS - EASIER * np.log10(max(float(bad.mean()), FEW_BAD) / FEW_BAD)
+        widths = max(widths, LEAST_WIDTHS)
+    return bad
+
+
+def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return what a smooth picture, the same in all views, reads."""
+    picture = smooth_guess(psi, frames, usable).astype(psi.weights.dtype)
+    return psi.forward(np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape)))
+
+
+def _square(difference: Array, where: NDArray[np.bool_]) -> float:
+    return float(np.mean(np.square(difference[where], dtype=np.float64)))
+
+
+def _without(usable: NDArray[np.bool_], shots: tuple[int, ...]) -> NDArray[np.bool_]:
+    if not shots:
+        return usable
+    kept = usable.copy()
+    kept[list(shots)] = False
+    return kept
+
+
+def _shots(shots: tuple[int, ...]) -> str:
+    """Return shots in words, counted from 1."""
+    return ("shot " if len(shots) == 1 else "shots ") + ", ".join(str(shot + 1) for shot in shots)
