@@ -359,6 +359,7 @@ def reconstruct(
             )
         typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
         typer.echo(f"read {out / 'light_field.h5'}")
+        _end_with_verdict(metrics["verdict"], strict)
         return
     with result_folder(out) as folder, shown_progress() as progress:
         bars = Bars(progress)
@@ -380,22 +381,22 @@ def reconstruct(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'pictures'}")
-    _show_verdict(metrics["verdict"])
-    if strict and metrics["verdict"]["level"] == "do not use":
-        raise typer.Exit(1)
+    _end_with_verdict(metrics["verdict"], strict)
 
 
 VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
 
 
-def _show_verdict(verdict: dict) -> None:
-    """Print a verdict: its level, and a line for each reason with its remedy."""
+def _end_with_verdict(verdict: dict, strict: bool) -> None:
+    """Print a verdict, a line for each reason; strict: exit with 1 if it is not to be used."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
         typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
     for reason in verdict["reasons"]:
         what, remedy = reason["what"], reason["remedy"]
         typer.secho(f"{reason['level']}: {what}; {remedy}", fg=VERDICT_COLOURS[reason["level"]])
+    if strict and verdict["level"] == "do not use":
+        raise typer.Exit(1)
 
 
 @app.command()

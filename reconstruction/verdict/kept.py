@@ -15,9 +15,11 @@ FEWEST = 30
 SHARE = 0.015
 """Of the usable readings that are kept from every fit; more of few, so that WANTED are."""
 WANTED, MOST_SHARE = 150, 0.04
+SEED = 1
+"""Other than that of the readings which `adaptive` keeps for its standard deviation."""
 
 
-def kept_readings(usable: NDArray[np.bool_], seed: int = 0) -> NDArray[np.bool_]:
+def kept_readings(usable: NDArray[np.bool_], seed: int = SEED) -> NDArray[np.bool_]:
     """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit, at random."""
     share = min(max(SHARE, WANTED / max(int(usable.sum()), 1)), MOST_SHARE)
     return usable & (np.random.default_rng(seed).random(usable.shape) < share)

@@ -36,19 +36,49 @@ def reconstruct_judged(
     The light field is that of all readings but the few kept, which costs it next to nothing.
     """
     settings = settings or MethodSettings()
-    fitted, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    told: tuple[str, ...] = ()
-    left_out: tuple[int, ...] = ()
-    saturated = ~usable
-    if settings.screening:
-        seen = screened(psi, fitted, usable)
-        fitted, usable, told = seen.frames, seen.usable, seen.told
-        left_out = tuple(sorted((*seen.dark, *seen.double)))
-        settings = settings.model_copy(update={"screening": False})
-    kept = kept_readings(usable)
+    read, told = _as_fitted(psi, frames, noise_sigma, usable, settings.screening)
     result = reconstruct(
-        name, psi, fitted, noise_sigma, dictionary, settings, usable & ~kept, on_step
+        name,
+        psi,
+        read.frames,
+        noise_sigma,
+        dictionary,
+        settings.model_copy(update={"screening": False}),
+        read.usable & ~read.kept,
+        on_step,
     )
     result = dataclasses.replace(result, screening=told)
-    read = Read(fitted, usable, kept, np.where(saturated, frames, 0), left_out)
     return result, judged(gathered(psi, read, noise_sigma, result))
+
+
+def verdict_of(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
+    result: Reconstruction,
+    screening: bool = True,
+) -> Verdict:
+    """Return whether to trust what was found, in tiles say, without the readings `kept`."""
+    read, _ = _as_fitted(psi, frames, noise_sigma, usable, screening)
+    read = dataclasses.replace(read, kept=kept & read.usable)
+    return judged(gathered(psi, read, noise_sigma, result))
+
+
+def _as_fitted(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_] | None,
+    screening: bool,
+) -> tuple[Read, tuple[str, ...]]:
+    """Return the frames as a method gets them, and what was done to them before, in words."""
+    fitted, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    excluded = np.where(usable, 0, frames)
+    if not screening:
+        return Read(fitted, usable, kept_readings(usable), excluded), ()
+    seen = screened(psi, fitted, usable)
+    left_out = tuple(sorted((*seen.dark, *seen.double)))
+    read = Read(seen.frames, seen.usable, kept_readings(seen.usable), excluded, left_out)
+    return read, seen.told
