@@ -144,7 +144,8 @@ def test_few_readings_are_kept_and_the_same_each_time(three):
     usable = everywhere(three)
     usable[0, :20] = False
     kept = kept_readings(usable)
-    assert 0.01 < kept.sum() / usable.sum() < 0.03
+    # 150 of 7,936: a larger share of a small capture.
+    assert 0.012 < kept.sum() / usable.sum() < 0.025
     assert not kept[~usable].any()
     np.testing.assert_array_equal(kept, kept_readings(usable))
 

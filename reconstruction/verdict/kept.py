@@ -12,7 +12,7 @@ from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 FEWEST = 30
-SHARE = 0.015
+SHARE = 0.003
 """Of the usable readings that are kept from every fit; more of few, so that WANTED are."""
 WANTED, MOST_SHARE = 150, 0.04
 SEED = 1
