@@ -186,10 +186,11 @@ def test_a_fault_is_told_with_its_reason_and_a_remedy(fault, strength, reason):
     assert told[0].remedy
 
 
-def test_a_shot_that_screening_left_out_is_told():
-    verdict = judged_trial("missing-shot", 1)
+def test_many_shots_that_screening_left_out_are_told_and_few_are_not():
+    verdict = judged_trial("missing-shot", 2)
     assert verdict.level == "doubt"
-    assert "shot 3 was left out" in verdict.words
+    assert "2 of 3 shots were left out, dark or the same as another: 2, 3" in verdict.words
+    assert judged_trial("missing-shot", 1).level == "trust"
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])

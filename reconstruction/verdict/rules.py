@@ -49,6 +49,7 @@ UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
 ADAPTIVE = 0.7
 """Of the limits on Psi's errors, for the adaptive methods."""
+LEFT_OUT = Limits(0.4, 1.0)
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
@@ -107,12 +108,15 @@ def judged(evidence: Evidence) -> Verdict:
 def _shots(e: Evidence) -> Iterator[Reason]:
     if len(e.brightness) < 2:
         return
-    for shot in e.left_out:
+    if e.left_out:
+        share = len(e.left_out) / len(e.brightness)
+        shots = ", ".join(str(shot + 1) for shot in e.left_out)
         yield Reason(
-            f"shot {shot + 1} was left out: dark, or the same as another",
-            shot + 1,
-            "look at lamp and stage, and take it again",
-            "doubt",
+            f"{len(e.left_out)} of {len(e.brightness)} shots were left out, dark or the same as "
+            f"another: {shots}",
+            share,
+            "look at lamp and stage, and take them again",
+            LEFT_OUT.level(share),
         )
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
     bright = [(one or 0.0) if shot in kept else 1.0 for shot, one in enumerate(e.brightness)]
@@ -189,7 +193,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
     drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
     weak = STRENGTH_LOST.times(_patience(e, 0.4)).level(lost)
-    displaced = DISPLACED_PX.times(_patience(e, 0.6)).level(moved)
+    displaced = DISPLACED_PX.times(_patience(e, 0.85)).level(moved)
     if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
         yield Reason(
             f"the masks' shadow lies about {moved:.2f} pixels from where Psi says",
