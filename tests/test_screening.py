@@ -1,0 +1,144 @@
+"""Frames are screened: what is wrong is found, what is right is left alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.stability.faults import FAULTS, trial
+from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.neighbour_kernels import neighbour_range
+from reconstruction.screening import bad_pixels, screened
+
+SIZE = (48, 64)
+CAMERA = find_camera("rgbw-bayer-3shots")
+
+
+def made(name, strength, camera=CAMERA, scene="near-planar"):
+    return trial(FAULTS[name], strength, scene, camera, SIZE, zoom=3)
+
+
+def screen(one):
+    return screened(one.psi, one.readings, one.usable)
+
+
+def test_the_range_of_neighbours_is_that_of_numpy():
+    rng = np.random.default_rng(0)
+    values = rng.random((9, 11)).astype(np.float32)
+    colours = rng.integers(0, 2, (9, 11), dtype=np.uint8)
+    good = rng.random((9, 11)) < 0.7
+    low, high = np.empty((2, 9, 11), np.float32)
+    neighbour_range(values, colours, good, 2, 0.1, 4, low, high)
+    for y, x in np.ndindex(9, 11):
+        near = np.s_[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3]
+        kept = good[near] & (colours[near] == colours[y, x])
+        kept[min(y, 2), min(x, 2)] = False
+        around = np.sort(values[near][kept])
+        if len(around) < 4:
+            assert (low[y, x], high[y, x]) == (-np.inf, np.inf)
+        else:
+            step = int(0.1 * (len(around) - 1) + 0.5)
+            assert (low[y, x], high[y, x]) == (around[step], around[-1 - step])
+
+
+@pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "rgbw-mono"])
+def test_good_frames_pass_as_they_are(camera):
+    one = made("bad-pixels", 0, find_camera(camera))
+    seen = screen(one)
+    assert seen.frames is one.readings
+    assert not seen.dark
+    assert not seen.double
+    assert (seen.gains == 1).all()
+    assert seen.bad.mean() < 0.005
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_dark_and_double_shots_are_left_out(count):
+    last = tuple(range(3 - count, 3))
+    for name, kind in (("missing-shot", "dark"), ("repeated-shot", "double")):
+        seen = screen(made(name, count))
+        assert getattr(seen, kind) == last
+        assert not seen.usable[list(last)].any()
+        assert seen.usable[0].mean() > 0.99
+        assert seen.told[0].startswith("left out shot")
+
+
+def test_a_mask_that_is_to_stand_still_repeats_its_shots():
+    still = CAMERA.model_copy(update={"shots": (CAMERA.shots[0],) * 2})
+    seen = screen(made("flicker", 0, still))
+    assert seen.double == ()
+
+
+@pytest.mark.parametrize("percent", [3, 30])
+def test_flicker_is_measured_and_evened(percent):
+    one = made("flicker", percent)
+    seen = screen(one)
+    real = one.readings.mean(axis=(1, 2)) / made("flicker", 0).readings.mean(axis=(1, 2))
+    assert seen.gains == pytest.approx(real / real.mean(), rel=0.01)
+    assert seen.frames == pytest.approx(one.readings / seen.gains[:, None, None], rel=1e-5)
+
+
+@pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "scenario-ii-cfa"])
+@pytest.mark.parametrize("percent", [3, 10])
+def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
+    described = find_camera(camera)
+    one, told = (made(name, percent, described) for name in ("bad-pixels", "masked-pixels"))
+    bad = ~told.usable[0]
+    # A dead pixel in the shade, or one that hardly glows, does no harm.
+    harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
+    found = bad_pixels(one.psi, one.readings, one.usable)
+    assert harmful[bad].mean() > 0.5
+    assert found[bad & harmful].mean() > 0.7
+    assert found[~bad].mean() < 0.05
+
+
+def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
+    told = made("masked-pixels", 10)
+    found = bad_pixels(told.psi, told.readings, told.usable)
+    assert not found[~told.usable[0]].any()
+    assert found[told.usable[0]].mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "strength", "least_db"),
+    [
+        ("bad-pixels", 3, 1.0),
+        ("flicker", 20, 5.0),
+        ("missing-shot", 1, 5.0),
+        ("repeated-shot", 1, 4),
+    ],
+)
+def test_screening_mends_what_would_break_a_method(name, strength, least_db):
+    one = made(name, strength)
+    told, levels = [], []
+    for screening in (True, False):
+        settings = MethodSettings(screening=screening)
+        result = reconstruct("tv", one.psi, one.readings, one.noise_sigma, None, settings)
+        levels.append(psnr_db(result.light_field, one.truth))
+        told.append(result.screening)
+    assert levels[0] > levels[1] + least_db
+    assert told[0]
+    assert told[1] == ()
+
+
+@pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
+def test_screening_costs_good_frames_next_to_nothing(method):
+    one = made("flicker", 0)
+    levels = [
+        psnr_db(
+            reconstruct(
+                method, one.psi, one.readings, one.noise_sigma, None, MethodSettings(screening=on)
+            ).light_field,
+            one.truth,
+        )
+        for on in (True, False)
+    ]
+    assert abs(levels[0] - levels[1]) < 0.1
+
+
+def test_nothing_is_found_where_nothing_is_to_be_seen():
+    one = made("flicker", 0)
+    dark = dataclasses.replace(one, readings=np.zeros_like(one.readings))
+    assert screen(dark).told == ()

@@ -1,0 +1,259 @@
+"""Faults: each does what its name says, no more the weaker it is, and nothing at zero strength."""
+
+import numpy as np
+import pytest
+
+from calibration.placement import designed_placement
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.lightfield import save_views
+from emmc_rig.stability.faults import FAULTS, find_fault, trial
+from emmc_rig.stability.mask_faults import misplaced_psi
+from emmc_rig.stability.shot_faults import flicker_gains
+from emmc_rig.stability.trial import NotApplicableError, Setup
+from simulators import changes
+from simulators.scenes import render
+
+SCENE, SIZE = "near-planar", (32, 40)
+CAMERA = find_camera("rgbw-bayer-3shots")
+MISPLACED = ("mask-shift", "mask-rotation", "mask-distance-error", "mask-scale", "edge-blur")
+FAINT = {
+    **dict.fromkeys(MISPLACED, 1e-4), "vignetting": 1e-4, "flicker": 1e-4, "scene-motion": 1e-4,
+    "camera-motion": 1e-4, "specularity": 1e-3, "read-noise": 1e-3,
+}  # fmt: skip
+
+
+def made(name, strength, **more):
+    chosen = {"scene": SCENE, "camera": CAMERA, "size": SIZE, **more}
+    return trial(FAULTS[name], strength, **chosen)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return made("flicker", 0)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A scene of pictures, larger than what is reconstructed."""
+    folder = tmp_path_factory.mktemp("shed")
+    save_views(folder, render(SCENE, size=(48, 60)).light_field)
+    return str(folder)
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=lambda fault: fault.name)
+def test_a_sweep_goes_one_way(fault):
+    for strengths in (fault.strengths, fault.quick):
+        steps = np.diff(strengths)
+        assert len(steps) >= 2
+        assert (steps > 0).all() or (steps < 0).all()
+    assert fault.explained.endswith(".")
+
+
+@pytest.mark.parametrize("name", [f.name for f in FAULTS.values() if f.clean and 0 in f.strengths])
+def test_no_strength_is_no_fault(name, clean):
+    none = made(name, 0)
+    assert np.array_equal(none.readings, clean.readings)
+    assert none.psi.checksum() == none.true_psi.checksum() == clean.psi.checksum()
+    assert none.usable.all()
+    assert np.array_equal(none.truth, clean.truth)
+
+
+@pytest.mark.parametrize("name", FAINT)
+def test_a_vanishing_fault_vanishes(name, clean):
+    faint = made(name, FAINT[name])
+    off = faint.readings - clean.readings
+    assert np.abs(off).mean() < 1.5 * clean.noise_sigma
+    assert abs(off.mean()) < 1e-3
+    assert faint.psi.relative_difference(faint.true_psi) < 1e-3
+
+
+@pytest.mark.parametrize("name", [*MISPLACED, "vignetting", "repeated-shot"])
+def test_a_stronger_fault_moves_psi_further(name):
+    errors = [
+        one.psi.relative_difference(one.true_psi)
+        for one in (made(name, strength) for strength in FAULTS[name].quick)
+    ]
+    assert errors[0] == 0
+    assert (np.diff(errors) > 0).all()
+
+
+def test_the_method_is_told_the_design_and_the_readings_are_the_real_camera_s():
+    one = made("mask-shift", 2)
+    design = build_imaging_matrix(CAMERA, SIZE)
+    assert one.psi.checksum() == design.checksum()
+    real = np.abs(one.readings - one.true_psi.forward(one.truth)).mean()
+    assumed = np.abs(one.readings - one.psi.forward(one.truth)).mean()
+    assert real < 0.1 * assumed
+
+
+def test_the_placement_of_a_camera_as_designed_is_its_psi():
+    placed = misplaced_psi(CAMERA, SIZE, designed_placement(CAMERA))
+    assert placed.relative_difference(build_imaging_matrix(CAMERA, SIZE)) < 1e-3
+
+
+def test_noise_follows_the_photons():
+    one = made("exposure", 300)
+    clean = one.psi.forward(one.truth)
+    noise = CAMERA.sensor.noise
+    per_shot = 300 / len(CAMERA.shots)
+    variance = clean.mean() / per_shot + (noise.read_noise_electrons**2 + 0.13) / per_shot**2
+    assert np.std(one.readings - clean) == pytest.approx(np.sqrt(variance), rel=0.1)
+    assert one.noise_sigma == pytest.approx(np.sqrt(variance), rel=0.1)
+
+
+def test_read_noise_is_not_clipped_at_black():
+    one = made("read-noise", 3000)
+    missed = one.readings - one.psi.forward(one.truth)
+    per_shot = 15_500 / len(CAMERA.shots)
+    assert missed.std() == pytest.approx(3000 / per_shot, rel=0.05)
+    assert abs(missed.mean()) < 3 * missed.std() / np.sqrt(missed.size)
+
+
+@pytest.mark.parametrize("percent", [10, 60])
+def test_so_many_readings_saturate(percent):
+    one = made("saturation", percent)
+    assert 1 - one.usable.mean() == pytest.approx(percent / 100, abs=0.02)
+    brightest = one.psi.forward(one.truth)
+    assert brightest[~one.usable].mean() > brightest[one.usable].mean()
+
+
+def test_bad_pixels_are_bad_in_every_shot_and_told_only_when_masked(clean):
+    silent, told = made("bad-pixels", 20), made("masked-pixels", 20)
+    assert silent.usable.all()
+    bad = ~told.usable[0]
+    assert (told.usable == told.usable[0]).all()
+    assert bad.mean() == pytest.approx(0.2, abs=0.03)
+    off = np.abs(silent.readings - clean.readings).mean(axis=0)
+    assert np.median(off[bad]) > 20 * np.median(off[~bad])
+
+
+def test_the_lamp_flickers_between_shots_alone(clean):
+    one = made("flicker", 30)
+    gains = flicker_gains(3, 30, 0)
+    assert gains.mean() == pytest.approx(1)
+    assert np.std(np.log(gains)) == pytest.approx(0.3)
+    ratio = one.readings.mean(axis=(1, 2)) / clean.readings.mean(axis=(1, 2))
+    assert ratio == pytest.approx(gains, rel=0.01)
+
+
+def test_missing_shots_are_dark_and_repeated_ones_alike(clean):
+    dark = made("missing-shot", 1)
+    assert abs(dark.readings[2].mean()) < 1e-3
+    assert np.abs(dark.readings[:2] - clean.readings[:2]).mean() < 0.01
+    double = made("repeated-shot", 1)
+    assert np.abs(double.readings[2] - double.readings[1]).mean() < 0.02
+    assert np.abs(clean.readings[2] - clean.readings[1]).mean() > 0.1
+    with pytest.raises(NotApplicableError, match="3 of 3 shots"):
+        made("missing-shot", 3)
+
+
+@pytest.mark.parametrize("name", ["scene-motion", "camera-motion"])
+def test_the_first_shot_sees_the_truth_and_later_ones_do_not(name, clean):
+    one = made(name, 3)
+    off = np.abs(one.readings - clean.readings).mean(axis=(1, 2))
+    assert off[0] < 0.005
+    assert off[2] > off[1] > 2 * off[0]
+    assert np.array_equal(one.truth, clean.truth)
+
+
+def test_a_measured_scene_moves_as_a_built_in_one_does(measured):
+    still, turned = (made("camera-motion", px, scene=measured) for px in (0, 2))
+    off = np.abs(turned.readings - still.readings).mean(axis=(1, 2))
+    assert off[2] > off[1] > 3 * off[0]
+    with pytest.raises(NotApplicableError, match="smaller --size"):
+        made("camera-motion", 8, scene=measured)
+
+
+def test_a_moved_world_is_the_picture_moved():
+    plain = render(SCENE, (1, 1), (48, 64)).light_field
+    moved = render(
+        SCENE, (1, 1), (48, 64), 0, lambda world: changes.moved(world, 4 / 64, 0, True)
+    ).light_field
+    assert np.abs(moved[..., 4:, :] - plain[..., :-4, :]).mean() < 2e-3
+
+
+def test_the_background_stands_while_things_move():
+    plain = render(SCENE, (1, 1), (48, 64)).light_field
+    moved = render(SCENE, (1, 1), (48, 64), 0, lambda w: changes.moved(w, 0.02, 0)).light_field
+    same = np.abs(moved - plain).max(axis=-1) < 1e-3
+    assert 0.2 < same.mean() < 0.9
+
+
+@pytest.mark.parametrize("px", [2, 8])
+def test_disparities_span_what_is_asked(px):
+    one = made("disparity-range", px)
+    assert np.ptp(one.disparity_px) == pytest.approx(px, rel=0.05)
+
+
+@pytest.mark.parametrize("percent", [20, 60])
+def test_leaves_hide_the_share_asked_for(percent, clean):
+    one = made("occlusion", percent)
+    hidden = (one.disparity_px > clean.disparity_px.max() + 1e-3).mean()
+    assert hidden == pytest.approx(percent / 100, abs=0.08)
+
+
+def test_mirrors_show_other_things_in_every_view(clean):
+    def spread(one):
+        return np.abs(one.truth - one.truth[2, 2]).mean()
+
+    one = made("specularity", 60)
+    assert 0.5 < one.truth.mean() / clean.truth.mean() < 1.5
+    assert spread(one) > 1.2 * spread(clean)
+
+
+def test_contrast_fades_towards_the_mean_and_the_peak_with_it(clean):
+    one = made("contrast", 10)
+    assert one.truth.std(axis=(0, 1, 2, 3)) == pytest.approx(
+        0.1 * clean.truth.std(axis=(0, 1, 2, 3)), rel=1e-3
+    )
+    assert one.truth.mean() == pytest.approx(clean.truth.mean(), rel=1e-3)
+    assert one.peak == 0.1
+
+
+def test_designs_are_told_to_the_method():
+    for name, strength in (("mask-cell", 4), ("mask-distance", 2), ("shots", 2), ("r", 0.25)):
+        one = made(name, strength)
+        assert one.psi.checksum() == one.true_psi.checksum()
+        assert one.usable.all()
+    assert made("shots", 2).psi.shots == 2
+    assert made("r", 1 / 16).readings.shape == (3, 8, 10)
+    views = made("views", 7)
+    assert views.truth.shape[:2] == (7, 7)
+    # The same aperture, cut finer: the outermost views see a little further apart than five do.
+    assert np.ptp(views.disparity_px) == pytest.approx(
+        np.ptp(made("views", 5).disparity_px) * 5 / 7, rel=0.02
+    )
+
+
+def test_a_mask_on_the_sensor_codes_all_views_alike():
+    weights = made("mask-distance", 0).psi.weights
+    assert np.allclose(weights, weights[:, :1, :1], atol=1e-6)
+    assert not np.allclose(*made("mask-distance", 1).psi.weights[0, 0, :2], atol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["disparity-range", "occlusion", "specularity", "scene-motion"])
+def test_a_measured_scene_is_not_made_up(name, measured):
+    with pytest.raises(NotApplicableError, match="built-in scenes only"):
+        made(name, 2, scene=measured)
+
+
+def test_what_a_camera_cannot_have_is_told():
+    aperture = find_camera("coded-aperture-random")
+    for name in ("mask-shift", "mask-cell"):
+        with pytest.raises(NotApplicableError, match="one mask"):
+            made(name, 1, camera=aperture)
+    with pytest.raises(NotApplicableError, match="were not measured"):
+        FAULTS["views"].make(Setup("nowhere", CAMERA, SIZE), 9)
+
+
+def test_equal_seeds_make_equal_trials():
+    one, same, other = (made("bad-pixels", 10, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(one.readings, same.readings)
+    assert not np.array_equal(one.readings, other.readings)
+
+
+def test_a_misspelt_fault_names_the_nearest():
+    with pytest.raises(AppError, match="did you mean 'mask-shift'"):
+        find_fault("maskshift")
