@@ -209,6 +209,7 @@ def demo(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'report.html'}")
+    _end_with_verdict(metrics["verdict"], strict=False)
 
 
 @app.command()
