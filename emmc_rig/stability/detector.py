@@ -2,9 +2,9 @@
 
 A result is broken when it lost more than 3 dB against that of the same capture without the fault,
 good when it lost 1 dB or less. It is poor when it lost 3 dB or less but had little to lose: without
-the fault another method of those measured was 2 dB better. What is poor or between may be flagged
-or not. Rows keep the evidence, from which verdicts are made anew: changed rules need no new
-measurement.
+the fault it was within 5 dB of a picture of one even colour, or another method of those measured
+was 2 dB better. What is poor or between may be flagged or not. Rows keep the evidence, from which
+verdicts are made anew: changed rules need no new measurement.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from emmc_rig import __version__
@@ -25,7 +26,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of, open_folder
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
-from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.reconstruct import open_dictionary
@@ -41,8 +42,8 @@ from simulators.scenes import SCENES
 
 ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
 NONE, ALL = "none", "all"
-REVISION = 1
-BROKEN_DB, GOOD_DB, POOR_DB = 3.0, 1.0, 2.0
+REVISION = 2
+BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
 KINDS = (SENSOR, MASK, SHOTS)
 """Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
 
@@ -231,8 +232,9 @@ def _row(method: str, given: Trial) -> dict:
     except (ReconstructionError, ModelError) as fault:
         return {"refused": str(fault)}
     level = psnr_db(found.light_field, given.truth) + 20 * math.log10(given.peak)
-    view = psnr_db(replicate_centre(given.truth), given.truth) + 20 * math.log10(given.peak)
-    return {"psnr_db": level, "view_db": view, "evidence": verdict.evidence.as_dict()}
+    even = np.broadcast_to(given.truth.mean(axis=(0, 1, 2, 3)), given.truth.shape)
+    even_db = psnr_db(even, given.truth) + 20 * math.log10(given.peak)
+    return {"psnr_db": level, "even_db": even_db, "evidence": verdict.evidence.as_dict()}
 
 
 @lru_cache(maxsize=4)
@@ -254,7 +256,7 @@ def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
             continue
         level = harmless["psnr_db"]
         rival = best[replace(case.harmless, method="")]
-        little = level < rival - POOR_DB
+        little = level < max(rival - POOR_DB, harmless["even_db"] + EVEN_DB)
         verdict = judged(Evidence.from_dict(row["evidence"]))
         found.append(Judged(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
     return found
