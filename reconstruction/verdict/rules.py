@@ -43,7 +43,7 @@ LEAST_NOISE = 0.1
 """Of an even scene noise is all there is to miss, and does no harm."""
 NOISE = Limits(0.3, 0.8)
 """Deviation of the readings over their mean."""
-UNEXPLAINED = Limits(1.1, 1.5)
+UNEXPLAINED = Limits(0.75, 1.1)
 """Beyond 1: the smooth picture alone foretells the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
@@ -288,7 +288,8 @@ def _search(e: Evidence) -> Iterator[Reason]:
 def _fit(e: Evidence) -> Iterator[Reason]:
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
-            "readings kept from the fit are foretold worse than by a smooth picture",
+            f"{max(e.explained, 0):.0%} of what readings kept from the fit show beyond a smooth "
+            "picture is explained",
             e.explained,
             "take another method, or more shots",
             UNEXPLAINED.level(1 - e.explained),
