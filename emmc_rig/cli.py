@@ -18,7 +18,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
@@ -370,6 +370,8 @@ def reconstruct(
             lambda step: bars.advance(step), why,
         )  # fmt: skip
         bars.finish()
+    for line in metrics["screening"]:
+        console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
@@ -646,7 +648,9 @@ def stability(
     from emmc_rig.stability.run import StabilityStopped
 
     if faults:
-        table = Table("fault", "unit", "strengths", "what happens", box=SIMPLE)
+        table = Table(
+            Column("fault", no_wrap=True), "unit", "strengths", "what happens", box=SIMPLE
+        )
         for one in FAULTS.values():
             table.add_row(
                 one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained

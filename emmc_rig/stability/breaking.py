@@ -89,15 +89,16 @@ def told(found: Span | None, strengths: Sequence[float]) -> str:
     """Return a span as what the table says of it."""
     if found is None:
         return "already at the mildest"
-    low, high = (
-        None if place is None else f"{strength_at(strengths, place):.2g}"
-        for place in (found.low, found.high)
-    )
-    if high is None:
-        # plain numbers read better than 1e+03
-        return "never" if low is None else f"towards {_plain(low)}"
-    return _plain(high) if low is None else f"{_plain(low)} and {_plain(high)}"
+    words = []
+    if found.low is not None:
+        words.append(f"before {_plain(strength_at(strengths, found.low))}")
+    if found.high is not None:
+        from_there = _plain(strength_at(strengths, found.high))
+        words.append(f"from {from_there}" if words else from_there)
+    return ", ".join(words) or "never"
 
 
-def _plain(text: str) -> str:
-    return f"{float(text):,g}".replace(",", " ")
+def _plain(strength: float) -> str:
+    """Return two digits, as one writes them: 0.042, 12, 340."""
+    rounded = float(f"{strength:.2g}")
+    return f"{rounded:.0f}" if rounded >= 10 else f"{rounded:g}"

@@ -55,8 +55,8 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     head = table_head(("Fault", "Unit", "Kind", *methods))
     body = (
         '<p class="lead">Each cell: where the method falls 3 dB below its best / where it falls '
-        'below the copied centre view. "Never": not within the sweep; two numbers: broken below '
-        "the first and beyond the second.</p>"
+        'below the copied centre view. "Never": not within the sweep; "before": also broken on the '
+        "other side of the best, up to there.</p>"
         f'<div class="scroll"><table class="breaks">{head}'
         f"<tbody>{lines}</tbody></table></div>"
     )

@@ -1,0 +1,284 @@
+"""Sweeps until failure: breaking points, curves, and `emmc-rig stability` end to end."""
+
+import csv
+import html.parser
+import json
+import sys
+
+import pytest
+
+from emmc_rig import cli
+from emmc_rig.demo import Silent
+from emmc_rig.errors import AppError
+from emmc_rig.model.lightfield import save_views
+from emmc_rig.output import METRICS
+from emmc_rig.page import Section
+from emmc_rig.stability import command as stability_command
+from emmc_rig.stability import draw
+from emmc_rig.stability import run as stability_run
+from emmc_rig.stability.breaking import Span, below_best, below_view, span, strength_at, told
+from emmc_rig.stability.command import BREAKS_CSV, POINTS_CSV, run_stability
+from emmc_rig.stability.curves import POOLED, curves
+from emmc_rig.stability.faults import FAULTS
+from emmc_rig.stability.plan import Point, planned, stability_settings
+from emmc_rig.stability.rows import breaking_rows
+from emmc_rig.stability.run import POINTS, StabilityStopped
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from simulators.scenes import render
+
+SIZE = (24, 32)
+
+
+def quick(**more):
+    chosen = {"methods": ("tv",), "faults": ("flicker",), "screening": "on", **more}
+    return stability_settings(True, chosen.pop("scenes", ["dark"]), SIZE, **chosen)
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    """Total variation of a few steps: the same path, sooner done."""
+
+    def solved(name, psi, readings, sigma, dictionary, settings, usable):
+        few = {"tv": {"max_steps": 3}, "screening": settings.screening}
+        chosen = MethodSettings.model_validate(few)
+        return reconstruct(name, psi, readings, sigma, dictionary, chosen, usable)
+
+    monkeypatch.setattr(stability_run, "reconstruct", solved)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No charts: they take longer than a few steps do."""
+    monkeypatch.setattr(stability_command, "_written", lambda run, *_: run.folder)
+
+
+class Page(html.parser.HTMLParser):
+    """Collects ids and what is loaded from elsewhere."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.foreign = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href") and not value.startswith(("data:", "#")):
+                self.foreign.append(value)
+
+
+def ends(found):
+    return None if found is None else (found.low, found.high)
+
+
+def test_a_curve_breaks_where_its_line_crosses_three_decibels_below_the_best():
+    # From 29 to 26 the line crosses 27 after two thirds of the way.
+    assert ends(below_best([30, 29, 26, 10])) == (None, pytest.approx(1 + 2 / 3))
+    assert ends(below_best([30, 29, 28])) == (None, None)
+    assert ends(below_best([10, 30, 10])) == pytest.approx((0.85, 1.15))
+    assert below_best([None, None]) is None
+
+
+def test_a_curve_breaks_where_it_crosses_the_copied_view():
+    assert ends(below_view([24, 20, 16], [18, 18, 18])) == (None, pytest.approx(1.5))
+    assert below_view([24, 20, 16], [26, 22, 18]) is None
+    assert ends(below_view([20, 24, 20], [22, 20, 22])) == pytest.approx((1 / 3, 5 / 3))
+    # A flat scene is its centre view, which nothing exceeds.
+    assert ends(below_view([30, 30, 30], [None, 25, 20])) == (0, None)
+
+
+def test_a_method_that_fails_is_broken_from_there_on():
+    assert below_best([30, 29, None]) == Span(None, 2.0)
+    assert span([1, 1, -1], whole=True) == Span(None, 2.0)
+
+
+def test_nothing_lies_between_one_shot_and_two():
+    assert below_best([30, 20, 10], whole=True) == Span(None, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("strengths", "place", "expected"),
+    [((0, 2, 8), 0.5, 1), ((0, 2, 8), 1.5, 4), ((100, 1), 0.5, 10), ((0, 2, 8), 2.0, 8)],
+)
+def test_strengths_are_interpolated_in_ratios_but_from_zero(strengths, place, expected):
+    assert strength_at(strengths, place) == pytest.approx(expected)
+
+
+def test_breaking_points_in_words():
+    strengths = (0.1, 1, 10, 1000)
+    assert told(None, strengths) == "already at the mildest"
+    assert told(Span(None, None), strengths) == "never"
+    assert told(Span(None, 2.5), strengths) == "100"
+    assert told(Span(0.5, None), strengths) == "before 0.32"
+    assert told(Span(1.0, 2.0), strengths) == "before 1, from 10"
+
+
+def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
+    levels = {"a": (30, 20, 10), "b": (20, 18, 14)}
+    results: dict[Point, dict] = {
+        Point(scene, "mask-shift", strength, "tv"): {"psnr_db": level, "view_db": 15}
+        for scene, row in levels.items()
+        for strength, level in zip((0, 1, 4), row, strict=True)
+    }
+    results[Point("a", "occlusion", 0, "tv")] = {"psnr_db": 30, "view_db": 15}
+    results[Point("a", "occlusion", 10, "tv")] = {"failed": "no light"}
+    found = curves(results)
+    pooled = [curve for curve in found if curve.scene == POOLED]
+    assert [curve.levels for curve in pooled] == [(25, 19, 12), (30, None)]
+    rows, methods = breaking_rows(found, POOLED)
+    assert methods == ("tv",)
+    assert [row.title for row in rows] == ["Mask shift", "Occlusion density"]
+    assert rows[1].cells == ("10 / 10",)
+
+
+def test_screening_is_compared_where_it_should_matter():
+    points = planned(quick(faults=("flicker", "mask-shift"), screening="both"))
+    bare = {point.fault for point in points if not point.screened}
+    assert bare == {"flicker"}
+    assert {point.screened for point in planned(quick(screening="off"))} == {False}
+    names = {point.fault for point in planned(stability_settings(False, [], None))}
+    assert names == set(FAULTS)
+    full = {point.method for point in planned(stability_settings(False, [], None))}
+    assert full <= set(METHODS)
+
+
+def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_path):
+    monkeypatch.setattr(draw, "PNG_DPI", 40)
+    shed = tmp_path / "shed"
+    save_views(shed, render("near-planar", size=(30, 36)).light_field)
+    chosen = quick(
+        scenes=["dark", str(shed)], faults=("flicker", "disparity-range"), screening="both"
+    )
+    more = Section("theory", "Theory", "Theory beside it", "<p>expected</p>")
+    outcome = run_stability(chosen, tmp_path / "out", Silent(), [more])
+    folder = tmp_path / "out"
+    assert outcome.curves[0].scene == POOLED
+    assert any("Disparity range" in line and "shed" in line for line in outcome.left_out)
+    with open(folder / POINTS_CSV, newline="") as file:
+        rows = list(csv.DictReader(file))
+    with open(folder / BREAKS_CSV, newline="") as file:
+        breaks = list(csv.DictReader(file))
+    # Flicker twice, screened and not, in two scenes and both together; disparity in one.
+    quick_counts = [len(FAULTS[name].quick) for name in ("flicker", "disparity-range")]
+    assert len(rows) == 4 * quick_counts[0] + quick_counts[1]
+    assert len(breaks) == len(outcome.curves) == 6 + 2
+    page = Page((folder / "stability.html").read_text())
+    assert not page.foreign
+    assert len(page.ids) == len(set(page.ids))
+    assert "theory" in page.ids
+    marks = [name for name in page.ids if name.startswith("mark-")]
+    assert len(marks) == sum(len(curve.levels) for curve in outcome.curves)
+    metrics = json.loads((folder / METRICS).read_text())
+    assert len(metrics["curves"]) == len(outcome.curves)
+    for name in ("dark", "all-scenes-between-shots"):
+        for ending in ("svg", "png"):
+            assert (folder / "charts" / f"{name}.{ending}").stat().st_size > 5000
+
+
+def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp_path):
+    run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
+    lines = (tmp_path / "out" / POINTS).read_text().splitlines()
+    assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
+
+
+def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):
+    calls, once = [], stability_run.reconstruct
+
+    def stopping(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return once(*arguments)
+
+    monkeypatch.setattr(stability_run, "reconstruct", stopping)
+    with pytest.raises(StabilityStopped, match="1 of 4 points are kept"):
+        run_stability(quick(), tmp_path / "out", Silent())
+    run_stability(quick(), tmp_path / "out", Silent())
+    assert len(calls) == 1 + 4
+    kept = (tmp_path / "out" / POINTS).read_text()
+    run_stability(quick(), tmp_path / "out", Silent())
+    assert len(calls) == 1 + 4
+    assert (tmp_path / "out" / POINTS).read_text() == kept
+    run_stability(quick(seed=1), tmp_path / "out", Silent())
+    assert len(calls) == 1 + 8
+
+
+def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
+    def failing(name, psi, readings, *others):
+        if readings[2].mean() < 0.01:
+            raise ReconstructionError("no light in shot 3")
+        return reconstruct(name, psi, readings, *others)
+
+    monkeypatch.setattr(stability_run, "reconstruct", failing)
+    outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
+    (curve,) = outcome.curves
+    assert curve.levels[1:] == (None, None)
+    assert told(curve.below_best(), curve.strengths) == "1"
+    assert any("no light in shot 3" in line for line in outcome.left_out)
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["emmc-rig", "stability", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        told = capsys.readouterr()
+        return stop.value.code, told.out, " ".join(told.err.split())
+
+    return call
+
+
+def test_the_command_prints_the_table(few_steps, command):
+    code, out, _ = command(
+        "--fast", "--scene", "dark", "--fault", "flicker", "--method", "tv", "--size", "24x32"
+    )
+    assert code == 0
+    assert "Lamp flicker" in out
+    assert "not screened" in " ".join(out.split())
+    assert "stability.html" in out
+
+
+def test_the_command_lists_its_faults(command):
+    code, out, _ = command("--list")
+    assert code == 0
+    for name in FAULTS:
+        assert name in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--fault", "flikker"), "--fault flikker: did you mean 'flicker'?"),
+        (("--method", "tvv"), "no method 'tvv': did you mean 'tv'?"),
+        (("--size", "8x8"), "--size 8x8: needs 16x16 or more"),
+        (("--camera", "rgbw-mono-1"), "rgbw-mono"),
+        (("--scene", "nowhere"), "nowhere"),
+        (("--scene", "dark", "--scene", "dark"), "two are called 'dark'"),
+        (("--method", "dict-omp", "--dictionary", "none.h5"), "none.h5"),
+        (
+            ("--fault", "mask-shift", "--method", "tv", "--camera", "coded-aperture-random"),
+            "one mask",
+        ),
+    ],
+)
+def test_wrong_input_is_one_line_and_leaves_nothing_half_written(
+    few_steps, undrawn, command, tmp_path, arguments, line
+):
+    small = () if "--size" in arguments else ("--size", "24x32")
+    code, _, err = command("--fast", *small, *arguments)
+    assert code == 1
+    assert line in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "emmc-stability" / "stability.html").exists()
+
+
+def test_another_folder_s_content_is_left_alone(few_steps, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    with pytest.raises(AppError, match="holds something else than an earlier sweep"):
+        run_stability(quick(), tmp_path / "mine", Silent())
