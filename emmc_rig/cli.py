@@ -383,8 +383,6 @@ def reconstruct(
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    for line in metrics["screening"]:
-        typer.echo(f"screened: {line}")
     typer.echo(f"open {out / 'pictures'}")
     _end_with_verdict(metrics["verdict"], strict)
 
