@@ -208,6 +208,7 @@ def demo(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'report.html'}")
+    _end_with_verdict(metrics["verdict"], strict=False)
 
 
 @app.command()
@@ -315,6 +316,9 @@ def reconstruct(
         Path | None,
         typer.Option("--chart", help="of `emmc-rig chart`, to choose by (default: the shipped)"),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
+    ] = False,
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
@@ -355,6 +359,7 @@ def reconstruct(
             )
         typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
         typer.echo(f"read {out / 'light_field.h5'}")
+        _end_with_verdict(metrics["verdict"], strict)
         return
     with result_folder(out) as folder, shown_progress() as progress:
         bars = Bars(progress)
@@ -378,6 +383,22 @@ def reconstruct(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'pictures'}")
+    _end_with_verdict(metrics["verdict"], strict)
+
+
+VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
+
+
+def _end_with_verdict(verdict: dict, strict: bool) -> None:
+    """Print a verdict, a line for each reason; strict: exit with 1 if it is not to be used."""
+    colour = VERDICT_COLOURS[verdict["level"]]
+    if not verdict["reasons"]:
+        typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
+    for reason in verdict["reasons"]:
+        what, remedy = reason["what"], reason["remedy"]
+        typer.secho(f"{reason['level']}: {what}; {remedy}", fg=VERDICT_COLOURS[reason["level"]])
+    if strict and verdict["level"] == "do not use":
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -590,8 +611,11 @@ def stability(
         ),
     ] = None,
     camera: Annotated[
-        str, typer.Option("--camera", help="a shipped camera or a YAML file")
-    ] = "rgbw-bayer-3shots",
+        str | None,
+        typer.Option(
+            "--camera", help="a shipped camera or a YAML file (default: rgbw-bayer-3shots)"
+        ),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
@@ -618,6 +642,9 @@ def stability(
         bool,
         typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
     ] = False,
+    verdicts: Annotated[
+        bool, typer.Option("--verdicts", help="instead: how well verdicts tell broken results")
+    ] = False,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
@@ -628,7 +655,7 @@ def stability(
     from emmc_rig.stability.beside import measure_beside
     from emmc_rig.stability.command import run_stability
     from emmc_rig.stability.faults import FAULTS
-    from emmc_rig.stability.plan import planned, stability_settings
+    from emmc_rig.stability.plan import CAMERA, planned, stability_settings
     from emmc_rig.stability.rows import breaking_rows
     from emmc_rig.stability.run import StabilityStopped
 
@@ -642,8 +669,11 @@ def stability(
             )
         Console().print(table)
         return
+    if verdicts:
+        _stability_verdicts(fast, scene, camera, fault, method, _size(size), seed, out)
+        return
     settings = stability_settings(
-        fast, scene or [], _size(size), camera=camera, faults=tuple(fault or []),
+        fast, scene or [], _size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
         screening={None: "both", True: "on", False: "off"}[screening],
     )  # fmt: skip
@@ -671,6 +701,47 @@ def stability(
     for line in outcome.left_out:
         console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
     typer.echo(f"open {outcome.page}")
+
+
+def _stability_verdicts(
+    fast: bool,
+    scenes: list[str] | None,
+    camera: str | None,
+    faults: list[str] | None,
+    methods: list[str] | None,
+    size: tuple[int, int] | None,
+    seed: int,
+    out: Path,
+) -> None:
+    from emmc_rig.stability.detector import detector_settings, run_detector, tables, told, wrong
+
+    settings = detector_settings(
+        fast, scenes or [], camera, faults or [], methods or [], size, seed
+    )
+    try:
+        with shown_progress() as progress:
+            bars = Bars(progress)
+            results = run_detector(settings, out, bars)
+            bars.finish()
+    except KeyboardInterrupt:
+        _fail(f"stopped by Ctrl-C; what is judged is kept in {out}: run it again", INTERRUPTED)
+    table = Table(
+        "fault", "method", "broken: flagged", "good: flagged", "between", "poor", box=SIMPLE
+    )
+    for (name, method), tally in tables(results).items():
+        table.add_row(
+            name,
+            method,
+            f"{tally.broken_flagged} of {tally.broken}",
+            f"{tally.good_flagged} of {tally.good}",
+            f"{tally.between_flagged} of {tally.between}",
+            f"{tally.poor_flagged} of {tally.poor}",
+        )
+    Console().print(table)
+    for one in wrong(results):
+        kind = "missed" if one.kind == "broken" else "false alarm"
+        console.print(f"[yellow]{kind}:[/] {told(one)}", highlight=False, soft_wrap=True)
+    typer.echo(f"open {out / 'verdicts.csv'}")
 
 
 def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:

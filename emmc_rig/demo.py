@@ -36,8 +36,10 @@ from emmc_rig.output import command_line, save_frames, versions, write_metrics
 from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.report import ReportContent, write_report
 from emmc_rig.scene import fine_scene
-from reconstruction.methods import MethodSettings, find_method, reconstruct
+from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.verdict.rules import Verdict
+from reconstruction.verdict.run import reconstruct_judged
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 Array = NDArray[np.floating]
@@ -151,8 +153,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         variance = calibration.reading_variance(frames_dn, exposures_s)
         sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
 
-        def light_field(psi: ImagingMatrix) -> Reconstruction:
-            return reconstruct(
+        def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
+            return reconstruct_judged(
                 settings.method,
                 psi,
                 readings,
@@ -163,9 +165,9 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 lambda p: watcher.step(_told(p)),
             )
 
-        result = light_field(calibration.psi)
+        result, verdict = light_field(calibration.psi)
     with stages("exact Psi, for comparison"):
-        compared = light_field(exact)
+        compared, _ = light_field(exact)
     with stages("evaluate"):
         estimate = result.light_field
         psnr, exact_psnr = psnr_db(estimate, truth), psnr_db(compared.light_field, truth)
@@ -189,6 +191,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "method": result.method,
             "status": result.status,
             "advice": result.advice,
+            "verdict": verdict.as_dict(),
             "steps": result.steps,
             "parameters": result.parameters,
             "seed": settings.seed,

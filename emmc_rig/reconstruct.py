@@ -41,10 +41,15 @@ from emmc_rig.scene import open_scene
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
-from reconstruction.methods import MethodSettings, find_method, reconstruct
-from reconstruction.result import Progress
+from reconstruction.methods import MethodSettings, find_method
+from reconstruction.result import Progress, Reconstruction
 from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
+from reconstruction.verdict.kept import kept_readings
+from reconstruction.verdict.rules import Verdict
+from reconstruction.verdict.run import reconstruct_judged, verdict_of
 
+JUDGED = 512
+"""Rows and columns of the window that a verdict on tiles is by."""
 FRAMES, PSI, LIGHT_FIELD, MAPS = "frames.h5", "psi.h5", "light_field.h5", "maps.h5"
 
 
@@ -161,7 +166,7 @@ def run_reconstruct(
     psi = ImagingMatrix.load(psi_path)
     views = psi.light_field_shape[:2]
     dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
-    result = reconstruct(
+    result, verdict = reconstruct_judged(
         method,
         psi,
         capture.readings,
@@ -177,6 +182,7 @@ def run_reconstruct(
         "status": result.status,
         "advice": result.advice,
         "screening": list(result.screening),
+        "verdict": verdict.as_dict(),
         "steps": result.steps,
         "seconds": result.seconds,
         "parameters": result.parameters,
@@ -210,6 +216,36 @@ def save_maps(path: Path, maps: Mapping[str, NDArray]) -> None:
             file.create_dataset(name, data=values, compression="lzf")
 
 
+def _judged_middle(
+    method: str,
+    psi: SavedPsi,
+    capture: Capture,
+    kept: NDArray[np.bool_],
+    dataset: h5py.Dataset,
+    settings: MethodSettings | None,
+) -> Verdict:
+    """Return the verdict on the middle of a light field in a file, as much as fits into memory."""
+    k = psi.binning
+    rows, columns = (
+        slice(first, first + min(JUDGED, whole))
+        for whole in psi.size
+        for first in [max(0, (whole - JUDGED) // 2 // k * k)]
+    )
+    seen = np.s_[:, rows.start // k : rows.stop // k, columns.start // k : columns.stop // k]
+    found = np.asarray(dataset[:, :, rows, columns])
+    result = Reconstruction(method, found, "in tiles", "", 0, (), 0.0, {})
+    screening = (settings or MethodSettings()).screening
+    return verdict_of(
+        psi.window(rows, columns),
+        capture.readings[seen],
+        capture.noise_sigma,
+        capture.usable[seen],
+        kept[seen],
+        result,
+        screening,
+    )
+
+
 def run_in_tiles(
     folder: Path,
     out: Path,
@@ -230,6 +266,7 @@ def run_in_tiles(
     psi = SavedPsi(psi_path)
     views = psi.window(slice(0, psi.binning), slice(0, psi.binning)).light_field_shape[:2]
     dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
+    kept = kept_readings(capture.usable)
     started = time.perf_counter()
     with h5py.File(out / LIGHT_FIELD, "w") as file:
         dataset = file.create_dataset("light_field", (*views, *psi.size, 3), "f4")
@@ -242,14 +279,16 @@ def run_in_tiles(
             dataset,
             dictionary,
             settings,
-            capture.usable,
+            capture.usable & ~kept,
             tile,
             on_tile=on_tile,
         )
+        verdict = _judged_middle(method, psi, capture, kept, dataset, settings)
     metrics = {
         "method": method,
         "status": "in tiles",
         "advice": "",
+        "verdict": verdict.as_dict(),
         "tiles": len(results),
         "tile": tile,
         "seconds": time.perf_counter() - started,

@@ -368,7 +368,7 @@ FIGURES = {
     "scene_provenance": Figure("Origin of the scene", "", "", ""),
     "camera": Figure("Camera", "", "", ""),
 }
-SHOWN_ELSEWHERE = {"versions", "seconds", "warnings", "command"}
+SHOWN_ELSEWHERE = {"verdict", "versions", "seconds", "warnings", "command"}
 
 
 def _number(value: object) -> float | None:
@@ -448,6 +448,7 @@ def _cards(content: ReportContent) -> str:
                 f"{total_s:.1f} s" if stages else "not measured",
                 "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
             ),
+            _verdict_card(metrics.get("verdict")),
             card(
                 "Solver",
                 status,
@@ -455,6 +456,20 @@ def _cards(content: ReportContent) -> str:
                 "good" if status.startswith("converged") else "watch",
             ),
         )
+    )
+
+
+def _verdict_card(verdict: object) -> str:
+    """Return whether to trust the light field, with the gravest reason."""
+    if not isinstance(verdict, dict):
+        return card("Verdict", "not judged", "")
+    told = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
+    level = verdict["level"]
+    return card(
+        "Verdict",
+        level,
+        told[0] if told else "nothing in frames, Psi and light field speaks against it",
+        {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
 
 

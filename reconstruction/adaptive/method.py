@@ -46,6 +46,7 @@ from reconstruction.choices import darkness, smooth_guess
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.tv import TVSettings, reconstruct_tv
+from reconstruction.verdict.shadow import Shadow, relief, shadow
 
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
@@ -56,9 +57,9 @@ DIM, TINY = 0.1, 1e-12
 call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
 TRIAL_STEPS = 4
 """Of the fits, with colour and without, that tell whether the scene has any."""
-EXPLAINED = 0.7
-"""Share of what held-out readings differ by from the smooth picture's that must be explained: 0.92
-to 0.96 on four real scenes, 0.53 to 0.66 with a Psi whose masks were 5 samples off."""
+SHADOW = 0.7
+"""Strength of the masks' shadow in the readings, as a share of what Psi says, below which Psi is
+called another's: at least 0.93 on clean captures, 0 to 0.25 with masks 4 samples off."""
 
 
 class AdaptiveSettings(Settings):
@@ -174,7 +175,9 @@ def reconstruct_adaptive(
         "model": model_map(kinds, found, off, k),
     }
     explained = _explained(missed, data.readings, bright.noise, held)
-    judged = _judgement(settings, volume, explained)
+    masks = shadow(relief(given.psi, given.frames, given.typical, usable))
+    decided = _decided(volume)
+    judged = _judgement(settings, volume, decided, masks)
     plainly = (given.frames - given.psi.forward(plain.light_field))[held]
     surely = missed[held] * scale
     if held.sum() >= FEWEST and np.square(plainly).mean() < np.square(surely).mean():
@@ -215,6 +218,8 @@ def reconstruct_adaptive(
             "disparities": len(volume.disparities),
             "search_seconds": searched_s,
             "held_readings": int(held.sum()),
+            "at_end": volume.at_end,
+            **({} if decided is None else {"decided": decided}),
             **({} if explained is None else {"explained": explained}),
             **{
                 f"share_{name.replace(' ', '_')}": float(v)
@@ -334,27 +339,31 @@ def _explained(missed: Array, plain: Array, noise: Array, held: NDArray[np.bool_
     return 1 - (float(np.mean(np.square(missed[held]))) - allowed) / before
 
 
+def _decided(volume: search.Volume) -> float | None:
+    """Return the share of the textured patches that prefer some disparity; None without any."""
+    textured = volume.kind > 0
+    return float(volume.decisive[textured].mean()) if textured.any() else None
+
+
 def _judgement(
-    settings: AdaptiveSettings, volume: search.Volume, explained: float | None
+    settings: AdaptiveSettings, volume: search.Volume, decided: float | None, masks: Shadow
 ) -> list[str]:
     """Return what the user should know before trusting the result."""
     told = []
-    textured = volume.kind > 0
-    if textured.any():
-        decided = float(volume.decisive[textured].mean())
-        if decided < UNDECIDED:
-            told.append(
-                f"the evidence is flat: {1 - decided:.0%} of the textured patches prefer no "
-                "disparity; use a mask that differs from view to view, or more shots"
-            )
+    if decided is not None and decided < UNDECIDED:
+        told.append(
+            f"the evidence is flat: {1 - decided:.0%} of the textured patches prefer no "
+            "disparity; use a mask that differs from view to view, or more shots"
+        )
     if volume.at_end > search.WANTED:
         told.append(
             f"disparities reach the end of the search, {settings.furthest_px:g} px: raise "
             "furthest_px"
         )
-    if explained is not None and explained < EXPLAINED:
+    strengths = masks.strength[np.isfinite(masks.strength)]
+    if strengths.size and float(strengths.min()) < SHADOW:
         told.append(
-            f"only {explained:.0%} of what readings kept from the fit show is explained: Psi may "
-            "not be theirs, or the scene is hardly made of surfaces"
+            f"the masks show in the readings at {max(float(strengths.min()), 0):.0%} of the "
+            "strength that Psi says: Psi may not be theirs"
         )
     return told

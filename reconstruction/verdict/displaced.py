@@ -1,0 +1,189 @@
+"""Where the masks' shadow really falls: displacements from the readings, by the camera's design.
+
+The design tells how the relief of the masks changes when they move or their distance differs. What
+the readings do beyond Psi's own relief is regressed on these changes, tile by tile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.errors import ModelError
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.verdict.shadow import Relief, relief_of, tiles
+
+Array = NDArray[np.floating]
+STEP_PX = 0.25
+"""Of the differences that stand for derivatives."""
+DISTANCE_STEP = 0.1
+VIGNETTING_STEP = 0.3
+ALIKE = 0.5
+"""Correlation below which the design says nothing about a Psi."""
+LEAST_RELIEF = 0.02
+
+
+@dataclass(frozen=True)
+class Change:
+    """One way in which the masks may be otherwise than Psi says, if it is the only one.
+
+    value, deviation: of the change. gain: by how much it lowers the weighted squared residual.
+    """
+
+    value: float
+    deviation: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Displaced:
+    """shifts: (tile, 2), by which the shadow lies off Psi's (y, x), in pixels.
+
+    errors: (tile, 2), their deviations. centres: (tile, 2), (y, x) in pixels. shift: their
+    weighted mean. size_px: their root mean square beyond what the deviations make. changes: of
+    `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost rays lose.
+    """
+
+    shifts: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    centres: NDArray[np.float64]
+    shift: tuple[float, float]
+    size_px: float
+    changes: dict[str, Change]
+
+
+def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
+    """Return the camera with the masks near its sensor moved, and further by a factor."""
+    near = [n for n, m in camera.masks.items() if m.distance_mm < 0.5 * camera.lens.distance_mm]
+    shots = []
+    for shot in camera.shots:
+        offsets = dict(shot.offset_um)
+        for name in near:
+            x, y = offsets.get(name, (0.0, 0.0))
+            offsets[name] = (x + dx_um, y + dy_um)
+        shots.append(shot.model_copy(update={"offset_um": offsets}))
+    masks = {
+        name: mask.model_copy(update={"distance_mm": mask.distance_mm * distance})
+        if name in near
+        else mask
+        for name, mask in camera.masks.items()
+    }
+    return camera.model_copy(update={"shots": tuple(shots), "masks": masks})
+
+
+def _design(psi: ImagingMatrix) -> Camera | None:
+    """Return the camera of a Psi, None where it is not known or has no mask near the sensor."""
+    try:
+        camera = Camera.model_validate_json(psi.camera_json)
+    except ValidationError:
+        return None
+    near = [m for m in camera.masks.values() if m.distance_mm < 0.5 * camera.lens.distance_mm]
+    fits = len(camera.shots) == psi.shots and camera.views == psi.light_field_shape[:2]
+    return camera if near and fits else None
+
+
+def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
+    """Return by how much the masks lie off; None where the design cannot tell."""
+    camera = _design(psi)
+    if camera is None:
+        return None
+    pixel_um = camera.sensor.sample_pitch_um * psi.binning
+
+    def drawn(dy_px: float, dx_px: float, distance: float = 1.0) -> Array:
+        moved = _moved(camera, dy_px * pixel_um, dx_px * pixel_um, distance)
+        return relief_of(build_imaging_matrix(moved, psi.size), found.picture)[1]
+
+    try:
+        own = drawn(0, 0)
+        up, down = drawn(STEP_PX, 0), drawn(-STEP_PX, 0)
+        right, left = drawn(0, STEP_PX), drawn(0, -STEP_PX)
+        further = drawn(0, 0, 1 + DISTANCE_STEP)
+    except ModelError:
+        return None
+    good = found.good
+    both = own[good], found.masks[good]
+    norms = [float(np.sqrt(np.mean(np.square(one)))) for one in both] if good.any() else [0.0]
+    if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
+        return None
+    shift_y, shift_x = (up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)
+    darker = relief_of(_vignetted(psi, VIGNETTING_STEP), found.picture)[1]
+    changes = {
+        "distance": (further - own) / DISTANCE_STEP,
+        # A blur of variance s adds s/2 times the second derivatives.
+        "blur": (up + down + right + left - 4 * own) / (2 * STEP_PX**2),
+        "vignetting": (darker - found.masks) / VIGNETTING_STEP,
+    }
+    shifts, errors, centres = [], [], []
+    for y, x in tiles(good.shape[1:]):
+        base = [one[:, y, x] for one in (found.masks, shift_y, shift_x)]
+        fit = _regressed(base, found.seen[:, y, x], found.weight[:, y, x])
+        if fit is not None:
+            shifts.append(fit.values[1:])
+            errors.append(fit.deviations[1:])
+            centres.append(((y.start + y.stop) / 2, (x.start + x.stop) / 2))
+    if not shifts:
+        return None
+    moved, deviation = np.array(shifts), np.array(errors)
+    weight = 1 / np.square(deviation)
+    mean = np.average(moved, axis=0, weights=weight)
+    beyond = np.average(np.square(moved) - np.square(deviation), axis=0, weights=weight)
+    # One at a time: they look so much alike that together none could be told.
+    beyond_psi = found.seen - found.masks
+    alone = {
+        name: _regressed([one, shift_y, shift_x], beyond_psi, found.weight)
+        for name, one in changes.items()
+    }
+    return Displaced(
+        moved,
+        deviation,
+        np.array(centres),
+        (float(mean[0]), float(mean[1])),
+        float(np.sqrt(max(beyond.sum(), 0))),
+        {
+            name: Change(float(fit.values[0]), float(fit.deviations[0]), fit.gain)
+            for name, fit in alone.items()
+            if fit is not None
+        },
+    )
+
+
+def _vignetted(psi: ImagingMatrix, lost: float) -> ImagingMatrix:
+    """Return Psi with the outermost views darker by a share, those between by its square law."""
+    v, u = (np.arange(n) - (n - 1) / 2 for n in psi.light_field_shape[:2])
+    square = np.square(v)[:, None] + np.square(u)
+    passed = 1 - lost * square / max(float(square.max()), 1e-12)
+    weights = psi.weights * passed[:, :, None, None, None].astype(psi.weights.dtype)
+    return replace(psi, weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """values, deviations: of the base's. gain: fall of the mean weighted square."""
+
+    values: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+    gain: float
+
+
+def _regressed(base: Sequence[Array], seen: Array, weight: Array) -> _Fit | None:
+    """Return the weighted regression of what is seen on the base; None where it is not told."""
+    good = weight > 0
+    if good.sum() < 20 * len(base):
+        return None
+    columns = np.stack([one[good] for one in base], axis=1).astype(np.float64)
+    weights, values = weight[good].astype(np.float64), seen[good].astype(np.float64)
+    matrix = columns.T @ (columns * weights[:, None])
+    if np.linalg.cond(matrix) > 1e8:
+        return None
+    inverse = np.linalg.inv(matrix)
+    found = inverse @ (columns.T @ (weights * values))
+    left = values - columns @ found
+    scores = columns * (weights * left)[:, None]
+    spread = np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse))
+    gain = float(np.mean(weights * (values**2 - left**2)))
+    return _Fit(found, spread, gain)

@@ -1,0 +1,146 @@
+"""Everything that speaks for or against a light field, as plain figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.result import Reconstruction
+from reconstruction.verdict.displaced import displaced
+from reconstruction.verdict.kept import foretold
+from reconstruction.verdict.pixels import judged_pixels
+from reconstruction.verdict.shadow import relief, shadow
+from reconstruction.verdict.shots import compared
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Figures of a capture and of a light field found from it; None where there is nothing to say.
+
+    method: that found it; status: what it said. left_out: shots that screening left out. noise:
+    the readings' deviation over their mean.
+    """
+
+    method: str
+    status: str
+    left_out: tuple[int, ...]
+    noise: float
+    relief: float
+    strengths: tuple[float | None, ...]
+    strength_errors: tuple[float | None, ...]
+    lowest_strength: float | None
+    lowest_at: tuple[int, int]
+    other_strengths: tuple[tuple[float | None, ...], ...]
+    displaced_px: float | None
+    shift_px: tuple[float, float] | None
+    changes: dict[str, tuple[float | None, ...]]
+    brightness: tuple[float | None, ...]
+    motion_px: float | None
+    motion_effect: float | None
+    moved_at: tuple[int, int, int] | None
+    off: float
+    unusable: float
+    saturated: float
+    blind: float
+    hole_px: float
+    hole_at: tuple[int, int]
+    kept: int
+    missed: float | None
+    plain: float | None
+    explained: float | None
+    noise_share: float | None
+    beyond: float | None
+    parameters: dict[str, float]
+
+    def as_dict(self) -> dict:
+        """Return the figures as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, figures: Mapping[str, Any]) -> Evidence:
+        """Return evidence from what `as_dict` gave, also after a way through JSON."""
+        return cls(**{key: _tupled(value) for key, value in figures.items()})
+
+
+TOLD = ("decided", "at_end", "furthest_px", "share_free")
+"""Parameters of a result that bear on whether it can be trusted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """frames, usable: (shot, pixel_y, pixel_x), as screened. kept: those kept from the fit.
+
+    excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
+    that screening left out, for being dark or for repeating others.
+    """
+
+    frames: Array
+    usable: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+    excluded: Array
+    left_out: tuple[int, ...] = ()
+
+
+def gathered(
+    psi: ImagingMatrix, read: Read, noise_sigma: float, result: Reconstruction
+) -> Evidence:
+    """Return what there is to say of a light field that was fitted without the readings kept."""
+    frames, usable = np.where(read.usable, read.frames, 0), read.usable
+    found = relief(psi, frames, noise_sigma, usable)
+    masks = shadow(found)
+    off = displaced(psi, found)
+    shots = compared(psi, found)
+    moved = shots.motion
+    pixels = judged_pixels(psi, read.excluded, found, noise_sigma, usable)
+    fits = foretold(psi, frames, noise_sigma, read.kept & usable, result.light_field, found)
+    mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
+    return Evidence(
+        method=result.method,
+        status=result.status,
+        left_out=read.left_out,
+        noise=noise_sigma / mean,
+        relief=masks.relief,
+        strengths=_plain(masks.strength),
+        strength_errors=_plain(masks.error),
+        lowest_strength=_plain([masks.lowest])[0],
+        lowest_at=masks.where,
+        other_strengths=tuple(_plain(row) for row in shots.masks),
+        displaced_px=None if off is None else off.size_px,
+        shift_px=None if off is None else off.shift,
+        changes={} if off is None else {k: _plain(astuple(one)) for k, one in off.changes.items()},
+        brightness=_plain(shots.brightness),
+        motion_px=None if moved is None else moved.size_px,
+        motion_effect=None if moved is None else moved.effect,
+        moved_at=None if moved is None else (moved.shot, *moved.place),
+        off=pixels.off,
+        unusable=pixels.unusable,
+        saturated=pixels.saturated,
+        blind=pixels.blind,
+        hole_px=pixels.hole_px,
+        hole_at=pixels.hole,
+        kept=0 if fits is None else fits.readings,
+        missed=None if fits is None else fits.missed,
+        plain=None if fits is None else fits.plain,
+        explained=None if fits is None else fits.explained,
+        noise_share=None if fits is None else fits.noise,
+        beyond=None if fits is None else fits.beyond,
+        parameters={key: result.parameters[key] for key in TOLD if key in result.parameters},
+    )
+
+
+def _plain(values: Iterable[float]) -> tuple[float | None, ...]:
+    """Return plain numbers; None for those that are not finite."""
+    return tuple(float(value) if np.isfinite(value) else None for value in values)
+
+
+def _tupled(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tupled(item) for key, item in value.items()}
+    return tuple(map(_tupled, value)) if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,106 @@
+"""Pixels that cannot be used and are not listed, and holes that those listed leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.verdict.shadow import Relief
+
+Array = NDArray[np.floating]
+BLIND_PX = 1.9
+SMOOTH = 0.5
+"""Of the neighbours' typical value: they must lie within so much for a pixel to be judged."""
+DIMMEST = 0.2
+"""Of the light expected without masks: pixels behind dark cells tell nothing of others."""
+ENOUGH = 6
+"""Neighbours, of eight, that must be usable."""
+SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
+"""Times the neighbours' spread, their typical value, and the noise, that a pixel is off by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """off: share that are far off all around, of readings whose neighbours agree.
+
+    unusable, saturated: shares of the readings. blind: share of the pixels that lie BLIND_PX or
+    further from any that a shot sees. hole_px: radius of the largest hole; hole: its centre (y, x).
+    """
+
+    off: float
+    unusable: float
+    saturated: float
+    blind: float
+    hole_px: float
+    hole: tuple[int, int]
+
+
+def judged_pixels(
+    psi: ImagingMatrix,
+    excluded: Array,
+    found: Relief,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+) -> Pixels:
+    """Return what is wrong with single pixels. excluded: what unusable pixels read."""
+    step = 1 if psi.colour is None else 2
+    off, told = 0, 0
+    for shot in range(psi.shots):
+        passed = 1 + found.masks[shot]
+        detail = (1 + found.read[shot]) / np.maximum(passed, DIMMEST)
+        good = found.good[shot] & (passed > DIMMEST)
+        around, known = _neighbours(detail, good, step)
+        low, high, typical = around[1], around[-2], np.abs(around[3:5].mean(axis=0))
+        spread = high - low
+        smooth = good & (known >= ENOUGH) & (spread < SMOOTH * typical)
+        apart = np.where(detail > high, detail - high, np.maximum(low - detail, 0))
+        light = found.level[shot] * passed
+        wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
+        wild &= apart > LEAST * typical
+        off += int((wild & smooth).sum())
+        told += int(smooth.sum())
+    seen = usable.any(axis=0)
+    unseen = np.asarray(~seen, dtype=np.uint8)
+    radius = cv2.distanceTransform(unseen, cv2.DIST_L2, 3)
+    hole = np.unravel_index(int(radius.argmax()), radius.shape)
+    return Pixels(
+        off / max(told, 1),
+        float(1 - usable.mean()),
+        _saturated(excluded, found, usable),
+        float((radius >= BLIND_PX).mean()),
+        float(radius.max()),
+        (int(hole[0]), int(hole[1])),
+    )
+
+
+def _saturated(excluded: Array, found: Relief, usable: NDArray[np.bool_]) -> float:
+    """Return the share of readings that are not usable and above nearly all that are."""
+    above = 0
+    for shot, good in enumerate(usable):
+        if good.any():
+            read = found.level[shot] * (1 + found.read[shot])
+            limit = float(np.quantile(read[good], 0.99))
+            above += int((excluded[shot][~good] >= limit).sum())
+    return above / usable.size
+
+
+def _neighbours(
+    values: Array, good: NDArray[np.bool_], step: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the eight neighbours at a step in order, (8, y, x), and how many are good, (y, x).
+
+    Those not good take the others' mean.
+    """
+    rows, columns = values.shape
+    padded = np.pad(np.where(good, values, np.nan), step, mode="reflect")
+    places = [(i, j) for i in (0, step, 2 * step) for j in (0, step, 2 * step)]
+    places.remove((step, step))
+    found = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
+    known = np.isfinite(found)
+    count = known.sum(axis=0)
+    mean = np.where(known, found, 0).sum(axis=0) / np.maximum(count, 1)
+    return np.sort(np.where(known, found, mean), axis=0).astype(np.float32), count

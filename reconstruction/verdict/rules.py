@@ -1,0 +1,296 @@
+"""The rules: figures beyond a limit become reasons, each with its remedy, and reasons a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from reconstruction.verdict.evidence import Evidence
+
+Level = Literal["trust", "doubt", "do not use"]
+LEVELS: tuple[Level, ...] = ("trust", "doubt", "do not use")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Of a figure: beyond the first a result is doubted, beyond the second not to be used."""
+
+    doubt: float
+    refuse: float
+
+    def level(self, figure: float) -> Level:
+        """Return what a figure speaks for; larger is worse."""
+        return LEVELS[(figure > self.doubt) + (figure > self.refuse)]
+
+    def times(self, factor: float) -> Limits:
+        """Return the limits scaled."""
+        return Limits(self.doubt * factor, self.refuse * factor)
+
+
+DISPLACED_PX = Limits(0.28, 0.6)
+STRENGTH_LOST = Limits(0.15, 0.35)
+"""Of the masks' shadow, as a share of what Psi says."""
+VIGNETTING = Limits(0.06, 0.3)
+FLICKER = Limits(0.05, 0.15)
+MOTION = Limits(0.075, 0.3)
+"""What motion between shots changes, over the mean reading."""
+OFF = Limits(0.015, 0.05)
+SATURATED = Limits(0.14, 0.35)
+BLIND = Limits(0.05, 0.25)
+NOISE_SHARE = Limits(0.61, 0.9)
+LEAST_NOISE = 0.1
+"""Of an even scene noise is all there is to miss, and does no harm."""
+NOISE = Limits(0.3, 0.8)
+"""Deviation of the readings over their mean."""
+UNEXPLAINED = Limits(0.75, 1.1)
+"""Beyond 1: the smooth picture alone foretells the readings better."""
+UNDECIDED = Limits(0.75, 1.0)
+AT_END = Limits(0.01, 1.0)
+ADAPTIVE = 0.7
+"""Of the limits on Psi's errors, for the adaptive methods."""
+LEFT_OUT = Limits(0.4, 1.0)
+DARK = 0.3
+"""Brightness over the shots' mean below which a shot is called dark."""
+ANOTHERS = 0.5
+"""Strength of another shot's masks above which, and of its own below which, shots are confused."""
+LEAST_STRENGTH = 0.25
+"""Displacements are told by first differences, which fade with the shadow: divided by its strength,
+but not by less than this."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """what: in words. figure: behind it. remedy: what to do. level: what it alone speaks for."""
+
+    what: str
+    figure: float
+    remedy: str
+    level: Level
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """level: of the gravest reason; reasons: the gravest first; evidence: all the figures."""
+
+    level: Level
+    reasons: tuple[Reason, ...]
+    evidence: Evidence
+
+    @property
+    def words(self) -> str:
+        """The verdict in one line."""
+        if not self.reasons:
+            return "trust: readings, masks and noise agree with the light field"
+        return f"{self.level}: " + "; ".join(f"{one.what}: {one.remedy}" for one in self.reasons)
+
+    def as_dict(self) -> dict:
+        """Return the verdict as plain data."""
+        return {
+            "level": self.level,
+            "reasons": [asdict(one) for one in self.reasons],
+            "features": asdict(self.evidence),
+        }
+
+
+def judged(evidence: Evidence) -> Verdict:
+    """Return the verdict that the evidence leads to."""
+    found = [
+        reason
+        for rule in (_shots, _masks, _pixels, _noise, _search, _fit)
+        for reason in rule(evidence)
+        if reason.level != "trust"
+    ]
+    found.sort(key=lambda one: -LEVELS.index(one.level))
+    return Verdict(found[0].level if found else "trust", tuple(found), evidence)
+
+
+def _shots(e: Evidence) -> Iterator[Reason]:
+    if len(e.brightness) < 2:
+        return
+    if e.left_out:
+        share = len(e.left_out) / len(e.brightness)
+        shots = ", ".join(str(shot + 1) for shot in e.left_out)
+        yield Reason(
+            f"{len(e.left_out)} of {len(e.brightness)} shots were left out, dark or the same as "
+            f"another: {shots}",
+            share,
+            "look at lamp and stage, and take them again",
+            LEFT_OUT.level(share),
+        )
+    kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
+    bright = [(one or 0.0) if shot in kept else 1.0 for shot, one in enumerate(e.brightness)]
+    dark = [shot for shot, one in enumerate(bright, 1) if one < DARK]
+    if dark:
+        yield Reason(
+            f"shot {dark[0]} is dark", bright[dark[0] - 1], "take it again, or leave it out",
+            "do not use",
+        )  # fmt: skip
+        return
+    for shot in kept if len(kept) > 1 else []:
+        row = e.other_strengths[shot]
+        own = row[shot] or 0.0
+        other, t = max((one or 0.0, t) for t, one in enumerate(row) if t != shot)
+        if other > ANOTHERS and own < ANOTHERS:
+            yield Reason(
+                f"shot {shot + 1} shows the masks of shot {t + 1}",
+                other,
+                "the stage did not move, or frames are out of order: take it again",
+                "do not use",
+            )
+            return
+    apart = [abs(one - 1) for one in bright]
+    worst = apart.index(max(apart))
+    yield Reason(
+        f"shot {worst + 1} differs in brightness by {apart[worst]:.1%}",
+        apart[worst],
+        "steady the lamp, or normalise the frames by a reference",
+        FLICKER.level(apart[worst]),
+    )
+    if e.motion_px is not None and e.motion_effect is not None and e.moved_at and _masks_fit(e):
+        shot, y, x = e.moved_at
+        yield Reason(
+            f"between shots 1 and {shot + 1} the picture moves by {e.motion_px:.1f} pixels at row "
+            f"{y}, column {x}",
+            e.motion_px,
+            "hold scene and camera still, or reconstruct one shot by adaptive",
+            MOTION.level(e.motion_effect),
+        )
+
+
+def _strength(e: Evidence) -> tuple[float, float] | None:
+    """Return the masks' weakest strength among the shots, and its deviation; None if untold."""
+    told = [
+        (one, error)
+        for one, error in zip(e.strengths, e.strength_errors, strict=True)
+        if one is not None and error is not None
+    ]
+    return min(told) if told else None
+
+
+def _masks_fit(e: Evidence) -> bool:
+    weakest = _strength(e)
+    return weakest is not None and weakest[0] > 1 - STRENGTH_LOST.refuse
+
+
+def _patience(e: Evidence, power: float) -> float:
+    """Return by how much errors of Psi weigh less than on one shot reconstructed by tv.
+
+    They set several shots against one another, and mislead methods that look for disparities.
+    """
+    shots = sum(one is not None for one in e.strengths)
+    return shots**-power * (ADAPTIVE if e.method.startswith("adaptive") else 1)
+
+
+def _masks(e: Evidence) -> Iterator[Reason]:
+    """Of all that may be wrong with the masks, the one reason that the readings speak most for."""
+    weakest = _strength(e)
+    if weakest is None:
+        return
+    lost = 1 - weakest[0] - 2 * weakest[1]
+    moved = (e.displaced_px or 0.0) / max(weakest[0], LEAST_STRENGTH)
+    changes = {name: one for name, one in e.changes.items() if None not in one}
+    likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
+    drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
+    weak = STRENGTH_LOST.times(_patience(e, 0.4)).level(lost)
+    displaced = DISPLACED_PX.times(_patience(e, 0.85)).level(moved)
+    if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
+        yield Reason(
+            f"the masks' shadow lies about {moved:.2f} pixels from where Psi says",
+            moved,
+            drift,
+            displaced if LEVELS.index(displaced) > LEVELS.index(weak) else weak,
+        )
+    elif weak != "trust":
+        yield Reason(_weakness(weakest[0], likeliest, changes), weakest[0], drift, weak)
+    elif likeliest == "vignetting":
+        darker, deviation, _ = changes[likeliest]
+        assert darker is not None
+        assert deviation is not None
+        yield Reason(
+            f"the outermost rays seem to lose {min(darker, 1):.0%} more than Psi says",
+            darker,
+            "measure Psi with whiteboards at this aperture, or close the aperture",
+            VIGNETTING.times(_patience(e, 0.6)).level(darker - 2 * deviation),
+        )
+
+
+def _weakness(strength: float, likeliest: str, changes: Mapping[str, Sequence]) -> str:
+    told = f"the masks show at {strength:.0%} of the strength that Psi says"
+    if strength < LEAST_STRENGTH:
+        return told + ", as if they were others"
+    if not likeliest or changes[likeliest][0] <= 0:
+        return told
+    value = changes[likeliest][0]
+    if likeliest == "distance":
+        return told + f", as if they stood {value:.0%} further from the sensor"
+    return told + f", as if their edges were blurred by {value**0.5:.1f} pixels more"
+
+
+def _pixels(e: Evidence) -> Iterator[Reason]:
+    # A shadow elsewhere makes readings differ from their neighbours, too.
+    weakest = _strength(e)
+    if weakest is None or weakest[0] > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
+        yield Reason(
+            f"{e.off:.1%} of the readings are far off all around them",
+            e.off,
+            "list dead and hot pixels (a dark and a reference frame tell them), or expose less",
+            OFF.level(e.off),
+        )
+    yield Reason(
+        f"{e.saturated:.0%} of the readings are saturated",
+        e.saturated,
+        "expose less, or bracket",
+        SATURATED.level(e.saturated / len(e.strengths) ** 0.25),
+    )
+    yield Reason(
+        f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "
+        f"{2 * e.hole_px:.0f} pixels wide at row {e.hole_at[0]}, column {e.hole_at[1]}",
+        e.blind,
+        "expose less, bracket, or replace the sensor's dead area by another shot",
+        BLIND.level(e.blind),
+    )
+
+
+def _noise(e: Evidence) -> Iterator[Reason]:
+    light = "more light, longer exposure or more shots"
+    if NOISE.level(e.noise) != "trust":
+        yield Reason(
+            f"noise is {e.noise:.0%} of the mean reading", e.noise, light, NOISE.level(e.noise)
+        )
+    elif e.noise_share is not None and e.noise > LEAST_NOISE:
+        yield Reason(
+            f"noise makes {e.noise_share:.0%} of what readings kept from the fit are missed by",
+            e.noise_share,
+            light,
+            NOISE_SHARE.level(e.noise_share),
+        )
+
+
+def _search(e: Evidence) -> Iterator[Reason]:
+    """What methods that look for disparities say of them."""
+    decided, at_end = e.parameters.get("decided"), e.parameters.get("at_end", 0.0)
+    if decided is not None:
+        yield Reason(
+            f"{1 - decided:.0%} of the textured patches prefer no disparity",
+            decided,
+            "use a mask that differs from view to view, or more shots",
+            UNDECIDED.level(1 - decided),
+        )
+    yield Reason(
+        f"{at_end:.0%} of the patches want disparities beyond the range searched",
+        at_end,
+        "raise furthest_px, or focus nearer to the scene",
+        AT_END.level(at_end),
+    )
+
+
+def _fit(e: Evidence) -> Iterator[Reason]:
+    if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
+        yield Reason(
+            f"{max(e.explained, 0):.0%} of what readings kept from the fit show beyond a smooth "
+            "picture is explained",
+            e.explained,
+            "take another method, or more shots",
+            UNEXPLAINED.level(1 - e.explained),
+        )

@@ -1,0 +1,183 @@
+"""How strongly the masks' shadow stands in the readings, compared with what Psi says.
+
+Around the smooth picture that explains the frames' local means, Psi says how the masks modulate
+the readings. Whatever the scene, its texture does not know the masks: so the regression of what
+the readings do around the smooth picture on what the masks should do has slope 1 where Psi is the
+camera's, less where the masks lie elsewhere or are blurred, and slope 0 where they are others.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.choices import smooth_guess
+
+Array = NDArray[np.floating]
+SMOOTH_PX = 4.0
+"""Deviation of the window over which readings and masks are averaged."""
+LOCAL_PX = 2.0
+"""Deviation of the window over which the scene's texture is judged."""
+DIMMEST = 0.05
+"""Share of the typical expected reading below which a pixel tells nothing."""
+TILE_PX = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """Readings and masks around the smooth picture, (shot, pixel_y, pixel_x) each.
+
+    level: what is expected of evenly grey masks. masks: what the masks add, as a share of it.
+    read: what the readings add; seen: that, without its local mean. good: where both are known.
+    weight: the texture's inverse variance. picture: the smooth picture, (y, x, c).
+    """
+
+    level: NDArray[np.float32]
+    masks: NDArray[np.float32]
+    read: NDArray[np.float32]
+    seen: NDArray[np.float32]
+    good: NDArray[np.bool_]
+    weight: NDArray[np.float32]
+    picture: Array
+
+
+def channels(psi: ImagingMatrix) -> NDArray[np.int64]:
+    """Return which filter of the sensor each pixel has, (shot, pixel_y, pixel_x)."""
+    k = psi.binning
+    if psi.colour is None:
+        return np.zeros(psi.frames_shape, dtype=np.int64)
+    return psi.colour[:, ::k, ::k].astype(np.int64)
+
+
+def averaged(values: Array, good: NDArray, filters: NDArray[np.int64], deviation: float) -> Array:
+    """Return the mean of the good pixels about each, among those with its filter; shots apart."""
+    found = np.zeros(values.shape, dtype=np.float32)
+    for shot in range(len(values)):
+        for one in np.unique(filters[shot]):
+            mine = filters[shot] == one
+            use = (mine & good[shot]).astype(np.float32)
+            top = cv2.GaussianBlur(use * values[shot].astype(np.float32), (0, 0), deviation)
+            bottom = cv2.GaussianBlur(use, (0, 0), deviation)
+            found[shot][mine] = (top / np.maximum(bottom, 1e-6))[mine]
+    return found
+
+
+def relief_of(
+    psi: ImagingMatrix, picture: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return what a picture (y, x, c), seen in all views, makes a Psi read.
+
+    First of evenly grey masks, then what the masks add as a share of it, both
+    (shot, pixel_y, pixel_x).
+    """
+    k = psi.binning
+    rows, columns = psi.frames_shape[1:]
+    white = psi.weights.sum(axis=(1, 2), dtype=np.float64)
+    white = white.reshape(psi.shots, rows, k, -1, columns, k).sum(axis=(2, 5))
+    colours = picture.reshape(rows, k, columns, k, 3).mean(axis=(1, 3))
+    filters = channels(psi)
+    every = np.ones(psi.frames_shape, dtype=bool)
+    expected, level = np.zeros(psi.frames_shape), np.zeros(psi.frames_shape)
+    for stored in range(white.shape[2]):
+        if psi.colour is None:
+            light = np.broadcast_to(colours[..., stored], psi.frames_shape)
+        else:
+            light = np.take_along_axis(colours[None], filters[..., None], axis=3)[..., 0]
+        expected += white[:, :, stored] * light
+        level += averaged(white[:, :, stored], every, filters, SMOOTH_PX) * light
+    masks = expected / np.maximum(level, 1e-12) - 1
+    return level.astype(np.float32), np.where(level > 0, masks, 0).astype(np.float32)
+
+
+def relief(
+    psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_]
+) -> Relief:
+    """Return readings and masks around the smooth picture."""
+    picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
+    level, masks = relief_of(psi, picture)
+    filters = channels(psi)
+    floor = DIMMEST * float(np.median(level))
+    good = usable & (level > max(floor, 3 * noise_sigma))
+    safe = np.where(good, level, 1)
+    masks = np.where(good, masks, 0)
+    read = np.where(good, np.where(usable, frames, 0) / safe - 1, 0).astype(np.float32)
+    # The smooth picture errs where brightness turns: what is left of the means is taken away.
+    seen = read - np.where(good, averaged(read - masks, good, filters, SMOOTH_PX), 0)
+    rough = averaged(np.square(seen - masks), good, filters, LOCAL_PX)
+    least = float(np.median(rough[good])) if good.any() else 1.0
+    weight = np.where(good, 1 / np.maximum(rough, 0.3 * least + 1e-12), 0)
+    return Relief(level, masks, read, seen, good, weight.astype(np.float32), picture)
+
+
+def tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Return tiles of about TILE_PX a side that cover rows x columns of pixels."""
+    cuts = [np.linspace(0, n, max(1, n // TILE_PX) + 1).round().astype(int) for n in size]
+    return [
+        (slice(int(top), int(bottom)), slice(int(left), int(right)))
+        for top, bottom in itertools.pairwise(cuts[0])
+        for left, right in itertools.pairwise(cuts[1])
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Shadow:
+    """How strongly the masks are seen: 1 where Psi is right.
+
+    strength, error: of every shot, and its standard deviation. lowest: in the weakest of the
+    picture's tiles, by two of its deviations above; where: its centre (y, x) in pixels.
+    relief: root mean square of what the masks add.
+    """
+
+    strength: NDArray[np.float64]
+    error: NDArray[np.float64]
+    lowest: float
+    where: tuple[int, int]
+    relief: float
+
+
+def shadow(found: Relief) -> Shadow:
+    """Return how strongly the masks are seen in the readings."""
+    strength, error = zip(
+        *(_slope(found.masks[s], found.seen[s], found.weight[s]) for s in range(len(found.masks))),
+        strict=True,
+    )
+    lowest, where = np.inf, (0, 0)
+    for y, x in tiles(found.masks.shape[1:]):
+        slope, deviation = _slope(found.masks[:, y, x], found.seen[:, y, x], found.weight[:, y, x])
+        if slope + 2 * deviation < lowest:
+            lowest = slope + 2 * deviation
+            where = ((y.start + y.stop) // 2, (x.start + x.stop) // 2)
+    added = found.masks[found.good]
+    return Shadow(
+        np.array(strength),
+        np.array(error),
+        float(lowest),
+        where,
+        float(np.sqrt(np.mean(np.square(added)))) if added.size else 0.0,
+    )
+
+
+def cross_strength(found: Relief) -> NDArray[np.float64]:
+    """Return how strongly each shot's readings show each shot's masks, (read, said)."""
+    shots = len(found.masks)
+    return np.array(
+        [
+            [_slope(found.masks[t], found.seen[s], found.weight[s])[0] for t in range(shots)]
+            for s in range(shots)
+        ]
+    )
+
+
+def _slope(masks: Array, seen: Array, weight: Array) -> tuple[float, float]:
+    """Return the weighted regression of seen on masks and its deviation; NaN if untold."""
+    square = float((weight * np.square(masks, dtype=np.float64)).sum())
+    if square <= 0:
+        return np.nan, np.nan
+    slope = float((weight * masks * seen).sum(dtype=np.float64)) / square
+    left = np.square(weight * masks * (seen - slope * masks), dtype=np.float64)
+    return slope, float(np.sqrt(left.sum())) / square

@@ -1,0 +1,277 @@
+"""Verdicts: their figures against theory, and that faults are told with reason and remedy."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from emmc_rig.camera_sheet import find_camera
+from emmc_rig.cli import app
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.simulate import simulate
+from emmc_rig.stability.faults import FAULTS, trial
+from reconstruction.methods import MethodSettings
+from reconstruction.result import Reconstruction
+from reconstruction.tv import TVSettings
+from reconstruction.verdict.displaced import displaced
+from reconstruction.verdict.evidence import Evidence, Read, gathered
+from reconstruction.verdict.kept import foretold, kept_readings
+from reconstruction.verdict.pixels import judged_pixels
+from reconstruction.verdict.rules import LEVELS, judged
+from reconstruction.verdict.run import reconstruct_judged
+from reconstruction.verdict.shadow import relief, shadow
+from reconstruction.verdict.shots import compared
+
+SIZE = (48, 64)
+SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
+"""What screening mends before verdicts see it; without it they must tell."""
+QUICK = MethodSettings(tv=TVSettings(max_steps=20))
+
+
+@pytest.fixture(scope="module")
+def three():
+    return build_imaging_matrix(find_camera("rgbw-bayer-3shots"), SIZE)
+
+
+def everywhere(psi):
+    return np.ones(psi.frames_shape, dtype=bool)
+
+
+def grey(psi, value=0.5):
+    return psi.forward(np.full(psi.light_field_shape, value, np.float32))
+
+
+def relief_in(psi, frames, sigma=1e-4, usable=None):
+    return relief(psi, frames, sigma, everywhere(psi) if usable is None else usable)
+
+
+def test_masks_of_an_even_scene_show_at_their_full_strength(three):
+    found = shadow(relief_in(three, grey(three)))
+    np.testing.assert_allclose(found.strength, 1, atol=0.01)
+    assert found.lowest == pytest.approx(1, abs=0.02)
+    assert found.relief > 0.3
+
+
+def test_masks_half_as_strong_show_at_half_strength(three):
+    even = relief_in(three, grey(three))
+    halved = even.level * (1 + 0.5 * even.masks)
+    # The smooth picture follows what is left, by a little.
+    np.testing.assert_allclose(shadow(relief_in(three, halved)).strength, 0.53, atol=0.06)
+
+
+def test_an_even_scene_behind_a_displaced_mask_tells_the_displacement():
+    camera = find_camera("rgbw-bayer-1shot")
+    moved = camera.model_copy(
+        update={"shots": (camera.shots[0].model_copy(update={"offset_um": {"mask": (2.4, -4.8)}}),)}
+    )
+    psi, true = build_imaging_matrix(camera, SIZE), build_imaging_matrix(moved, SIZE)
+    found = displaced(psi, relief_in(psi, grey(true)))
+    # Samples of 24 um.
+    assert found.shift == pytest.approx((-0.2, 0.1), abs=0.03)
+    assert found.size_px == pytest.approx(np.hypot(0.2, 0.1), abs=0.03)
+    assert displaced(psi, relief_in(psi, grey(psi))).size_px < 0.02
+
+
+def test_a_psi_without_its_camera_tells_no_displacement(three):
+    bare = ImagingMatrix(three.weights, three.colour, three.binning)
+    assert displaced(bare, relief_in(bare, grey(bare))) is None
+
+
+def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
+    gains = np.array([1.1, 0.9, 1.0])
+    found = compared(three, relief_in(three, grey(three) * gains[:, None, None]))
+    np.testing.assert_allclose(found.brightness, gains, atol=0.01)
+    swapped = compared(three, relief_in(three, grey(three)[[0, 2, 1]]))
+    assert swapped.masks[1].argmax() == 2
+    assert swapped.masks[2].argmax() == 1
+    assert swapped.masks[0].argmax() == 0
+
+
+def test_pixels_far_off_are_counted(three):
+    frames, chosen = grey(three), np.zeros(three.frames_shape, bool)
+    chosen[:, 5::9, 7::9] = True
+    frames = np.where(chosen, 0.02 * frames, frames)
+    found = judged_pixels(three, frames, relief_in(three, frames), 1e-4, everywhere(three))
+    assert found.off == pytest.approx(chosen.mean(), rel=0.2)
+    clean = judged_pixels(
+        three, grey(three), relief_in(three, grey(three)), 1e-4, everywhere(three)
+    )
+    assert clean.off == 0
+
+
+def test_holes_are_measured_and_placed(three):
+    usable = everywhere(three)
+    usable[:, 20:31, 40:51] = False
+    frames = grey(three)
+    found = judged_pixels(three, frames, relief_in(three, frames, usable=usable), 1e-4, usable)
+    assert found.unusable == pytest.approx(121 / np.prod(SIZE))
+    # The middle of 11 pixels lies 6 from the nearest that is seen; the outermost ring but 1.
+    assert found.hole_px == pytest.approx(6, abs=0.5)
+    assert found.hole == (25, 45)
+    assert found.blind == pytest.approx(81 / np.prod(SIZE), rel=0.05)
+    # What is excluded reads no more than the rest, so it is not saturated.
+    assert found.saturated < 0.01
+    frames[~usable] = 1
+    assert judged_pixels(
+        three, frames, relief_in(three, frames, usable=usable), 1e-4, usable
+    ).saturated == pytest.approx(121 / np.prod(SIZE))
+
+
+def test_readings_kept_tell_what_is_explained_and_what_is_noise(three):
+    rng = np.random.default_rng(0)
+    truth = np.clip(0.5 + 0.2 * rng.normal(size=three.light_field_shape), 0, 1).astype(np.float32)
+    sigma = 0.01
+    clean = three.forward(truth)
+    frames = (clean + sigma * rng.normal(size=clean.shape)).astype(np.float32)
+    kept = rng.random(clean.shape) < 0.3
+    found = foretold(three, frames, sigma, kept, truth, relief_in(three, frames, sigma))
+    assert found.readings == kept.sum()
+    assert found.noise == pytest.approx(1, abs=0.1)
+    assert found.explained == pytest.approx(1, abs=0.1)
+    assert found.missed == pytest.approx(sigma / frames[kept].mean(), rel=0.05)
+    off = foretold(three, frames, sigma, kept, truth * 0.9, relief_in(three, frames, sigma))
+    expected = sigma**2 / np.mean(np.square(frames - 0.9 * clean)[kept])
+    assert off.noise == pytest.approx(expected, rel=0.05)
+    few = np.zeros_like(kept)
+    few[0, 0, :5] = True
+    assert foretold(three, frames, sigma, few, truth, relief_in(three, frames, sigma)) is None
+
+
+def test_few_readings_are_kept_and_the_same_each_time(three):
+    usable = everywhere(three)
+    usable[0, :20] = False
+    kept = kept_readings(usable)
+    # 150 of 7,936: a larger share of a small capture.
+    assert 0.012 < kept.sum() / usable.sum() < 0.025
+    assert not kept[~usable].any()
+    np.testing.assert_array_equal(kept, kept_readings(usable))
+
+
+def judged_trial(
+    fault, strength, camera="rgbw-bayer-3shots", scene="deep-occlusions", seed=0, screening=True
+):
+    given = trial(FAULTS[fault], strength, scene, find_camera(camera), SIZE, seed, 3)
+    settings = QUICK.model_copy(update={"screening": screening})
+    _, verdict = reconstruct_judged(
+        "tv", given.psi, given.readings, given.noise_sigma, None, settings, given.usable
+    )
+    return verdict
+
+
+@pytest.mark.parametrize(
+    ("fault", "strength", "reason"),
+    [
+        ("mask-shift", 0.5, "shadow lies about"),
+        ("mask-shift", 4, "as if they were others"),
+        ("edge-blur", 0.75, "blurred"),
+        ("vignetting", 80, "outermost rays"),
+        ("flicker", 20, "brightness"),
+        ("repeated-shot", 1, "shot 3 shows the masks of shot 2"),
+        ("missing-shot", 1, "shot 3 is dark"),
+        ("camera-motion", 2, "the picture moves"),
+        ("bad-pixels", 10, "far off"),
+        ("saturation", 60, "saturated"),
+        ("masked-pixels", 90, "holes"),
+        ("exposure", 50, "noise"),
+    ],
+)
+def test_a_fault_is_told_with_its_reason_and_a_remedy(fault, strength, reason):
+    verdict = judged_trial(fault, strength, screening=fault not in SCREENED)
+    assert verdict.level != "trust"
+    told = [one for one in verdict.reasons if reason in one.what]
+    assert told, verdict.words
+    assert told[0].remedy
+
+
+def test_many_shots_that_screening_left_out_are_told_and_few_are_not():
+    verdict = judged_trial("missing-shot", 2)
+    assert verdict.level == "doubt"
+    assert "2 of 3 shots were left out, dark or the same as another: 2, 3" in verdict.words
+    assert judged_trial("missing-shot", 1).level == "trust"
+
+
+@pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])
+@pytest.mark.parametrize("scene", ["near-planar", "wide-disparity"])
+def test_a_capture_without_a_fault_is_trusted(scene, camera):
+    verdict = judged_trial("mask-shift", 0, camera, scene, seed=3)
+    assert verdict.level == "trust", verdict.words
+    assert verdict.reasons == ()
+
+
+def clean_evidence(three):
+    empty = Reconstruction(
+        "tv", np.full(three.light_field_shape, 0.5, np.float32), "converged", "", 1, (), 0.0, {}
+    )
+    usable = everywhere(three)
+    read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
+    return gathered(three, read, 1e-3, empty)
+
+
+def test_evidence_survives_json(three):
+    evidence = clean_evidence(three)
+    assert Evidence.from_dict(json.loads(json.dumps(evidence.as_dict()))) == evidence
+
+
+def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
+    evidence = clean_evidence(three)
+    assert judged(evidence).level == "trust"
+    worse = dataclasses.replace(evidence, off=0.03, displaced_px=2.0)
+    verdict = judged(worse)
+    assert verdict.level == "do not use"
+    assert [LEVELS.index(one.level) for one in verdict.reasons] == [2, 1]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A capture as it should be, and the same with a Psi whose masks lie elsewhere."""
+    made = []
+    for name in ("right", "wrong"):
+        folder = tmp_path_factory.mktemp(name)
+        camera = find_camera("rgbw-bayer-2shots")
+        simulate("non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0, folder)
+        if name == "wrong":
+            psi = ImagingMatrix.load(folder / "psi.h5")
+            dataclasses.replace(psi, weights=np.roll(psi.weights, 6, axis=(3, 5))).save(
+                folder / "psi.h5"
+            )
+        made.append(folder)
+    return made
+
+
+def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be_used(
+    folders, tmp_path
+):
+    right, wrong = folders
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("tv: {max_steps: 40}\n")
+    results = {}
+    for name, folder in (("right", right), ("wrong", wrong)):
+        out = tmp_path / name
+        told = CliRunner().invoke(
+            app,
+            [
+                "reconstruct",
+                str(folder),
+                "--settings",
+                str(settings),
+                "--strict",
+                "--out",
+                str(out),
+            ],
+        )
+        metrics = json.loads((out / "metrics.json").read_text())
+        results[name] = told.exit_code, told.stdout.strip().splitlines()[-1], metrics["verdict"]
+        assert (out / "light_field.h5").is_file()
+    code, last, verdict = results["right"]
+    assert code == 0
+    assert last.startswith("trust")
+    assert verdict["level"] == "trust"
+    code, last, verdict = results["wrong"]
+    assert code == 1
+    assert last.startswith(verdict["reasons"][-1]["level"])
+    assert verdict["level"] == "do not use"
+    assert "\x1b" not in last
+    assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
