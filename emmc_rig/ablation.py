@@ -68,7 +68,7 @@ def ablations(
             method,
             psi,
             capture.readings,
-            capture.noise_sigma,
+            capture.deviation,
             dictionary,
             settings,
             capture.usable,

@@ -371,6 +371,8 @@ def reconstruct(
         bars.finish()
     for line in metrics["screening"]:
         console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
+    for line in metrics.get("left_out", ()):
+        console.print(f"[cyan]not modelled:[/] {line}", highlight=False, soft_wrap=True)
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]

@@ -55,11 +55,17 @@ FRAMES, PSI, LIGHT_FIELD, MAPS = "frames.h5", "psi.h5", "light_field.h5", "maps.
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """readings: (shot, y, x). noise_sigma: their typical deviation. usable: (shot, y, x)."""
+    """readings, their standard deviation, which are usable: (shot, y, x) each."""
 
     readings: NDArray[np.float32]
-    noise_sigma: float
+    deviation: NDArray[np.floating]
     usable: NDArray[np.bool_]
+
+    @property
+    def noise_sigma(self) -> float:
+        """Their typical deviation: the root mean square of the usable ones."""
+        judged = self.deviation[self.usable]
+        return float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
 
 
 def read_capture(folder: Path) -> Capture:
@@ -81,9 +87,7 @@ def read_capture(folder: Path) -> Capture:
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")
-    judged = deviation[usable]
-    sigma = float(np.sqrt(np.mean(np.square(judged, dtype=np.float64)))) if judged.size else 0.0
-    return Capture(readings, sigma, usable)
+    return Capture(readings, deviation, usable)
 
 
 def read_session(folder: Path, psi_out: Path) -> Capture:
@@ -93,7 +97,7 @@ def read_session(folder: Path, psi_out: Path) -> Capture:
     """
     taken = session_readings(Session(folder))
     taken.psi.save(psi_out)
-    return Capture(taken.readings, taken.noise_sigma, taken.usable)
+    return Capture(taken.readings, np.sqrt(taken.variance), taken.usable)
 
 
 def _read(folder: Path, out: Path, psi_path: Path | None) -> tuple[Capture, Path]:
@@ -170,7 +174,7 @@ def run_reconstruct(
         method,
         psi,
         capture.readings,
-        capture.noise_sigma,
+        capture.deviation,
         dictionary,
         settings,
         capture.usable,
@@ -181,6 +185,7 @@ def run_reconstruct(
         "chosen": chosen,
         "status": result.status,
         "advice": result.advice,
+        "left_out": list(result.left_out),
         "screening": list(result.screening),
         "verdict": verdict.as_dict(),
         "steps": result.steps,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.dictionary import Dictionary
-from reconstruction.inputs import checked_inputs
+from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
@@ -25,7 +25,7 @@ def reconstruct_judged(
     name: str,
     psi: ImagingMatrix,
     frames: Array,
-    noise_sigma: float,
+    noise_sigma: float | Array,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
@@ -36,7 +36,8 @@ def reconstruct_judged(
     The light field is that of all readings but the few kept, which costs it next to nothing.
     """
     settings = settings or MethodSettings()
-    read, told = _as_fitted(psi, frames, noise_sigma, usable, settings.screening)
+    typical, _ = checked_noise(psi, noise_sigma, usable)
+    read, told = _as_fitted(psi, frames, typical, usable, settings.screening)
     result = reconstruct(
         name,
         psi,
@@ -48,7 +49,7 @@ def reconstruct_judged(
         on_step,
     )
     result = dataclasses.replace(result, screening=told)
-    return result, judged(gathered(psi, read, noise_sigma, result))
+    return result, judged(gathered(psi, read, typical, result))
 
 
 def verdict_of(
