@@ -105,14 +105,24 @@ def test_where_surfaces_fail_total_variation_is_returned_and_said_to_be(bayer):
     # Views with nothing in common: no disparity explains them.
     views = rng.random((*shape[:2], 6, 7, 3)).repeat(8, axis=2).repeat(8, axis=3)
     frames = bayer.forward(views.astype(np.float32))
-    found = reconstruct_adaptive(bayer, frames, 0.003, quick())
+    found = reconstruct_adaptive(bayer, frames, 0.003, quick().model_copy(update={"free": True}))
     assert "total variation is returned" in found.advice
     assert found.status == "doubtful"
-    assert (found.maps["model"] == MODELS.index("free")).all()
+    free = found.maps["model"] == MODELS.index("free")
+    assert free.mean() > 0.5
     plain = reconstruct_tv(bayer, frames, 0.003).light_field
-    assert np.abs(found.light_field - plain).mean() < 0.02
-    error = np.sqrt(np.square(found.light_field - views).mean())
-    assert 0.4 * error < found.maps["sigma"].mean() < 1.5 * error
+    assert np.abs(found.light_field - plain)[:, :, free].mean() < 0.05
+    surfaces = reconstruct_adaptive(bayer, frames, 0.003, quick()).light_field
+    errors = [float(np.square(one - views).mean()) for one in (found.light_field, surfaces)]
+    assert errors[0] < 0.9 * errors[1]
+    assert 0.2 * errors[0] < np.square(found.maps["sigma"]).mean() < 2.5 * errors[0]
+
+
+def test_surfaces_stay_where_nothing_speaks_against_them(bayer):
+    truth, _ = plane_scene(bayer, 0.7)
+    frames = bayer.forward(truth.astype(np.float32))
+    found = reconstruct_adaptive(bayer, frames, 0.003, quick().model_copy(update={"free": True}))
+    assert (found.maps["model"] == MODELS.index("free")).mean() < 0.2
 
 
 def test_every_reading_counts_by_its_own_noise(bayer):

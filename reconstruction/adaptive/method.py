@@ -8,8 +8,8 @@
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `texture`, `shrinkage`, `refine`).
-5. Where no surface explains the frames total variation decides (`free`), and everywhere when it
-   explains readings that were kept from the fit better than surfaces do.
+5. Where total variation explains readings that were kept from both fits better than surfaces do,
+   it is returned (`free`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 """
@@ -30,7 +30,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.free import freed, misfit, missed_variance
+from reconstruction.adaptive.free import freedom
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.parsimony import (
@@ -41,7 +41,7 @@ from reconstruction.adaptive.parsimony import (
     one_plane,
     plane_bound_db,
 )
-from reconstruction.adaptive.uncertainty import FEWEST, deviation, held_out
+from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import darkness, smooth_guess
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
@@ -55,6 +55,8 @@ COARSE_LENGTH_PX = 8.0
 DIM, TINY = 0.1, 1e-12
 """Mean brightness below which a scene is reconstructed as if it were so bright: what the settings
 call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
+MOSTLY = 0.5
+"""Share of the picture beyond which what surfaces do not explain is told."""
 TRIAL_STEPS = 4
 """Of the fits, with colour and without, that tell whether the scene has any."""
 SHADOW = 0.7
@@ -96,7 +98,7 @@ class AdaptiveSettings(Settings):
         default=40, ge=1, description="of total variation, from which textures begin"
     )
     free: bool = Field(
-        default=True, description="let total variation decide where no surface explains the frames"
+        default=True, description="return total variation where it explains the frames better"
     )
 
 
@@ -163,8 +165,9 @@ def reconstruct_adaptive(
         settings.layers,
         on_step=lambda step: tell(2 + step),
     )
+    seen = found.surfaces.light_field(found.texture) * np.float32(scale)
+    light_field = np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape)
     missed = bright.frames - found.surfaces.forward(found.texture)
-    off = misfit(given.psi, missed, bright.noise, usable)
     kinds = texture_map(volume, psi.size, k)
     doubt = search.variance_per_pixel(volume, psi.size, k)
     maps = {
@@ -172,35 +175,27 @@ def reconstruct_adaptive(
         "disparity_sigma": np.sqrt(doubt),
         "texture": kinds,
         "hidden": found.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
-        "model": model_map(kinds, found, off, k),
+        "model": model_map(kinds, found),
     }
     explained = _explained(missed, data.readings, bright.noise, held)
     masks = shadow(relief(given.psi, given.frames, given.typical, usable))
     decided = _decided(volume)
     judged = _judgement(settings, volume, decided, masks)
-    plainly = (given.frames - given.psi.forward(plain.light_field))[held]
-    surely = missed[held] * scale
-    if held.sum() >= FEWEST and np.square(plainly).mean() < np.square(surely).mean():
-        judged.append(
-            "readings kept from the fit speak against surfaces: total variation is returned"
-        )
-        light_field = reconstruct_tv(
-            given.psi, given.frames, given.typical, usable=usable, start=plain.light_field
-        ).light_field
-        maps["model"][:] = MODELS.index("free")
-        spread = missed_variance(given.psi, plainly, given.noise, held)
-        maps["sigma"] = np.full(light_field.shape[:4], np.sqrt(spread), dtype=np.float32)
-    else:
-        seen = found.surfaces.light_field(found.texture) * np.float32(scale)
-        surface = light_field = np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape)
-        if settings.free:
-            off *= np.float32(scale**2)
-            light_field = freed(given.psi, given.frames, given.typical, usable, surface, off, scale)
-        sure = deviation(found, doubt, bright.frames, bright.noise, held)
-        if sure is not None:
-            # What total variation moved is in doubt by as much.
-            moved = np.square(light_field - surface).mean(axis=-1)
-            maps["sigma"] = np.sqrt(np.square(sure.sigma * np.float32(scale)) + moved)
+    sure = deviation(found, doubt, bright.frames, bright.noise, held)
+    variance = None if sure is None else np.square(sure.sigma * np.float32(scale))
+    if settings.free and variance is not None:
+        rest = given.frames - given.psi.forward(plain.light_field)
+        free = freedom(given.psi, missed * np.float32(scale), rest, given.noise, held)
+        light_field = light_field + free.share[..., None] * (plain.light_field - light_field)
+        variance += free.share * (np.float32(free.variance) - variance)
+        maps["model"][free.share > 0.5] = MODELS.index("free")
+        if free.share.mean() > MOSTLY:
+            judged.append(
+                f"readings kept from the fit speak against surfaces in {free.share.mean():.0%} of "
+                "the picture, where total variation is returned: take more shots"
+            )
+    if variance is not None:
+        maps["sigma"] = np.sqrt(variance)
     tell(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     return Reconstruction(

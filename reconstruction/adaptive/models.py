@@ -15,8 +15,6 @@ SLANTED_PX = 0.01
 """Change of the disparity per pixel beyond which a surface counts as slanted."""
 NEAR_PX = 2
 """Samples around a hidden ray that see two layers."""
-FREE = 0.03
-"""Deviation of the light field from its surfaces beyond which a place counts as free."""
 
 
 def texture_map(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.uint8]:
@@ -28,21 +26,16 @@ def texture_map(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[
     return volume.kind[np.ix_(*nearest)].astype(np.uint8)
 
 
-def model_map(
-    texture: NDArray[np.uint8], scene: Scene, unexplained: NDArray[np.float32], binning: int
-) -> NDArray[np.uint8]:
-    """Return the index in MODELS of every sample of the centre view, (y, x).
+def model_map(texture: NDArray[np.uint8], scene: Scene) -> NDArray[np.uint8]:
+    """Return the index in MODELS of every sample of the centre view, (y, x), of surfaces.
 
-    texture: see `texture_map`. unexplained: the light field's variance off its surfaces, (pixel_y,
-    pixel_x).
+    texture: see `texture_map`.
     """
     textured = texture > 0
     down, right = np.gradient(scene.centre)
     slope = cv2.GaussianBlur(np.hypot(down, right).astype(np.float32), (0, 0), 3.0)
     around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
     layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0
-    far_off = unexplained.repeat(binning, axis=0).repeat(binning, axis=1) > FREE**2
     chosen = np.where(textured, np.where(slope > SLANTED_PX, 2, 1), 0)
     chosen[layered] = 3
-    chosen[far_off] = 4
     return chosen.astype(np.uint8)
