@@ -145,6 +145,9 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
         ratio = even_frames[kept][:, lit] / predicted[:, lit]
         ratio /= np.maximum(ratio.mean(axis=0), 1e-6)
         middle = np.median(ratio, axis=1)
+        if not (middle > 0).all():
+            # So few photons that most pixels of a shot read nothing.
+            return even
         spread = 1.4826 * np.median(np.abs(ratio - middle[:, None]), axis=1).max()
         # Neighbours err alike.
         error = 1.2533 * spread / np.sqrt(lit.sum() / ALIKE_PX**2)
