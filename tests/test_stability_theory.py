@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from emmc_rig.camera_sheet import find_camera
+from emmc_rig.model.errors import CameraError
 from emmc_rig.stability import beside, theory
 from emmc_rig.stability.faults import FAULTS, trial
 from emmc_rig.stability.plan import stability_settings
@@ -172,6 +173,22 @@ def test_parts_are_measured_into_the_folder_of_the_sweeps(tmp_path, monkeypatch)
     rows = (tmp_path / "out" / "theory.csv").read_text("utf-8").splitlines()
     assert rows[0].startswith("scene,fault,strength,bound_db")
     assert len(rows) == 4
+
+
+def test_nothing_is_written_for_a_wrong_camera_or_no_part(tmp_path):
+    settings = stability_settings(True, ["near-planar"], None)
+    assert beside.measure_beside(settings, [], tmp_path / "out", Counted()).sections == []
+    wrong = settings.model_copy(update={"camera": "rgbw-mno"})
+    with pytest.raises(CameraError, match="rgbw-mno"):
+        beside.measure_beside(wrong, ["theory"], tmp_path / "out", Counted())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_part_that_does_not_apply_is_left_out_in_words(tmp_path):
+    settings = stability_settings(True, ["near-planar"], (32, 40), camera="rgbw-mono")
+    found = beside.measure_beside(settings, ["mismatch"], tmp_path / "out", Counted())
+    assert found.sections == []
+    assert "colour filter" in found.told[0]
 
 
 def test_the_command_has_a_switch_for_each_part():

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from emmc_rig.camera_sheet import find_camera
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
 from emmc_rig.journal import open_folder
@@ -41,6 +42,7 @@ from emmc_rig.stability.theory_section import (
     rank_correlation,
     theory_sections,
 )
+from emmc_rig.stability.trial import NotApplicableError
 
 DRAWN = "charts"
 DEFAULT_SIZE = (96, 128)
@@ -115,7 +117,10 @@ def _mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Be
         settings.fast, settings.scenes, settings.camera, settings.size or DEFAULT_SIZE,
         settings.zoom, QUICK_METHODS if settings.fast else METHODS_JUDGED, settings.seed,
     )  # fmt: skip
-    found = measure_mismatch(chosen, folder, watcher)
+    try:
+        found = measure_mismatch(chosen, folder, watcher)
+    except NotApplicableError as fault:
+        return Beside([], {}, [f"mismatch left out: {fault}"])
     rows = [
         {
             **{key: _finite(value) for key, value in asdict(one).items()},
@@ -147,6 +152,9 @@ def measure_beside(
     Raises StabilityStopped at Ctrl-C, AppError for wrong input and a folder that cannot be
     written, and the errors of the layers below; points that are done are kept in each case.
     """
+    if not parts:
+        return Beside([], {}, [])
+    find_camera(settings.camera)  # raises before anything is written
     folder = open_folder(out, POINTS, "an earlier sweep")
     sections, metrics, lines = [], {}, []
     try:
