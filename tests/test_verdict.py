@@ -80,6 +80,13 @@ def test_a_psi_without_its_camera_tells_no_displacement(three):
     assert displaced(bare, relief_in(bare, grey(bare))) is None
 
 
+def test_a_coded_aperture_casts_no_shadow_that_could_tell():
+    psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
+    found = relief_in(psi, grey(psi) * (1 + 0.1 * np.random.default_rng(0).random(SIZE)))
+    assert np.isnan(shadow(found).strength).all()
+    assert displaced(psi, found) is None
+
+
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
     gains = np.array([1.1, 0.9, 1.0])
     found = compared(three, relief_in(three, grey(three) * gains[:, None, None]))
