@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.differences import norm_squared
+from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
@@ -56,17 +57,19 @@ def contrast(guess: Array) -> float:
     return max(float(guess.std()), 0.05 * float(np.abs(guess).max()), 1e-12)
 
 
-def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def smooth_guess(psi: ImagingMatrix | FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
 
     Every colour is the ratio of blurred back-projections, as if all views were equal.
     """
+    flat = psi if isinstance(psi, FlatPsi) else flat_psi(psi)
     kept = np.where(usable, frames, 0).astype(np.float32)
-    seen = psi.forward(np.ones(psi.light_field_shape, dtype=np.float32)) * usable
-    top = psi.adjoint(kept).sum(axis=(0, 1))
-    bottom = psi.adjoint(seen).sum(axis=(0, 1))
-    deviation = BLUR_SAMPLES * psi.binning
-    blurred = [cv2.GaussianBlur(image, (0, 0), deviation) for image in (top, bottom)]
+    seen = flat.forward(np.ones(flat.weights.shape[1:], dtype=np.float32)) * usable
+    deviation = BLUR_SAMPLES * flat.binning
+    blurred = [
+        cv2.GaussianBlur(flat.adjoint(image).astype(np.float32), (0, 0), deviation)
+        for image in (kept, seen)
+    ]
     floor = 1e-3 * float(blurred[1].mean())
     return np.maximum(blurred[0], 0) / np.maximum(blurred[1], floor)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
+from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.neighbour_kernels import neighbour_range
 
 Array = NDArray[np.floating]
@@ -62,10 +63,10 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     frames, usable: (shot, pixel_y, pixel_x), finite where usable. Where nothing is found they
     come back as they are.
     """
-    told = []
-    dark = dark_shots(psi, frames, usable)
+    told, flat = [], flat_psi(psi)
+    dark = dark_shots(flat, frames, usable)
     usable = _without(usable, dark)
-    double = double_shots(psi, frames, usable)
+    double = double_shots(flat, frames, usable)
     usable = _without(usable, double)
     if dark:
         told.append(f"left out {_shots(dark)}: dark, while the others are not")
@@ -74,12 +75,12 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
             f"left out {_shots(double)}: the same as one before, although the masks should have "
             "moved; look at the stage"
         )
-    gains = shot_gains(psi, frames, usable)
+    gains = shot_gains(flat, frames, usable)
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
         told.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
-    bad = bad_pixels(psi, frames, usable)
+    bad = bad_pixels(flat, frames, usable)
     if bad.any():
         usable = usable & ~bad
         told.append(
@@ -88,10 +89,9 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     return Screened(frames, usable, tuple(told), dark, double, gains, bad)
 
 
-def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that no light of the scene reached, while it reached others."""
-    lit = psi.weights.sum(axis=(1, 2, 4), dtype=np.float64)
-    expected = lit.mean(axis=(1, 2)) * psi.binning**2
+    expected = flat.weights.sum(axis=-1).mean(axis=(1, 2)) * flat.binning**2
     seen = np.array(
         [
             float(frame[kept].mean()) if kept.any() else np.nan
@@ -105,13 +105,13 @@ def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     return tuple(int(shot) for shot in np.flatnonzero(dark))
 
 
-def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that repeat another although Psi says that they differ.
 
     Of two such the one that fits its part of Psi worse is meant.
     """
-    kept = [shot for shot in range(psi.shots) if usable[shot].any()]
-    predicted = _predicted(psi, frames, usable)
+    kept = [shot for shot in range(len(frames)) if usable[shot].any()]
+    predicted = _predicted(flat, frames, usable)
     found: list[int] = []
     for place, shot in enumerate(kept):
         for other in kept[:place]:
@@ -125,26 +125,29 @@ def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -
     return tuple(sorted(found))
 
 
-def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return the brightness of the light in every shot, mean 1; all 1 where none is sure.
 
     What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
     every shot: the scene's texture is in all of them. The median over the pixels tells the light.
     """
-    even = np.ones(psi.shots)
+    even = np.ones(len(frames))
     kept = np.flatnonzero(usable.any(axis=(1, 2)))
     if len(kept) < 2:
         return even
     gains, error = even.copy(), np.inf
     for _ in range(GAIN_STEPS):
-        flat = frames / gains[:, None, None]
-        predicted = _predicted(psi, flat, usable)[kept]
+        even_frames = frames / gains[:, None, None]
+        predicted = _predicted(flat, even_frames, usable)[kept]
         lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
         if lit.sum() < FEWEST_LIT:
             return even
-        ratio = flat[kept][:, lit] / predicted[:, lit]
+        ratio = even_frames[kept][:, lit] / predicted[:, lit]
         ratio /= np.maximum(ratio.mean(axis=0), 1e-6)
         middle = np.median(ratio, axis=1)
+        if not (middle > 0).all():
+            # So few photons that most pixels of a shot read nothing.
+            return even
         spread = 1.4826 * np.median(np.abs(ratio - middle[:, None]), axis=1).max()
         # Neighbours err alike.
         error = 1.2533 * spread / np.sqrt(lit.sum() / ALIKE_PX**2)
@@ -155,7 +158,7 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     return gains
 
 
-def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
 
     What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
@@ -164,8 +167,8 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
     them: to leave out a good pixel costs little, to miss a bad one much.
     """
-    k = psi.binning
-    bad = np.zeros(psi.frames_shape[1:], dtype=bool)
+    k = flat.binning
+    bad = np.zeros(frames.shape[1:], dtype=bool)
     one_colour = np.zeros(bad.shape, dtype=np.uint8)
     low, high = np.empty((2, *bad.shape), dtype=np.float32)
     widths = BAD_WIDTHS
@@ -173,13 +176,13 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
         kept = usable & ~bad
         if not kept.any():
             break
-        predicted = _predicted(psi, frames, kept)
+        predicted = _predicted(flat, frames, kept)
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
         for shot in np.flatnonzero(kept.any(axis=(1, 2))):
             least = max(LEAST * float(predicted[shot].mean()), 1e-12)
             guess = np.maximum(predicted[shot], least)
             ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
-            colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
+            colours = one_colour if flat.colour is None else flat.colour[shot, ::k, ::k]
             neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
             known = np.isfinite(low) & usable[shot]
             if not known.any():
@@ -196,10 +199,9 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     return bad
 
 
-def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def _predicted(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return what a smooth picture, the same in all views, reads."""
-    picture = smooth_guess(psi, frames, usable).astype(psi.weights.dtype)
-    return psi.forward(np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape)))
+    return flat.forward(smooth_guess(flat, frames, usable))
 
 
 def _square(difference: Array, where: NDArray[np.bool_]) -> float:

@@ -8,6 +8,7 @@ import pytest
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.stability.faults import FAULTS, trial
+from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.neighbour_kernels import neighbour_range
 from reconstruction.screening import bad_pixels, screened
@@ -41,6 +42,19 @@ def test_the_range_of_neighbours_is_that_of_numpy():
         else:
             step = int(0.1 * (len(around) - 1) + 0.5)
             assert (low[y, x], high[y, x]) == (around[step], around[-1 - step])
+
+
+@pytest.mark.parametrize("stored", [1, 3])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_picture_in_all_views_is_seen_as_psi_sees_it(random_psi, stored, binning):
+    psi = random_psi(shots=2, stored=stored, binning=binning)
+    flat, rng = flat_psi(psi), np.random.default_rng(1)
+    picture = rng.random((*psi.size, 3), dtype=np.float32)
+    everywhere = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
+    assert flat.forward(picture) == pytest.approx(psi.forward(everywhere), rel=1e-5)
+    frames = rng.random(psi.frames_shape, dtype=np.float32)
+    summed = psi.adjoint(frames).sum(axis=(0, 1))
+    assert flat.adjoint(frames) == pytest.approx(summed, rel=1e-4, abs=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "rgbw-mono"])
@@ -88,7 +102,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
     bad = ~told.usable[0]
     # A dead pixel in the shade, or one that hardly glows, does no harm.
     harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
-    found = bad_pixels(one.psi, one.readings, one.usable)
+    found = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
     assert harmful[bad].mean() > 0.5
     assert found[bad & harmful].mean() > 0.7
     assert found[~bad].mean() < 0.05
@@ -96,7 +110,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
 
 def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
     told = made("masked-pixels", 10)
-    found = bad_pixels(told.psi, told.readings, told.usable)
+    found = bad_pixels(flat_psi(told.psi), told.readings, told.usable)
     assert not found[~told.usable[0]].any()
     assert found[told.usable[0]].mean() < 0.01
 
@@ -136,6 +150,13 @@ def test_screening_costs_good_frames_next_to_nothing(method):
         for on in (True, False)
     ]
     assert abs(levels[0] - levels[1]) < 0.1
+
+
+def test_frames_of_a_few_photons_pass_as_they_are():
+    seen = screen(made("exposure", 3))
+    assert np.isfinite(seen.frames).all()
+    assert (seen.gains == 1).all()
+    assert not seen.dark
 
 
 def test_nothing_is_found_where_nothing_is_to_be_seen():
