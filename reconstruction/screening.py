@@ -72,8 +72,8 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
         told.append(f"left out {_shots(dark)}: dark, while the others are not")
     if double:
         told.append(
-            f"left out {_shots(double)}: the same as one before, although the masks should have "
-            "moved; look at the stage"
+            f"left out {_shots(double)}: the same as another, although by Psi the masks moved; "
+            "look at the stage, or measure Psi again"
         )
     gains = shot_gains(flat, frames, usable)
     if (gains != 1).any():
