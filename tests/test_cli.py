@@ -252,7 +252,13 @@ def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
 def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
     from emmc_rig import demo
 
-    for stage in ("fine_scene", "capture_whiteboards", "capture_shots", "reconstruct", "ssim"):
+    for stage in (
+        "fine_scene",
+        "capture_whiteboards",
+        "capture_shots",
+        "reconstruct_judged",
+        "ssim",
+    ):
 
         def interrupted(*arguments, **settings):
             raise KeyboardInterrupt

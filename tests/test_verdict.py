@@ -69,15 +69,25 @@ def test_an_even_scene_behind_a_displaced_mask_tells_the_displacement():
     )
     psi, true = build_imaging_matrix(camera, SIZE), build_imaging_matrix(moved, SIZE)
     found = displaced(psi, relief_in(psi, grey(true)))
+    still = displaced(psi, relief_in(psi, grey(psi)))
+    assert found is not None
+    assert still is not None
     # Samples of 24 um.
     assert found.shift == pytest.approx((-0.2, 0.1), abs=0.03)
     assert found.size_px == pytest.approx(np.hypot(0.2, 0.1), abs=0.03)
-    assert displaced(psi, relief_in(psi, grey(psi))).size_px < 0.02
+    assert still.size_px < 0.02
 
 
 def test_a_psi_without_its_camera_tells_no_displacement(three):
     bare = ImagingMatrix(three.weights, three.colour, three.binning)
     assert displaced(bare, relief_in(bare, grey(bare))) is None
+
+
+def test_a_coded_aperture_casts_no_shadow_that_could_tell():
+    psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
+    found = relief_in(psi, grey(psi) * (1 + 0.1 * np.random.default_rng(0).random(SIZE)))
+    assert np.isnan(shadow(found).strength).all()
+    assert displaced(psi, found) is None
 
 
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
@@ -128,11 +138,13 @@ def test_readings_kept_tell_what_is_explained_and_what_is_noise(three):
     frames = (clean + sigma * rng.normal(size=clean.shape)).astype(np.float32)
     kept = rng.random(clean.shape) < 0.3
     found = foretold(three, frames, sigma, kept, truth, relief_in(three, frames, sigma))
+    assert found is not None
     assert found.readings == kept.sum()
     assert found.noise == pytest.approx(1, abs=0.1)
     assert found.explained == pytest.approx(1, abs=0.1)
     assert found.missed == pytest.approx(sigma / frames[kept].mean(), rel=0.05)
     off = foretold(three, frames, sigma, kept, truth * 0.9, relief_in(three, frames, sigma))
+    assert off is not None
     expected = sigma**2 / np.mean(np.square(frames - 0.9 * clean)[kept])
     assert off.noise == pytest.approx(expected, rel=0.05)
     few = np.zeros_like(kept)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.shadow import Relief, relief_of, tiles
+from reconstruction.verdict.shadow import LEAST_RELIEF, Relief, relief_of, tiles
 
 Array = NDArray[np.floating]
 STEP_PX = 0.25
@@ -25,7 +25,6 @@ DISTANCE_STEP = 0.1
 VIGNETTING_STEP = 0.3
 ALIKE = 0.5
 """Correlation below which the design says nothing about a Psi."""
-LEAST_RELIEF = 0.02
 
 
 @dataclass(frozen=True)

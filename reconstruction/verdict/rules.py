@@ -47,8 +47,8 @@ UNEXPLAINED = Limits(0.75, 1.1)
 """Beyond 1: the smooth picture alone foretells the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
-ADAPTIVE = 0.7
-"""Of the limits on Psi's errors, for the adaptive methods."""
+OTHERS = 0.7
+"""Of the limits on Psi's errors, for all methods but tv: they lose 3 dB sooner."""
 LEFT_OUT = Limits(0.4, 1.0)
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
@@ -176,10 +176,10 @@ def _masks_fit(e: Evidence) -> bool:
 def _patience(e: Evidence, power: float) -> float:
     """Return by how much errors of Psi weigh less than on one shot reconstructed by tv.
 
-    They set several shots against one another, and mislead methods that look for disparities.
+    They set several shots against one another, and mislead methods that assume more than tv.
     """
     shots = sum(one is not None for one in e.strengths)
-    return shots**-power * (ADAPTIVE if e.method.startswith("adaptive") else 1)
+    return shots**-power * (1 if e.method == "tv" else OTHERS)
 
 
 def _masks(e: Evidence) -> Iterator[Reason]:

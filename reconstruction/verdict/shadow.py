@@ -25,6 +25,8 @@ LOCAL_PX = 2.0
 """Deviation of the window over which the scene's texture is judged."""
 DIMMEST = 0.05
 """Share of the typical expected reading below which a pixel tells nothing."""
+LEAST_RELIEF = 0.02
+"""Of the masks, over the readings, below which they tell nothing (a coded aperture has none)."""
 TILE_PX = 24
 
 
@@ -176,7 +178,7 @@ def cross_strength(found: Relief) -> NDArray[np.float64]:
 def _slope(masks: Array, seen: Array, weight: Array) -> tuple[float, float]:
     """Return the weighted regression of seen on masks and its deviation; NaN if untold."""
     square = float((weight * np.square(masks, dtype=np.float64)).sum())
-    if square <= 0:
+    if square <= LEAST_RELIEF**2 * float(weight.sum(dtype=np.float64)):
         return np.nan, np.nan
     slope = float((weight * masks * seen).sum(dtype=np.float64)) / square
     left = np.square(weight * masks * (seen - slope * masks), dtype=np.float64)
