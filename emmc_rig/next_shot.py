@@ -262,6 +262,6 @@ def total_savings(rows: Sequence[Saving]) -> Iterator[str]:
         fixed = max(count for _, count in served)
         met = sum(row.stopped.psnr_db >= target_db for row, _ in served)
         yield (
-            f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it in "
-            f"truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
+            f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it "
+            f"in truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
         )

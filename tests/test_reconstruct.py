@@ -128,6 +128,7 @@ def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames,
         shapes = {name: values.shape for name, values in file.items()}
     assert shapes == {
         "disparity": SIZE,
+        "disparity_sigma": SIZE,
         "hidden": SIZE,
         "model": SIZE,
         "texture": SIZE,
