@@ -10,15 +10,6 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.table import Table
 
 from calibration.errors import CalibrationError
@@ -30,12 +21,12 @@ from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
 from emmc_rig.live.cli import live
 from emmc_rig.model.errors import ModelError
+from emmc_rig.progress import console, shown_bars
 from emmc_rig.session.cli import app as session
 from reconstruction.errors import ReconstructionError
 
 if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
-    from reconstruction.result import Progress as SolverProgress
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
@@ -55,7 +46,6 @@ app.add_typer(session, name="session")
 app.command()(capture)
 app.command()(live)
 app.command()(calibrate)
-console = Console(stderr=True)
 
 SceneOption = Annotated[
     str,
@@ -77,55 +67,6 @@ DictionaryOption = Annotated[
     str | None,
     typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
 ]
-
-
-class Bars:
-    """A `Watcher` that draws progress bars on a terminal, and plain lines elsewhere."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._task: TaskID | None = None
-
-    def begin(self, stage: str, steps: int | None) -> None:
-        """Finish the stage before and start a bar."""
-        self.finish()
-        self._task = self._progress.add_task(stage, total=steps, detail="")
-        if not console.is_terminal:
-            console.print(stage)
-
-    def step(self, detail: str) -> None:
-        """Advance the current bar."""
-        if self._task is not None:
-            self._progress.update(self._task, advance=1, detail=detail)
-
-    def advance(self, progress: SolverProgress) -> None:
-        """Show how far a solver is."""
-        if self._task is not None:
-            change = progress.relative_change
-            detail = "" if change is None else f"change {change:.1e}"
-            self._progress.update(
-                self._task, completed=progress.step, total=progress.total, detail=detail
-            )
-
-    def finish(self) -> None:
-        """Fill the current bar: a solver may stop before its last step."""
-        if self._task is not None:
-            done = self._progress.tasks[-1].completed or 1
-            self._progress.update(self._task, total=done, completed=done, detail="")
-
-
-def shown_progress() -> Progress:
-    """Return bars for a `Bars` to draw on."""
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[detail]}"),
-        console=console,
-        disable=not console.is_terminal,
-    )
 
 
 def _shown(value: object) -> str:
@@ -196,10 +137,8 @@ def demo(
     )
     for warning in described.warnings():
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         metrics = run_demo(settings, folder, bars)
-        bars.finish()
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     typer.echo(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
@@ -347,8 +286,7 @@ def reconstruct(
             raise typer.BadParameter(
                 "--truth needs the whole light field in memory, without --tile"
             )
-        with result_folder(out) as folder, shown_progress() as progress:
-            bars = Bars(progress)
+        with result_folder(out) as folder, shown_bars() as bars:
             bars.begin(f"{method} in tiles", None)
             metrics = run_in_tiles(
                 frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
@@ -356,14 +294,12 @@ def reconstruct(
         typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
         typer.echo(f"read {out / 'light_field.h5'}")
         return
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         bars.begin(method, None)
         metrics = run_reconstruct(
             frames, folder, method, psi, dictionary, chosen, truth,
             lambda step: bars.advance(step), why,
         )  # fmt: skip
-        bars.finish()
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
@@ -458,10 +394,8 @@ def chart(
         methods=tuple(method or []), scaling=scaling, dictionary=dictionary, seed=seed,
     )  # fmt: skip
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             outcome = run_chart(settings, place, bars)
-            bars.finish()
     except ChartStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
@@ -524,10 +458,8 @@ def train(
     }
     settings = train_settings(out, scenes or (), leave_out or (), grid, kind, chosen, resume)
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             dictionary, told = run(settings, bars)
-            bars.finish()
     except InterruptedTrainingError as stop:
         _fail(str(stop), INTERRUPTED)
     last = told["history"][-1]
@@ -567,10 +499,8 @@ def tables(
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
-            bars.finish()
     except TablesStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
@@ -611,11 +541,9 @@ def _chart_next_shot(
 
     described = find_camera(camera)
     folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
-    with shown_progress() as progress:
-        bars = Bars(progress)
+    with shown_bars() as bars:
         bars.begin("capture and judge", None)
         found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
-        bars.finish()
     names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
     table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]
