@@ -15,6 +15,8 @@ from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import load_hdf5, load_views, shifted
 from simulators.scenes import SCENES, render
 
+APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
+"""How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""
 _DEFAULT_VIEWS, _DEFAULT_SIZE_PX = (5, 5), (192, 256)
 _HDF5_ENDINGS = (".h5", ".hdf5")
 
