@@ -10,15 +10,6 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.table import Column, Table
 
 from calibration.errors import CalibrationError
@@ -30,12 +21,12 @@ from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
 from emmc_rig.live.cli import live
 from emmc_rig.model.errors import ModelError
+from emmc_rig.progress import console, shown_bars
 from emmc_rig.session.cli import app as session
 from reconstruction.errors import ReconstructionError
 
 if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
-    from reconstruction.result import Progress as SolverProgress
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 INTERRUPTED = 130
@@ -55,7 +46,6 @@ app.add_typer(session, name="session")
 app.command()(capture)
 app.command()(live)
 app.command()(calibrate)
-console = Console(stderr=True)
 
 SceneOption = Annotated[
     str,
@@ -77,55 +67,6 @@ DictionaryOption = Annotated[
     str | None,
     typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
 ]
-
-
-class Bars:
-    """A `Watcher` that draws progress bars on a terminal, and plain lines elsewhere."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._task: TaskID | None = None
-
-    def begin(self, stage: str, steps: int | None) -> None:
-        """Finish the stage before and start a bar."""
-        self.finish()
-        self._task = self._progress.add_task(stage, total=steps, detail="")
-        if not console.is_terminal:
-            console.print(stage)
-
-    def step(self, detail: str) -> None:
-        """Advance the current bar."""
-        if self._task is not None:
-            self._progress.update(self._task, advance=1, detail=detail)
-
-    def advance(self, progress: SolverProgress) -> None:
-        """Show how far a solver is."""
-        if self._task is not None:
-            change = progress.relative_change
-            detail = "" if change is None else f"change {change:.1e}"
-            self._progress.update(
-                self._task, completed=progress.step, total=progress.total, detail=detail
-            )
-
-    def finish(self) -> None:
-        """Fill the current bar: a solver may stop before its last step."""
-        if self._task is not None:
-            done = self._progress.tasks[-1].completed or 1
-            self._progress.update(self._task, total=done, completed=done, detail="")
-
-
-def shown_progress() -> Progress:
-    """Return bars for a `Bars` to draw on."""
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[detail]}"),
-        console=console,
-        disable=not console.is_terminal,
-    )
 
 
 def _shown(value: object) -> str:
@@ -196,10 +137,8 @@ def demo(
     )
     for warning in described.warnings():
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         metrics = run_demo(settings, folder, bars)
-        bars.finish()
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     typer.echo(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
@@ -351,8 +290,7 @@ def reconstruct(
             raise typer.BadParameter(
                 "--truth needs the whole light field in memory, without --tile"
             )
-        with result_folder(out) as folder, shown_progress() as progress:
-            bars = Bars(progress)
+        with result_folder(out) as folder, shown_bars() as bars:
             bars.begin(f"{method} in tiles", None)
             metrics = run_in_tiles(
                 frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
@@ -361,14 +299,12 @@ def reconstruct(
         typer.echo(f"read {out / 'light_field.h5'}")
         _end_with_verdict(metrics["verdict"], strict)
         return
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         bars.begin(method, None)
         metrics = run_reconstruct(
             frames, folder, method, psi, dictionary, chosen, truth,
             lambda step: bars.advance(step), why,
         )  # fmt: skip
-        bars.finish()
     for line in metrics["screening"]:
         console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
     for line in metrics.get("left_out", ()):
@@ -483,10 +419,8 @@ def chart(
         methods=tuple(method or []), scaling=scaling, dictionary=dictionary, seed=seed,
     )  # fmt: skip
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             outcome = run_chart(settings, place, bars)
-            bars.finish()
     except ChartStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
@@ -549,10 +483,8 @@ def train(
     }
     settings = train_settings(out, scenes or (), leave_out or (), grid, kind, chosen, resume)
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             dictionary, told = run(settings, bars)
-            bars.finish()
     except InterruptedTrainingError as stop:
         _fail(str(stop), INTERRUPTED)
     last = told["history"][-1]
@@ -592,10 +524,8 @@ def tables(
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
-            bars.finish()
     except TablesStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
@@ -680,14 +610,12 @@ def stability(
         screening={None: "both", True: "on", False: "off"}[screening],
     )  # fmt: skip
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             planned(settings)  # raises for wrong names before anything is measured
             switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
             wanted = [name for name, on in switches.items() if on]
             beside = measure_beside(settings, wanted, out, bars)
             outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
-            bars.finish()
     except StabilityStopped as stop:
         _fail(str(stop), INTERRUPTED)
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
@@ -721,10 +649,8 @@ def _stability_verdicts(
         fast, scenes or [], camera, faults or [], methods or [], size, seed
     )
     try:
-        with shown_progress() as progress:
-            bars = Bars(progress)
+        with shown_bars() as bars:
             results = run_detector(settings, out, bars)
-            bars.finish()
     except KeyboardInterrupt:
         _fail(f"stopped by Ctrl-C; what is judged is kept in {out}: run it again", INTERRUPTED)
     table = Table(
@@ -778,11 +704,9 @@ def _chart_next_shot(
 
     described = find_camera(camera)
     folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
-    with shown_progress() as progress:
-        bars = Bars(progress)
+    with shown_bars() as bars:
         bars.begin("capture and judge", None)
         found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
-        bars.finish()
     names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
     table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]

@@ -35,13 +35,12 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.output import command_line, save_frames, versions, write_metrics
 from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.report import ReportContent, write_report
-from emmc_rig.scene import fine_scene
+from emmc_rig.scene import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
-APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 Array = NDArray[np.floating]
 
 

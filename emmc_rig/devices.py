@@ -7,7 +7,6 @@ Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and
 from __future__ import annotations
 
 import logging
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,11 +21,10 @@ from rich.table import Table
 
 from emmc_rig.camera_commands import register, simulated_protocol
 from emmc_rig.errors import AppError
+from emmc_rig.signals import ENDING, handled
 
 if TYPE_CHECKING:
     from drivers.stage import HostStage
-
-INTERRUPTING = ("SIGTERM", "SIGHUP")
 
 app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
 _told = Console(stderr=True)
@@ -282,13 +280,8 @@ def _signals_interrupt() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    known = [getattr(signal, name) for name in INTERRUPTING if hasattr(signal, name)]
-    before = {number: signal.signal(number, interrupt) for number in known}
-    try:
+    with handled(interrupt, ENDING):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _show(stage: HostStage) -> None:

@@ -109,7 +109,7 @@ def preview(frame: RawFrame) -> NDArray[np.uint8]:
     scale = LONGEST_PREVIEW_PX / max(linear.shape[:2])
     if scale < 1:
         linear = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return srgb_codes(linear)
+    return srgb_codes(np.asarray(linear, np.float32))
 
 
 def srgb_codes(linear: Array) -> NDArray[np.uint8]:

@@ -29,14 +29,8 @@ from emmc_rig.errors import AppError
 from emmc_rig.journal import Journal, digest_of
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.rig_config import (
-    APERTURE_FACTOR,
-    PIXEL_FACTOR,
-    SIMULATED,
-    ImagedRig,
-    rig_description,
-)
-from emmc_rig.scene import fine_scene
+from emmc_rig.rig_config import SIMULATED, ImagedRig, rig_description
+from emmc_rig.scene import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
 from reconstruction.methods import reconstruct

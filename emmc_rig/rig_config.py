@@ -14,11 +14,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.hardware import Rig, open_camera, open_stage, simulated_rig
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings, read_yaml, validated
-from emmc_rig.scene import fine_scene
+from emmc_rig.scene import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from simulators.bench import RAYS_PER_VIEW
 
 SIMULATED = "simulated"
-APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 Ask = Callable[[str], None]
 
 
@@ -134,9 +133,10 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         )
         height, width = fine.scene.light_field.shape[2:4]
         clock = SYSTEM_CLOCK if imaged.real_time else None
-        yield simulated_rig(camera, fine.samples, (height, width), imaged.seed, clock, imaged.rays)[
-            0
-        ]
+        rig, _ = simulated_rig(
+            camera, fine.samples, (height, width), imaged.seed, clock, imaged.rays
+        )
+        yield rig
         return
     real = validated(RealRig, settings, "the rig", AppError)
     with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:

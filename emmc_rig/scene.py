@@ -17,6 +17,8 @@ from emmc_rig.model.lightfield import load_hdf5, load_views, shifted
 from simulators.raycaster import World
 from simulators.scenes import SCENES, render
 
+APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
+"""How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""
 _DEFAULT_VIEWS, _DEFAULT_SIZE_PX = (5, 5), (192, 256)
 _HDF5_ENDINGS = (".h5", ".hdf5")
 

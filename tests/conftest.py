@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import exit_code
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
@@ -41,6 +42,19 @@ def pytest_collection_modifyitems(config, items):
             if not config.getoption(f"--{device}"):
                 reason = f"no real {device}: name one with --{device}"
                 item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run the program in a folder of its own: exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        code = exit_code(*arguments)
+        shown = capsys.readouterr()
+        return code, shown.out, shown.err
+
+    return call
 
 
 @pytest.fixture(scope="session")

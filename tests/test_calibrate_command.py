@@ -1,7 +1,6 @@
 """`emmc-rig calibrate`: what it writes, what it says, and what it refuses."""
 
 import json
-import sys
 
 import h5py
 import numpy as np
@@ -10,7 +9,6 @@ import yaml
 
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
-from emmc_rig import cli
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
 from emmc_rig.calibrate.checks.command import run_checks
 from emmc_rig.calibrate.checks.scenes import moved_truth
@@ -48,22 +46,6 @@ def camera_file(tmp_path_factory):
         )
     )
     return path
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run the program in-process: returns exit code, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        shown = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else code), shown.out, shown.err
-
-    return call
 
 
 def test_calibrate_writes_psi_its_uncertainty_and_a_page(run, camera_file, tmp_path):

@@ -1,13 +1,12 @@
 """A session's whiteboards to Psi: planned by `calibrate --plan`, captured, fitted, used."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 import yaml
+from programs import exit_code
 
-from emmc_rig import cli
 from emmc_rig.capture.plan import load_plan
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
@@ -19,28 +18,15 @@ SIZE = (32, 48)
 RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "32x48", "--rays", "1024")
 
 
-def program(*arguments):
-    """Run the program in this process and return its exit code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    return stop.value.code or 0
-
-
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory):
     """A folder with a plan of `calibrate --plan` and its session."""
     folder = tmp_path_factory.mktemp("calibrated")
     plan = ("calibrate", "--plan", "--size", "32x48", "--out", folder / "plan")
-    assert program(*plan) == 0
+    assert exit_code(*plan) == 0
     out = folder / "session"
-    assert program("capture", folder / "plan" / "plan.yaml", *RIG, "--out", out) == 0
+    assert exit_code("capture", folder / "plan" / "plan.yaml", *RIG, "--out", out) == 0
     return folder
-
-
-def relative(psi, other):
-    return float(np.linalg.norm(psi.weights - other.weights) / np.linalg.norm(other.weights))
 
 
 def test_the_plan_written_is_one_that_captures(captured):
@@ -56,7 +42,7 @@ def test_the_plan_written_is_one_that_captures(captured):
 
 def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
     out = captured / "calibration"
-    assert program("calibrate", captured / "session", "--out", out) == 0
+    assert exit_code("calibrate", captured / "session", "--out", out) == 0
     told = capsys.readouterr().out
     assert "of the noise's variance" in told
     metrics = json.loads((out / "metrics.json").read_text())
@@ -69,7 +55,7 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     session = Session(captured / "session")
     design = build_imaging_matrix(camera_of(session), SIZE)
     psi = ImagingMatrix.load(out / "psi.h5")
-    assert relative(design, psi) > 10 * judged["relative_error"]
+    assert design.relative_difference(psi) > 10 * judged["relative_error"]
     assert "session" in (out / "report.html").read_text()
 
 
@@ -82,7 +68,7 @@ def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
 
 
 def test_a_route_without_its_whiteboards_says_which_plan_has_them(captured, capsys):
-    code = program("calibrate", captured / "session", "--route", "free", "--out", captured / "no")
+    code = exit_code("calibrate", captured / "session", "--route", "free", "--out", captured / "no")
     told = capsys.readouterr().err
     assert code == 1
     assert "--plan" in told or "view" in told
@@ -97,5 +83,5 @@ def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path
         path = tmp_path / "plan.yaml"
         plan = {"camera": "rgbw-bayer-1shot", "shots": [{}], "whiteboards": wrong}
         path.write_text(yaml.safe_dump(plan))
-        assert program("capture", path, *RIG, "--out", tmp_path / "out") == 1
+        assert exit_code("capture", path, *RIG, "--out", tmp_path / "out") == 1
         assert line in capsys.readouterr().err.replace("\n", " ")

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,8 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from programs import program
 
-from emmc_rig import cli
 from emmc_rig.session.listing import sessions_in
 from emmc_rig.session.session import Session, only_program
 from emmc_rig.session.storage import part_of
@@ -33,25 +32,11 @@ PLAN = {
 }
 
 
-def caller(monkeypatch, capsys, folder):
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("COLUMNS", "160")
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        shown = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else code), shown.out, shown.err
-
-    return call
-
-
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run the program in-process: returns exit code, standard output and standard error."""
-    return caller(monkeypatch, capsys, tmp_path)
+def run(run, monkeypatch):
+    """Run the program in this process: exit code, standard output and standard error."""
+    monkeypatch.setenv("COLUMNS", "160")
+    return run
 
 
 def one_line(text):
@@ -78,13 +63,9 @@ def captured(tmp_path_factory):
 
 def capture(*arguments):
     """Capture without a terminal; returns standard output and standard error."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        patch.setattr(sys, "argv", ["emmc-rig", "capture", *map(str, arguments), *RIG])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    assert not stop.value.code, err.getvalue()
-    return out.getvalue(), err.getvalue()
+    code, out, err = program("capture", *arguments, *RIG)
+    assert code == 0, err
+    return out, err
 
 
 def test_two_captures_of_one_plan_are_the_same_byte_for_byte(captured):

@@ -5,13 +5,11 @@ import html.parser
 import json
 import os
 import re
-import sys
 
 import cv2
 import numpy as np
 import pytest
 
-from emmc_rig import cli
 from emmc_rig.chart import lock, measure, plan
 from emmc_rig.chart import run as chart_run
 from emmc_rig.chart.captures import Capture, kept_capture
@@ -60,15 +58,12 @@ def settings(**more):
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
+def command(run):
+    """Run the program: exit code, standard output, and standard error on one line."""
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        told = capsys.readouterr()
-        return stop.value.code, told.out, " ".join(told.err.split())
+        code, out, err = run(*arguments)
+        return code, out, " ".join(err.split())
 
     return call
 

@@ -12,25 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig import cli
-
 SMALL = ["--size", "24x32"]
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run the program in-process: returns exit code, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        shown = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else code), shown.out, shown.err
-
-    return call
 
 
 def views_in(folder, rows=2, columns=2, size=(24, 32)):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,6 @@ from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
-from emmc_rig import cli
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import open_stage, probe_port
 from emmc_rig.stage_config import parse_stage
@@ -35,20 +35,10 @@ QUICK = AxisSpec(max_speed_um_s=100_000.0, acceleration_um_s2=1e7, start_um=500.
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run `emmc-rig devices` in-process: returns exit code, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
+def run(run, monkeypatch):
+    """Run `emmc-rig devices` in this process: exit code, standard output and standard error."""
     monkeypatch.setenv("COLUMNS", "150")
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", "devices", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        shown = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else code), shown.out, shown.err
-
-    return call
+    return partial(run, "devices")
 
 
 def usb_port(device, product):

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import pytest
 import uvicorn
+from programs import exit_code
 
 from drivers.camera import CameraIdentity
 from drivers.errors import RawFrameError
 from drivers.raw import RawFrame
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.cli import main
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import simulated_rig
 from emmc_rig.live import watch as watch_module
@@ -464,23 +464,15 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),
     ],
 )
-def test_bad_arguments_are_told_in_one_line(arguments, code, told, monkeypatch, capsys):
-    assert ended(arguments, monkeypatch) == code
+def test_bad_arguments_are_told_in_one_line(arguments, code, told, capsys):
+    assert exit_code("live", *arguments) == code
     shown = capsys.readouterr().err
     assert told in shown.replace("\n", " ")
     assert "Traceback" not in shown
 
 
-def ended(arguments, monkeypatch):
-    """Run the command in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["emmc-rig", "live", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return stop.value.code
-
-
-def test_a_port_in_use_is_told(monkeypatch, capsys):
+def test_a_port_in_use_is_told(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        assert ended(("--rig", "simulated", "--port", port), monkeypatch) == 1
+        assert exit_code("live", "--rig", "simulated", "--port", port) == 1
     assert "choose another --port" in capsys.readouterr().err

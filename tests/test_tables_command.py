@@ -4,14 +4,13 @@ import csv
 import html.parser
 import json
 import re
-import sys
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 from rich.console import Console
 
-from emmc_rig import cli
 from emmc_rig.demo import Silent
 from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.tables.command import run_tables
@@ -70,17 +69,9 @@ def whole(scenes, small_dictionary, tmp_path_factory):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", "tables", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        told = capsys.readouterr()
-        return stop.value.code or 0, told.out, told.err
-
-    return call
+def run(run):
+    """Run `emmc-rig tables` in this process: exit code, standard output and standard error."""
+    return partial(run, "tables")
 
 
 def one_line(text):

@@ -6,12 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 
-from emmc_rig import cli, train
+from emmc_rig import train
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.train import checkpoint_path, draw_atoms, find_sources
@@ -22,18 +23,9 @@ SMALL = ["--atoms", 24, "--patches", 120, "--patch", "4x4", "--sparsity", 3, "--
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run the program in-process: returns exit code, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["emmc-rig", "train", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        shown = capsys.readouterr()
-        return stop.value.code or 0, shown.out, shown.err
-
-    return call
+def run(run):
+    """Run `emmc-rig train` in this process: exit code, standard output and standard error."""
+    return partial(run, "train")
 
 
 @pytest.fixture

@@ -1,11 +1,8 @@
 """`emmc-rig capture --until`: shots chosen one by one; a session ends when it has enough."""
 
-import io
 import json
 import math
 import shutil
-import sys
-from contextlib import redirect_stderr, redirect_stdout
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun, still_rig
+from programs import program
 
-from emmc_rig import cli
 from emmc_rig.capture.enough import judged, stated_psnr_db
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.until import Until
@@ -47,17 +44,6 @@ PLAN = {
     "whiteboards": {"views": [[1, 1]], "shots": [0], "open": [{"repeats": 2}, {"held_out": True}]},
     "darks": {"repeats": 2},
 }
-
-
-def program(*arguments):
-    """Run the program in this process; returns exit code, standard output and standard error."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        patch.setenv("COLUMNS", "160")
-        patch.setattr(sys, "argv", ["emmc-rig", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    return stop.value.code or 0, out.getvalue(), err.getvalue()
 
 
 def plan_file(folder, **changes):

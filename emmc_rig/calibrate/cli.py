@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from emmc_rig.errors import AppError
+from emmc_rig.progress import shown_bars
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
 
@@ -109,12 +110,8 @@ def calibrate(
             )
         typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         return
-    from emmc_rig.cli import Bars, shown_progress
-
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         metrics = run_calibrate(settings, folder, bars)
-        bars.finish()
     chosen = metrics["chosen"]
     typer.echo(
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
@@ -128,15 +125,12 @@ def calibrate(
 
 def _calibrate_session(path: Path, route: str, out: Path) -> None:
     from emmc_rig.calibrate.run import calibrate_session
-    from emmc_rig.cli import Bars, shown_progress
     from emmc_rig.output import result_folder
     from emmc_rig.session.session import Session
 
     captured = Session(path)
-    with result_folder(out) as folder, shown_progress() as progress:
-        bars = Bars(progress)
+    with result_folder(out) as folder, shown_bars() as bars:
         metrics = calibrate_session(captured, folder, route, bars)
-        bars.finish()
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
     typer.echo(

@@ -164,11 +164,10 @@ def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float])
             for one in metrics["fit"]["boards"]
         ],
     )  # fmt: skip
-    figure, (axes,) = sheet(1, 5.2, label="")
+    figure, (axes,) = sheet(1, 5.2, label="typical residual / noise")
     axes.plot(np.arange(1, len(history) + 1), history, "o-", color=ACCENT, markersize=3)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("step, over widening windows", color=FAINT, fontsize=9)
-    axes.set_ylabel("typical residual / noise", color=FAINT, fontsize=9)
     titled(axes, "Convergence")
     fit = metrics["fit"]
     told = (
@@ -220,14 +219,13 @@ def _sensor(sheet_: SensorSheet) -> str:
         (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
         for name, value, deviation, unit in sheet_.rows()
     ]
-    figure, (transfer, linearity) = sheet(2, 5.0, label="")
+    figure, (transfer, linearity) = sheet(2, 5.0, label="temporal variance, DN²")
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
     grid = np.linspace(0, max(curve.mean_dn), 50)
     line = sheet_.dark_variance_dn2 + sheet_.gain_dn_per_electron * grid
     transfer.plot(grid, line, color=INK, linewidth=1)
     transfer.set_xlabel("signal above the dark, DN", color=FAINT, fontsize=9)
-    transfer.set_ylabel("temporal variance, DN²", color=FAINT, fontsize=9)
     titled(transfer, "Photon transfer")
     linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
     linearity.axhline(0, color=INK, linewidth=0.8)

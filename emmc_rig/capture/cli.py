@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -42,8 +42,8 @@ def capture(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
     rays: Annotated[
-        int, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
-    ] = 128,
+        int | None, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
+    ] = None,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
     ] = False,
@@ -75,9 +75,8 @@ def capture(
     from emmc_rig.output import parse_psnr, parse_size
     from emmc_rig.rig_config import ImagedRig
 
-    imaged = ImagedRig(
-        scene=scene, size=parse_size(size), seed=seed, real_time=real_time, rays=rays
-    )
+    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
+    imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time, **traced)
     until_db = None if until is None else parse_psnr(until, "--until")
     _run(plan, rig, imaged, until_db, dry_run, out)
 

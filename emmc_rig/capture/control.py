@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
 
-STOPPING_NOW = ("SIGTERM", "SIGHUP")
+from emmc_rig.signals import ENDING, handled
+
 PAUSE_POLL_S = 0.05
 
 
@@ -61,7 +61,7 @@ def interruptible(control: Control, told: Callable[[str], None]) -> Iterator[Non
             return
         raise KeyboardInterrupt
 
-    with _handled(interrupt):
+    with handled(interrupt, ("SIGINT", *ENDING)):
         yield
 
 
@@ -71,17 +71,5 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    with _handled(signal.SIG_IGN):
+    with handled(signal.SIG_IGN, ("SIGINT", *ENDING)):
         yield
-
-
-@contextmanager
-def _handled(handler: Any) -> Iterator[None]:
-    numbers = [signal.SIGINT]
-    numbers += [getattr(signal, name) for name in STOPPING_NOW if hasattr(signal, name)]
-    before = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, earlier in before.items():
-            signal.signal(number, earlier)

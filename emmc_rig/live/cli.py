@@ -5,11 +5,14 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from emmc_rig.live.watch import Watch
 
 EVERYWHERE = ("0.0.0.0", "::")
 
@@ -42,13 +45,11 @@ def live(
 ) -> None:
     """Show the camera on a local page: histogram, focus, mask alignment, jog. Ctrl-C ends."""
     from emmc_rig.live.server import LOCAL_HOSTS, application, new_token
-    from emmc_rig.live.watch import Watch
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
     listening = _listen(host, port)
     with closing(listening), _watch(rig, camera, stage, design, scene, size) as watch:
-        assert isinstance(watch, Watch)
         token = new_token()
         number = listening.getsockname()[1]
         shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
@@ -88,7 +89,7 @@ def _watch(
     design: str,
     scene: str,
     size: str | None,
-) -> Iterator[object]:
+) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
     from emmc_rig.hardware import SimulatedRig, open_camera, open_stage
     from emmc_rig.live.watch import Watch

@@ -72,10 +72,11 @@ def patch_errors(
     moved = np.zeros((3, len(at)))
     if slopes is not None:
         moved = OPPONENT @ np.einsum("sr,src->cr", steps, slopes[:, y, x])
-    shifted = sum(axis @ part for axis, part in zip(opponent, moved, strict=True))
-    covariance = sum(
-        size * (axis @ near.T) for size, near, axis in zip(variances, seen, opponent, strict=True)
-    )
+    shifted = np.zeros(psi.shots * readings)
+    covariance = np.zeros((len(shifted), len(shifted)))
+    for size, near, axis, part in zip(variances, seen, opponent, moved, strict=True):
+        shifted += axis @ part
+        covariance += size * (axis @ near.T)
     covariance += doubt * np.outer(shifted, shifted)
     errors = np.zeros(len(choices))
     for number, shots in enumerate(choices):
@@ -120,7 +121,8 @@ def expected_errors(
         for y in np.linspace(0, rows - SIDE, down)
         for x in np.linspace(0, columns - SIDE, across)
     ]
-    slopes = np.stack(np.gradient(np.asarray(picture, dtype=np.float64), axis=(0, 1)))
+    exact = np.asarray(picture, dtype=np.float64)
+    slopes = np.stack([np.gradient(exact, axis=axis) for axis in (0, 1)])
     errors = np.zeros(len(choices))
     for y, x in corners:
         middle = y + SIDE // 2, x + SIDE // 2
