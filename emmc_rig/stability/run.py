@@ -46,8 +46,7 @@ class StabilityStopped(KeyboardInterrupt):
 class StabilityRun:
     """What to measure, and where. results: by point; one with `failed` says why there is none.
 
-    pictures: by point; truths: by point, the picture of what should have been found. left_out: a
-    line for each (scene, fault) that could not be.
+    pictures: by point; truths: by point, the picture of what should have been found.
     """
 
     settings: StabilitySettings
@@ -55,7 +54,16 @@ class StabilityRun:
     results: dict[Point, dict] = field(default_factory=dict)
     pictures: dict[Point, Path] = field(default_factory=dict)
     truths: dict[Point, Path] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    _missing: dict[tuple[str, str, str], list[float]] = field(default_factory=dict)
+
+    @property
+    def left_out(self) -> list[str]:
+        """A line for what could not be, and why."""
+        return [
+            f"{FAULTS[fault].title} at {', '.join(map('{:g}'.format, some))}, {Path(scene).stem}: "
+            f"{why}"
+            for (scene, fault, why), some in self._missing.items()
+        ]
 
     def measure_all(self, points: Sequence[Point], watcher: Watcher) -> None:
         """Measure every point that the folder does not hold, and fill the dictionaries.
@@ -127,8 +135,7 @@ class StabilityRun:
         why: str,
         watcher: Watcher,
     ) -> None:
-        line = f"{FAULTS[fault].title} at {strength:g}, {Path(scene).stem}: {why}"
-        self.left_out.append(line)
+        self._missing.setdefault((scene, fault, why), []).append(strength)
         for point in points:
             watcher.step(f"left out: {point.label}")
 
