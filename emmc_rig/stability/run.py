@@ -16,7 +16,7 @@ import numpy as np
 
 from emmc_rig import __version__
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.chart.run import machine
+from emmc_rig.chart.run import dictionary_identity, machine
 from emmc_rig.chart.scores import angular_snr_db
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
@@ -248,11 +248,3 @@ def _content(
         return None
     seen = setup.scene_seen().light_field
     return [float(np.sum(seen, dtype=np.float64)), float(np.sum(np.square(seen, dtype=np.float64)))]
-
-
-def dictionary_identity(dictionary: str | None) -> str:
-    """Return what tells a dictionary from another: its name, and of a file its size and time."""
-    if dictionary is None or not Path(dictionary).is_file():
-        return dictionary or "lambertian"
-    seen = Path(dictionary).stat()
-    return f"{dictionary} {seen.st_size} {seen.st_mtime_ns}"
