@@ -123,7 +123,9 @@ class ChartRun:
             "capture": capture,
             "method": one.method,
             "settings": one.settings.model_dump(mode="json"),
-            "dictionary": _identity(settings.dictionary) if one.needs_dictionary else None,
+            "dictionary": dictionary_identity(settings.dictionary)
+            if one.needs_dictionary
+            else None,
             "cores": point.cores or available_cores(),
             "repeats": settings.repeats,
             "enough_s": settings.enough_s,
@@ -219,7 +221,7 @@ def machine() -> str:
     return f"{name}, {available_cores()} cores"
 
 
-def _identity(dictionary: str | None) -> str:
+def dictionary_identity(dictionary: str | None) -> str:
     """Return what tells a dictionary from another: its name, and of a file its size and time."""
     if dictionary is None or not Path(dictionary).is_file():
         return dictionary or "lambertian"

@@ -16,7 +16,7 @@ import numpy as np
 
 from emmc_rig import __version__
 from emmc_rig.camera_sheet import find_camera
-from emmc_rig.chart.run import machine
+from emmc_rig.chart.run import dictionary_identity, machine
 from emmc_rig.chart.scores import angular_snr_db
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
@@ -46,8 +46,7 @@ class StabilityStopped(KeyboardInterrupt):
 class StabilityRun:
     """What to measure, and where. results: by point; one with `failed` says why there is none.
 
-    pictures: by point; truths: by point, the picture of what should have been found. left_out: a
-    line for each (scene, fault) that could not be.
+    pictures: by point; truths: by point, the picture of what should have been found.
     """
 
     settings: StabilitySettings
@@ -55,7 +54,16 @@ class StabilityRun:
     results: dict[Point, dict] = field(default_factory=dict)
     pictures: dict[Point, Path] = field(default_factory=dict)
     truths: dict[Point, Path] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    _missing: dict[tuple[str, str, str], list[float]] = field(default_factory=dict)
+
+    @property
+    def left_out(self) -> list[str]:
+        """A line for what could not be, and why."""
+        return [
+            f"{FAULTS[fault].title} at {', '.join(map('{:g}'.format, some))}, {Path(scene).stem}: "
+            f"{why}"
+            for (scene, fault, why), some in self._missing.items()
+        ]
 
     def measure_all(self, points: Sequence[Point], watcher: Watcher) -> None:
         """Measure every point that the folder does not hold, and fill the dictionaries.
@@ -127,8 +135,7 @@ class StabilityRun:
         why: str,
         watcher: Watcher,
     ) -> None:
-        line = f"{FAULTS[fault].title} at {strength:g}, {Path(scene).stem}: {why}"
-        self.left_out.append(line)
+        self._missing.setdefault((scene, fault, why), []).append(strength)
         for point in points:
             watcher.step(f"left out: {point.label}")
 
@@ -241,11 +248,3 @@ def _content(
         return None
     seen = setup.scene_seen().light_field
     return [float(np.sum(seen, dtype=np.float64)), float(np.sum(np.square(seen, dtype=np.float64)))]
-
-
-def dictionary_identity(dictionary: str | None) -> str:
-    """Return what tells a dictionary from another: its name, and of a file its size and time."""
-    if dictionary is None or not Path(dictionary).is_file():
-        return dictionary or "lambertian"
-    seen = Path(dictionary).stat()
-    return f"{dictionary} {seen.st_size} {seen.st_mtime_ns}"
