@@ -140,8 +140,10 @@ def test_every_reading_counts_by_its_own_noise(bayer):
         for found in [reconstruct("adaptive", bayer, frames, noise, settings=settings)]
     ]
     assert errors[0] < 0.5 * errors[1]
-    same = [reconstruct("tv", bayer, frames, noise).light_field for noise in (deviation, typical)]
-    np.testing.assert_allclose(*same, atol=1e-5)
+    each, one = (
+        reconstruct("tv", bayer, frames, noise).light_field for noise in (deviation, typical)
+    )
+    np.testing.assert_allclose(each, one, atol=1e-5)
 
 
 def test_noise_levels_that_do_not_fit_are_refused_in_one_line(bayer):
