@@ -68,7 +68,7 @@ def ablations(
             method,
             psi,
             capture.readings,
-            capture.deviation,
+            capture.noise_sigma,
             dictionary,
             settings,
             capture.usable,

@@ -9,10 +9,35 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+
+
+@contextmanager
+def kept_when_stopped(
+    out: Path, folder: Path, stopped: type[KeyboardInterrupt], what: str = "point"
+) -> Iterator[None]:
+    """Say, when Ctrl-C or a full disk ends the block, that what was done is kept.
+
+    out: the folder as asked for, folder: where it is. Raises `stopped` and AppError.
+    """
+    try:
+        yield
+    except stopped:
+        raise
+    except KeyboardInterrupt as stop:
+        raise stopped(
+            f"stopped by Ctrl-C; every {what} that was done is kept in {folder}: "
+            "run the same command again to go on"
+        ) from stop
+    except OSError as fault:
+        raise AppError(
+            f"--out {out}: cannot be written ({fault.strerror or fault}); every {what} that was "
+            "done is kept: make room and run the same command again to go on"
+        ) from fault
 
 
 def digest_of(inputs: Mapping[str, object]) -> str:

@@ -174,7 +174,8 @@ def run_reconstruct(
         method,
         psi,
         capture.readings,
-        capture.deviation,
+        # Not of each: estimated from the reading itself, it is least where noise made that small.
+        capture.noise_sigma,
         dictionary,
         settings,
         capture.usable,

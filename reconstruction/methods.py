@@ -177,9 +177,10 @@ def reconstruct(
     """Return the light field that the method called `name` finds.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each; methods that take one take the root mean square. usable: pixels to fit (default
-    all). estimates: what `estimate_patches` found from the same inputs, for `dict-admm` and
-    `tv-dict` to go on from. Raises ReconstructionError for a method that is not known, a dictionary
+    one or of each (known: estimated from a reading it would favour those that noise made small);
+    methods that take one take the root mean square. usable: pixels to fit (default all).
+    estimates: what `estimate_patches` found from the same inputs, for `dict-admm` and `tv-dict` to
+    go on from. Raises ReconstructionError for a method that is not known, a dictionary
     that is missing, and inputs that do not fit each other.
     """
     method = find_method(name)

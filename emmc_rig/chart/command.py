@@ -18,7 +18,7 @@ from emmc_rig.chart.run import POINTS, ChartRun, ChartStopped, available_cores, 
 from emmc_rig.chart.scaling import Growth, growths
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
-from emmc_rig.journal import open_folder
+from emmc_rig.journal import kept_when_stopped, open_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.output import command_line, versions, write_metrics
 from simulators.scenes import SCENES
@@ -88,7 +88,7 @@ def run_chart(
         capture.described()
     folder = open_folder(out, POINTS, "an earlier chart")
     run = ChartRun(settings, folder)
-    try:
+    with kept_when_stopped(out, folder, ChartStopped):
         run.prepare(points, watcher)
         run.measure_all([*points, *(point for sweep in swept for point in sweep.points)], watcher)
         watcher.begin("draw", None)
@@ -112,18 +112,6 @@ def run_chart(
         write_text(folder / ADVICE, saved(rows_of(results), provenance))
         write_text(folder / PAGE, text)
         write_metrics(folder, _metrics(run, found, grown, left_out, seconds))
-    except ChartStopped:
-        raise
-    except KeyboardInterrupt as stop:
-        raise ChartStopped(
-            f"stopped by Ctrl-C; every point that was done is kept in {folder}: "
-            "run the same command again to go on"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); every point that was "
-            "done is kept: make room and run the same command again to go on"
-        ) from fault
     return Outcome(found, grown, left_out, folder / PAGE, seconds)
 
 

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.demo import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.journal import open_folder
+from emmc_rig.journal import kept_when_stopped, open_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.page import Section
 from emmc_rig.stability.breaking import below_best, told
@@ -157,7 +156,7 @@ def measure_beside(
     find_camera(settings.camera)  # raises before anything is written
     folder = open_folder(out, POINTS, "an earlier sweep")
     sections, metrics, lines = [], {}, []
-    try:
+    with kept_when_stopped(out, folder, StabilityStopped):
         (folder / DRAWN).mkdir(exist_ok=True)
         for name, measure in PARTS.items():
             if name in parts:
@@ -165,16 +164,6 @@ def measure_beside(
                 sections += found.sections
                 metrics |= found.metrics
                 lines += found.told
-    except KeyboardInterrupt as stop:
-        raise StabilityStopped(
-            f"stopped by Ctrl-C; every point that was done is kept in {folder}: "
-            "run the same command again to go on"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); every point that was "
-            "done is kept: make room and run the same command again to go on"
-        ) from fault
     return Beside(sections, metrics, lines)
 
 

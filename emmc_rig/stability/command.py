@@ -11,7 +11,7 @@ from emmc_rig.camera_sheet import find_camera
 from emmc_rig.chart.run import machine
 from emmc_rig.demo import Watcher
 from emmc_rig.errors import AppError
-from emmc_rig.journal import open_folder
+from emmc_rig.journal import kept_when_stopped, open_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.page import Section, provenance_table
@@ -76,17 +76,8 @@ def run_stability(
         ),
     ]
     watcher.begin("draw", None)
-    try:
+    with kept_when_stopped(out, folder, StabilityStopped):
         path = _written(run, found, left_out, more, figures or {}, clock() - started)
-    except KeyboardInterrupt as stop:
-        raise StabilityStopped(
-            f"stopped by Ctrl-C; every point is kept in {folder}: run the same command again"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); every point that was "
-            "done is kept: make room and run the same command again to go on"
-        ) from fault
     return Outcome(found, left_out, path, clock() - started)
 
 

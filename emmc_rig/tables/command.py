@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.demo import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.journal import open_folder
+from emmc_rig.journal import kept_when_stopped, open_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.tables.charts import draw_charts
@@ -58,7 +57,7 @@ def run_tables(
     folder = open_folder(out, CELLS, "earlier tables")
     source = _source(parts, library, dictionaries, settings, folder)
     run = Run(parts, library, source, settings, folder)
-    try:
+    with kept_when_stopped(out, folder, TablesStopped, "cell"):
         results = do_cells(run, watcher, clock)
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)
@@ -75,18 +74,6 @@ def run_tables(
         write_text(folder / CSV, csv_text(run, results))
         write_text(folder / PAGE, text)
         write_metrics(folder, _metrics(run, dictionaries, results, findings, seconds))
-    except TablesStopped:
-        raise
-    except KeyboardInterrupt as stop:
-        raise TablesStopped(
-            f"stopped by Ctrl-C; every cell that was done is kept in {folder}: "
-            "run the same command again to go on"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); every cell that was done "
-            "is kept: make room and run the same command again to go on"
-        ) from fault
     return Outcome(found, findings, folder / PAGE, seconds)
 
 
