@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from calibration.boards import Board
 from calibration.errors import CalibrationError
@@ -92,6 +91,9 @@ def _correlated(board: Board, mask: ShadowMask, start: Placement) -> Registratio
     y, x = np.mgrid[top - margin : top + height + margin, left - margin : left + width + margin]
     pixels = np.stack([y.ravel(), x.ravel()], axis=1)
     shadow = Shadow(mask, start)
+    # Half of what starting most commands takes, for a whiteboard's sake.
+    from scipy.signal import fftconvolve
+
     usable, channels = board.usable[crop], board.channels[crop]
     reading = np.where(usable, board.reading[crop], 0).astype(np.float64)
     product = energy = 0.0

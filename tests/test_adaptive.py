@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.fft import dct
 from scipy.stats import multivariate_t
 
 from emmc_rig.camera_sheet import find_camera
@@ -18,7 +19,12 @@ from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
-from reconstruction.adaptive.shrinkage import denoised
+from reconstruction.adaptive.shrinkage import (
+    SIDE,
+    _columns_analysed,
+    _columns_synthesised,
+    denoised,
+)
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
@@ -92,8 +98,8 @@ def test_psi_of_surfaces_is_psi_of_their_light_field(random_psi, monkeypatch):
         frames = rng.normal(size=psi.frames_shape).astype(np.float32)
         change = rng.normal(size=(20, 22)).astype(np.float32)
         results = []
-        for most in (assembly.MOST_ENTRIES, 0):
-            monkeypatch.setattr(assembly, "MOST_ENTRIES", most)
+        for most in (assembly.MOST_CELLS, 0):
+            monkeypatch.setattr(assembly, "MOST_CELLS", most)
             surfaces = Surfaces(psi, disparity, hidden, 5)
             forward, adjoint = surfaces.derivative(slopes(texture[0]))
             results.append(
@@ -176,6 +182,24 @@ def test_beliefs_on_a_chain_are_the_exact_marginals():
     for place in range(4):
         exact = joint.sum(axis=tuple(k for k in range(4) if k != place))
         np.testing.assert_allclose(found[0, place], exact / exact.sum(), rtol=1e-4)
+
+
+def test_another_object_is_rarer_the_larger_its_disparity():
+    disparities = np.array([-4.0, 0.0, 1.0, 2.0, 4.0])
+    pairs = compatibility(disparities, 0.01, 0.1, np.array([1.0, 1.0, 1.0, 1.0, 2.0]))
+    np.testing.assert_allclose(pairs, pairs.T)
+    jumps = pairs[1, [0, 3, 4]]
+    np.testing.assert_allclose(jumps / jumps[0], [1, 1.5, 2])
+
+
+def test_columns_of_blocks_are_analysed_by_the_orthonormal_cosine_transform():
+    block = np.random.default_rng(5).normal(size=(SIDE, SIDE)).astype(np.float32)
+    found = block.ravel().copy()
+    _columns_analysed(found, SIDE)
+    expected = np.asarray(dct(block, axis=0, norm="ortho"))
+    np.testing.assert_allclose(found.reshape(SIDE, SIDE), expected, atol=1e-5)
+    _columns_synthesised(found, SIDE)
+    np.testing.assert_allclose(found, block.ravel(), atol=1e-5)
 
 
 def test_what_repeats_is_kept_and_noise_is_removed():

@@ -6,7 +6,6 @@ from test_adaptive import plane_scene, quick
 
 from emmc_rig.camera_sheet import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from reconstruction.adaptive import parsimony
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.parsimony import Plane, colour_is_needed, grey_psi, one_plane
@@ -163,4 +162,4 @@ def test_a_plane_counts_from_the_middle_of_the_frame():
     np.testing.assert_allclose(
         over[:, 0], 0.5 + 0.1 * np.array([-1.25, -0.75, -0.25, 0.25, 0.75, 1.25])
     )
-    assert parsimony.Plane(0, 0, 0).is_static
+    assert Plane(0, 0, 0).is_static

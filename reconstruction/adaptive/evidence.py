@@ -8,8 +8,8 @@ covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evi
 amplitude a and the colourfulness b alike, and pays for what a model could have explained but
 did not see (Occam's factor, log det).
 
-Operations of a patch: m^2 / 2 (R^2 + S D) + D H m^3 / 6 with R rays a pixel (25, or 25 k^2), S
-distinct separations of them (81), D disparities, H pairs of amplitude and colourfulness.
+Operations of a patch: m^2 / 2 (2 + D) S + m R S + (D + 4 H) m^3 / 6 with R rays a pixel (25, or
+25 k^2), S distinct separations of them (81), D disparities, H pairs of amplitude and colourfulness.
 """
 
 from __future__ import annotations
@@ -91,27 +91,33 @@ class EvidencePatches:
         return np.stack([part.ravel() for part in parts], axis=1).astype(np.int64)
 
 
-def _separations(
+def _spectrum(
     views: tuple[int, int], binning: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pairs of rays of two pixels by how far they lie apart, and these separations.
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the waves that rays are analysed into, their separations, and the waves back.
 
-    Pairs (separation, pair, 2), padded to a multiple of TERMS with pairs of a ray that is dark;
-    separations (separation, 2), in samples and in views.
+    Pairs of rays matter by how far they lie apart only: a correlation, which for the discrete
+    Fourier transforms over all separations is a product. Waves (wave, ray): cosine and sine by
+    turns, of the mean first; separations (separation, 4), two in samples and two in views; waves
+    back (separation, wave). Rays and waves are padded with zeros to multiples of TERMS.
     """
+    lengths = np.array([binning, binning, *views])
     v, u, y, x = (axis.ravel() for axis in np.indices((*views, binning, binning)))
     rays = np.stack([y, x, v, u], axis=1)
-    apart = (rays[:, None] - rays[None]).reshape(-1, 4)
-    kinds, index = np.unique(apart, axis=0, return_inverse=True)
-    index = index.ravel()
-    width = -(-int(np.bincount(index).max()) // TERMS) * TERMS
-    count = -(-len(kinds) // TERMS) * TERMS
-    members = np.full((count, width, 2), len(rays), dtype=np.int64)
-    for k in range(len(kinds)):
-        pairs = np.flatnonzero(index == k)
-        members[k, : len(pairs)] = np.stack(np.divmod(pairs, len(rays)), axis=1)
-    kinds = np.concatenate([kinds, np.zeros((count - len(kinds), 4), dtype=kinds.dtype)])
-    return members, kinds[:, :2], kinds[:, 2:]
+    apart = np.indices(tuple(2 * lengths - 1)).reshape(4, -1).T - (lengths - 1)
+    # The first half of the frequencies is the second's negative: a real function's says no more.
+    once = 2 * np.pi * apart[len(apart) // 2 :] / (2 * lengths - 1)
+    short = -len(once) % (TERMS // 2)
+
+    def analysed(positions: NDArray[np.int64]) -> Array:
+        phase = positions @ once.T
+        both = np.stack([np.cos(phase), np.sin(phase)], axis=-1).reshape(len(phase), -1)
+        return np.pad(both, ((0, 0), (0, 2 * short)))
+
+    waves = np.pad(analysed(rays).T, ((0, 0), (0, -len(rays) % TERMS)))
+    back = 2 * analysed(apart) / len(apart)
+    back[:, 0] /= 2
+    return waves.astype(np.float32), apart, back
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,16 +152,17 @@ def patch_evidence(
     short = -count % LANES
     filled = np.concatenate([corners, np.repeat(corners[-1:], short, axis=0)])
     scales = np.square(np.concatenate([brightness, np.repeat(brightness[-1:], short)]))
-    members, samples_apart, views_apart = _separations(psi.light_field_shape[:2], psi.binning)
+    waves, separations, back = _spectrum(psi.light_field_shape[:2], psi.binning)
     pixels_apart = places[:, None, 1:] - places[None, :, 1:]
     kinds, offsets = np.unique(pixels_apart.reshape(-1, 2), axis=0, return_inverse=True)
     disparities = np.asarray(disparities, dtype=np.float64)
     apart = (
         kinds[:, None, None] * psi.binning
-        + samples_apart[None, None]
-        - disparities[None, :, None, None] * views_apart[None, None]
+        + separations[None, None, :, :2]
+        - disparities[None, :, None, None] * separations[None, None, :, 2:]
     )
-    tables = prior.covariance(np.square(apart).sum(axis=-1)).astype(np.float32)
+    tables = (prior.covariance(np.square(apart).sum(axis=-1)) @ back).astype(np.float32)
+    tables = np.pad(tables, ((0, 0), (0, -len(disparities) % TERMS), (0, 0)))
     probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])
     out = np.empty((len(filled), len(disparities)), dtype=np.float32)
     chosen = np.zeros(len(filled), dtype=np.int64)
@@ -174,7 +181,7 @@ def patch_evidence(
             filled[lanes],
             places,
             psi.binning,
-            members,
+            waves,
             index,
             tables,
             probed.astype(np.int64),

@@ -1,7 +1,9 @@
 """Kernels of the patches' evidence: covariances of readings, their factors, log-likelihoods.
 
 LANES patches are worked on side by side: arrays end with (..., lane), and the innermost loops run
-along it. Sums are taken four terms at a time, which halves what is read and written.
+along it. Sums are taken four terms at a time, which halves what is read and written, and of rows
+and columns in blocks; what is worked on together lies a constant apart in one flat array, else
+checks for overlap keep the compiler from vectors.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ def _gather(
     """Cut Psi, data, variances and colours into patches, one a lane; nothing where not usable.
 
     places: (reading, 3), shot, and row and column of the pixel from the corner's. corners: (lane,
-    2) of pixels. rays: (part, reading, ray + 1, lane), luminance and, where three colours are
-    stored, two chrominances; the last ray is left at 0. known: (2, reading, lane), data and
+    2) of pixels. rays: (part, reading, ray, lane), luminance and, where three colours are
+    stored, two chrominances. known: (2, reading, lane), data and
     variance. seen: (reading, lane) colour. measured: (lane,), how many are usable.
     """
     _, views_v, views_u, _, stored, _ = weights.shape
@@ -61,52 +63,81 @@ def _gather(
 
 
 @njit(cache=True, fastmath=True)
-def _meet(here, there, members, meetings):
-    """Add to meetings (separation, lane) the products of two pixels' rays (ray + 1, lane).
+def _meet(here, there, lanes, meetings):
+    """Add to meetings (wave, lane) the spectrum of how two pixels' rays are correlated.
 
-    members: (separation, pair, 2), the pairs of rays so far apart.
+    here, there: their own spectra (wave, lane), cosine and sine by turns. All flat.
     """
-    lanes = here.shape[1]
-    for k in range(members.shape[0]):
-        pairs = members[k]
-        total = meetings[k]
-        for n in range(0, pairs.shape[0], TERMS):
-            if pairs[n, 0] == here.shape[0] - 1:
-                break
-            a, b = here[pairs[n, 0]], there[pairs[n, 1]]
-            c, d = here[pairs[n + 1, 0]], there[pairs[n + 1, 1]]
-            e, f = here[pairs[n + 2, 0]], there[pairs[n + 2, 1]]
-            g, h = here[pairs[n + 3, 0]], there[pairs[n + 3, 1]]
-            for lane in range(lanes):
-                total[lane] += (
-                    a[lane] * b[lane] + c[lane] * d[lane] + e[lane] * f[lane] + g[lane] * h[lane]
-                )
+    for k in range(0, meetings.size, 2 * LANES):
+        a, b, total = here[k : k + 2 * LANES], there[k : k + 2 * LANES], meetings[k : k + 2 * LANES]
+        for lane in range(lanes):
+            even, odd = a[lane], a[LANES + lane]
+            total[lane] += even * b[lane] + odd * b[LANES + lane]
+            total[LANES + lane] += odd * b[lane] - even * b[LANES + lane]
 
 
 @njit(cache=True, fastmath=True)
-def _correlate(meetings, table, out):
-    """Set out (disparity, lane) to table (disparity, separation) times meetings."""
-    lanes = meetings.shape[1]
-    for h in range(out.shape[0]):
-        total = out[h]
-        for lane in range(lanes):
-            total[lane] = 0
-        for k in range(0, meetings.shape[0], TERMS):
-            p, q, r, s = table[h, k], table[h, k + 1], table[h, k + 2], table[h, k + 3]
-            a, b, c, d = meetings[k], meetings[k + 1], meetings[k + 2], meetings[k + 3]
+def _mixed(table, terms, lanes, out):
+    """Set out (row, lane) to table (row, term) times terms (term, lane), the latter two flat.
+
+    TERMS rows and terms at a time: a value read serves as many sums.
+    """
+    width = TERMS * LANES
+    out[:] = 0
+    for h in range(0, table.shape[0], TERMS):
+        total = out[h * LANES : h * LANES + width]
+        first, second, third, fourth = table[h], table[h + 1], table[h + 2], table[h + 3]
+        for k in range(0, table.shape[1], TERMS):
+            part = terms[k * LANES : k * LANES + width]
+            p, q, r, s = first[k], first[k + 1], first[k + 2], first[k + 3]
+            e, f, g, i = second[k], second[k + 1], second[k + 2], second[k + 3]
+            t, u, v, w = third[k], third[k + 1], third[k + 2], third[k + 3]
+            x, y, z, o = fourth[k], fourth[k + 1], fourth[k + 2], fourth[k + 3]
             for lane in range(lanes):
-                total[lane] += p * a[lane] + q * b[lane] + r * c[lane] + s * d[lane]
+                a, b = part[lane], part[LANES + lane]
+                c, d = part[2 * LANES + lane], part[3 * LANES + lane]
+                total[lane] += p * a + q * b + r * c + s * d
+                total[LANES + lane] += e * a + f * b + g * c + i * d
+                total[2 * LANES + lane] += t * a + u * b + v * c + w * d
+                total[3 * LANES + lane] += x * a + y * b + z * c + o * d
+
+
+@njit(cache=True, fastmath=True)
+def _less_products(columns, i, j, m, lanes, matrix):
+    """Take the products of TERMS columns off rows i, i + 1 of matrix, at columns j, j + 1.
+
+    columns: (m + 2, TERMS, lane), matrix: (m + 2, m, lane), both flat.
+    """
+    width = TERMS * LANES
+    left, right = columns[i * width : (i + 2) * width], columns[j * width : (j + 2) * width]
+    at = (i * m + j) * LANES
+    upper = matrix[at : at + 2 * LANES]
+    lower = matrix[at + m * LANES : at + (m + 2) * LANES]
+    for lane in range(lanes):
+        a, b = left[lane], left[LANES + lane]
+        c, d = left[2 * LANES + lane], left[3 * LANES + lane]
+        p, q = left[4 * LANES + lane], left[5 * LANES + lane]
+        r, s = left[6 * LANES + lane], left[7 * LANES + lane]
+        e, f = right[lane], right[LANES + lane]
+        g, h = right[2 * LANES + lane], right[3 * LANES + lane]
+        t, u = right[4 * LANES + lane], right[5 * LANES + lane]
+        v, w = right[6 * LANES + lane], right[7 * LANES + lane]
+        upper[lane] -= a * e + b * f + c * g + d * h
+        upper[LANES + lane] -= a * t + b * u + c * v + d * w
+        lower[lane] -= p * e + q * f + r * g + s * h
+        lower[LANES + lane] -= p * t + q * u + r * v + s * w
 
 
 @njit(cache=True, fastmath=True)
 def _log_likelihood(matrix, measured, freedom, columns, product, square, out):
-    """Set out (lane,) to the log-likelihoods of matrix (m + 1, m, lane), destroyed.
+    """Set out (lane,) to the log-likelihoods of matrix (m + 2, m, lane), destroyed.
 
-    Lower triangles of scale matrices, the data as last row, of multivariate t distributions with
+    Lower triangles of scale matrices, the data as row m, of multivariate t distributions with
     `freedom` degrees and measured (lane,) readings; constants are left out. m is a multiple of
-    TERMS. columns: (TERMS, m + 1, lane), product, square: (lane,), to work in.
+    TERMS. columns: (m + 2, TERMS, lane), product, square: (lane,), to work in.
     """
     m, lanes = matrix.shape[1:]
+    flat_columns, flat = columns.reshape(-1), matrix.reshape(-1)
     for lane in range(lanes):
         out[lane] = 0
         square[lane] = 0
@@ -114,47 +145,39 @@ def _log_likelihood(matrix, measured, freedom, columns, product, square, out):
         for lane in range(lanes):
             product[lane] = 1
         for k in range(first, first + TERMS):
-            column = columns[k - first]
+            here = k - first
             for i in range(k, m + 1):
-                row, line = matrix[i, k], column[i]
+                row, line = matrix[i, k], columns[i, here]
                 for lane in range(lanes):
                     line[lane] = row[lane]
-                for before in range(k - first):
-                    a, b = columns[before, i], columns[before, k]
+                for before in range(here):
+                    a, b = columns[i, before], columns[k, before]
                     for lane in range(lanes):
                         line[lane] -= a[lane] * b[lane]
-            pivot = column[k]
+            pivot = columns[k, here]
             for lane in range(lanes):
                 pivot[lane] = max(pivot[lane], np.float32(1e-12))
                 product[lane] *= pivot[lane]
                 pivot[lane] = np.float32(1.0) / np.sqrt(pivot[lane])
             for i in range(k + 1, m + 1):
-                line = column[i]
+                line = columns[i, here]
                 for lane in range(lanes):
                     line[lane] *= pivot[lane]
             for lane in range(lanes):
-                square[lane] += column[m, lane] ** 2
+                square[lane] += columns[m, here, lane] ** 2
         for lane in range(lanes):
             out[lane] -= 0.5 * log(product[lane])
-        for i in range(first + TERMS, m + 1):
-            a, b, c, d = columns[0, i], columns[1, i], columns[2, i], columns[3, i]
-            for j in range(first + TERMS, min(i + 1, m)):
-                e, f, g, h = columns[0, j], columns[1, j], columns[2, j], columns[3, j]
-                row = matrix[i, j]
-                for lane in range(lanes):
-                    row[lane] -= (
-                        a[lane] * e[lane]
-                        + b[lane] * f[lane]
-                        + c[lane] * g[lane]
-                        + d[lane] * h[lane]
-                    )
+        # Row m + 1 is not used: rows are taken in pairs.
+        for i in range(first + TERMS, m + 1, 2):
+            for j in range(first + TERMS, min(i + 1, m), 2):
+                _less_products(flat_columns, i, j, m, lanes, flat)
     for lane in range(lanes):
         out[lane] -= 0.5 * (freedom + measured[lane]) * log(1 + square[lane] / freedom)
 
 
 @njit(cache=True, fastmath=True)
 def _fill(sums, known, seen, strength, chroma, matrix):
-    """Set matrix (m + 1, m, lane) to the readings' covariance and, as last row, their values.
+    """Set matrix (m + 2, m, lane) to the readings' covariance and, as last row, their values.
 
     sums: (part, pair, lane). strength, chroma: (lane,). seen: (reading, lane), or no reading where
     three colours are stored.
@@ -193,7 +216,7 @@ def evidence(
     corners,
     places,
     binning,
-    members,
+    waves,
     offsets,
     tables,
     probes,
@@ -207,9 +230,10 @@ def evidence(
     """Set out (lane, disparity) to log-likelihoods, constants left out, and chosen (lane,).
 
     data, ridge: (shot, pixel_y, pixel_x), readings less those of the mean, their variances.
-    corners: (batch, lane, 2) pixels. places: see `_gather`. members: see `_meet`. offsets:
-    (reading, reading), the index of how far two pixels lie apart. tables: (offset, disparity,
-    separation), the texture's correlation. amplitudes, chromas: (kind,), variance of luminance,
+    corners: (batch, lane, 2) pixels. places: see `_gather`. waves: (wave, ray), of which
+    the rays' spectra are made. offsets: (reading, reading), the index of how far two pixels lie
+    apart. tables: (offset, disparity, wave), the texture's correlation, padded with zeros to a
+    multiple of TERMS disparities. amplitudes, chromas: (kind,), variance of luminance,
     times scales (lane,), and of a chrominance over that of luminance. probes: indices of
     the disparities at which every kind is judged; out is that of the best of them, `chosen`.
     """
@@ -217,11 +241,10 @@ def evidence(
     readings = places.shape[0]
     m = -(-readings // TERMS) * TERMS
     lanes = corners.shape[0]
-    disparities, separations = tables.shape[1:]
-    rays_count = weights.shape[1] * weights.shape[2] * binning**2
+    disparities, rows, spectrum = out.shape[1], tables.shape[1], tables.shape[2]
     parts = 1 if stored == 1 else 3
     groups = 1 if stored == 1 else 2
-    rays = np.zeros((parts, readings, rays_count + 1, lanes), np.float32)
+    rays = np.zeros((parts, readings, waves.shape[1], lanes), np.float32)
     known = np.zeros((2, m, lanes), np.float32)
     known[1] = 1
     seen = np.zeros((m, lanes), np.uint8)
@@ -240,23 +263,28 @@ def evidence(
         seen,
         measured,
     )
+    spectra = np.empty((parts, readings, spectrum * lanes), np.float32)
+    for part in range(parts):
+        for i in range(readings):
+            _mixed(waves, rays[part, i].reshape(-1), lanes, spectra[part, i])
     sums = np.zeros((disparities, groups, m * (m + 1) // 2, lanes), np.float32)
-    meetings = np.empty((separations, lanes), np.float32)
-    row = np.empty((disparities, lanes), np.float32)
+    meetings = np.empty(spectrum * lanes, np.float32)
+    row = np.empty((rows, lanes), np.float32)
+    flat_row = row.reshape(-1)
     first = 0
     for i in range(readings):
         for j in range(i + 1):
             for part in range(parts):
                 if part < 2:
                     meetings[:] = 0
-                _meet(rays[part, i], rays[part, j], members, meetings)
+                _meet(spectra[part, i], spectra[part, j], lanes, meetings)
                 if part != 1:
-                    _correlate(meetings, tables[offsets[i, j]], row)
+                    _mixed(tables[offsets[i, j]], meetings, lanes, flat_row)
                     for h in range(disparities):
                         sums[h, min(part, 1), first] = row[h]
             first += 1
-    matrix = np.empty((m + 1, m, lanes), np.float32)
-    columns = np.empty((TERMS, m + 1, lanes), np.float32)
+    matrix = np.zeros((m + 2, m, lanes), np.float32)
+    columns = np.zeros((m + 2, TERMS, lanes), np.float32)
     product, square = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
     likelihood = np.empty(lanes, np.float32)
     best = np.full(lanes, -np.inf, np.float32)

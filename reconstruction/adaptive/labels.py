@@ -11,17 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+RARE_PX = 2.0
+"""Disparity that half as many objects have as have none."""
 
 
-def compatibility(disparities: NDArray[np.floating], slope_px: float, jump: float) -> Array:
+def compatibility(
+    disparities: NDArray[np.floating],
+    slope_px: float,
+    jump: float,
+    spacing_px: float | NDArray[np.floating] = 1.0,
+) -> Array:
     """Return the joint prior of two neighbours' disparities, (L, L), symmetric, not normalised.
 
-    slope_px: mean difference of neighbours on one object. jump: probability of another object.
+    slope_px: mean difference of neighbours on one object. jump: probability of another object,
+    whose disparity is the rarer the larger. spacing_px: between disparities, if it varies.
     """
     apart = np.abs(disparities[:, None] - disparities[None])
     same = np.exp(-apart / slope_px)
     same /= same.sum(axis=1).max()
-    return (1 - jump) * same + jump / len(disparities)
+    common = spacing_px / (1 + np.abs(disparities) / RARE_PX)
+    common = common / common.sum()
+    return (1 - jump) * same + jump * len(disparities) * np.outer(common, common)
 
 
 def _normalised(beliefs: Array) -> Array:

@@ -1,5 +1,7 @@
 """The adaptive method: disparities by evidence, then the texture of the surfaces they make.
 
+Edges that views do not reach are told from the scene first (`edges`).
+
 1. Patches judge disparities by the likelihood of their readings (`evidence`, `search`), and agree
    with their neighbours (`labels`).
 2. If the whole scene needs no more than one plane, or no colour, it gets no more (`parsimony`).
@@ -29,6 +31,7 @@ from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
+from reconstruction.adaptive.edges import dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.free import freedom
 from reconstruction.adaptive.joint import TextureSettings, solve
@@ -43,6 +46,7 @@ from reconstruction.adaptive.parsimony import (
 )
 from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import darkness, smooth_guess
+from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.tv import TVSettings, reconstruct_tv
@@ -105,7 +109,8 @@ class AdaptiveSettings(Settings):
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches, fewer steps."""
     quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
-    return settings.model_copy(update={"step_px": 0.25, "stride": 8, "texture": quick})
+    coarser = {"step_px": 0.25, "stride": 8, "start_steps": settings.start_steps // 2 or 1}
+    return settings.model_copy(update={**coarser, "texture": quick})
 
 
 def reconstruct_adaptive(
@@ -134,10 +139,15 @@ def reconstruct_adaptive(
             on_step(Progress(step, None, None, total))
 
     given = Given(psi, frames, typical, noise, usable).over(darkness(psi), of_psi=True)
-    picture = np.asarray(smooth_guess(given.psi, given.frames, usable), dtype=np.float32)
+    flat = flat_psi(given.psi)
+    edges = dark_edges(flat, given.frames, usable)
+    if edges is not None:
+        all_usable, usable = usable, usable & ~edges.within
+        given = replace(given, usable=usable)
+    picture = np.asarray(smooth_guess(flat, given.frames, usable), dtype=np.float32)
     scale = min(1.0, max(float(picture.mean()), TINY) / DIM)
     bright = given.over(scale)
-    data = _unexplained_by(picture / np.float32(scale), bright, settings)
+    data = _unexplained_by(picture / np.float32(scale), flat, bright, settings)
     volume = _searched(data, settings, lambda: tell(1))
     k = psi.binning
     centre = search.per_pixel(volume, psi.size, k)
@@ -145,15 +155,16 @@ def reconstruct_adaptive(
     tell(2)
     held = held_out(usable)
     # Total variation is what surfaces must beat on the readings kept from both, and their begin.
-    start = TVSettings(max_steps=settings.start_steps)
+    start = TVSettings(max_steps=settings.start_steps, objective_every=settings.start_steps + 1)
     plain = reconstruct_tv(given.psi, given.frames, given.typical, start, usable & ~held)
     precision = np.where(usable & ~held, 1 / data.variance, 0).astype(np.float32)
     nearer = 1 if settings.nearer == "larger" else -1
     begun = centre_view(plain.light_field) / np.float32(scale)
     needed = Needed(given.psi, centre, begun, settings.texture)
-    left_out: list[str] = []
+    left_out = [] if edges is None else [edges.told]
     if settings.parsimony:
-        needed, left_out = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
+        needed, spared = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
+        left_out += spared
     found = solve(
         needed.psi,
         needed.centre,
@@ -194,6 +205,8 @@ def reconstruct_adaptive(
                 f"readings kept from the fit speak against surfaces in {free.share.mean():.0%} of "
                 "the picture, where total variation is returned: take more shots"
             )
+    if edges is not None:
+        light_field = faded(edges, given.psi, light_field, given.frames, all_usable)
     if variance is not None:
         maps["sigma"] = np.sqrt(variance)
     tell(total)
@@ -250,14 +263,16 @@ class Given:
         return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
 
 
-def _unexplained_by(picture: Array, given: Given, settings: AdaptiveSettings) -> search.Data:
+def _unexplained_by(
+    picture: Array, flat: FlatPsi, given: Given, settings: AdaptiveSettings
+) -> search.Data:
     """Return what a smooth picture (y, x, c), the same in all views, leaves to be explained."""
-    psi, k = given.psi, given.psi.binning
-    flat = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
+    k = flat.binning
     grey = picture.mean(axis=-1)
     brightness = grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3))
     variance = given.noise + np.float32(settings.misfit**2)
-    return search.Data(psi, given.frames - psi.forward(flat), variance, given.usable, brightness)
+    left = (given.frames - flat.forward(picture)).astype(np.float32)
+    return search.Data(given.psi, left, variance, given.usable, brightness)
 
 
 def _searched(

@@ -3,22 +3,22 @@
 A ray is a sample (y, x) of a view (v, u); at disparity d it sees the texture at
 (y - d (v - V // 2), x - d (u - U // 2)), the place of that point in the centre view, by cubic
 interpolation (Catmull-Rom). Textures reach beyond the centre view by a margin on all sides, since
-other views see there. Where memory allows, the rays are assembled to a sparse matrix (`assembly`);
-else each is followed anew: 2 x 16 operations for every weight that is not 0.
+other views see there. Where memory allows, the rays are laid out once (`assembly`); else each is
+followed anew: 2 x 16 operations for every weight that is not 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import get_num_threads, njit
 from numpy.typing import NDArray
-from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import TAPS, assembled, cubic, first_tap
+from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out
 from reconstruction.adaptive.bands import in_bands
 
 Array = NDArray[np.floating]
@@ -30,7 +30,6 @@ def _follow(
     colour,
     disparity,
     hidden,
-    factors,
     margin,
     binning,
     first,
@@ -41,12 +40,11 @@ def _follow(
 ):
     """Project textures to the pixel rows first to last - 1 of frames, or, back, frames to textures.
 
-    textures: (part, layer, c, y, x), padded; a ray sees the sum of the parts times factors
-    (part, v, u). frames: (shot, pixel_y, pixel_x). What is projected to is added to.
+    textures: (layer, c, y, x), padded. frames: (shot, pixel_y, pixel_x). What is projected to is
+    added to.
     """
     shots, views_v, views_u, _, stored, columns = weights.shape
-    parts = textures.shape[0]
-    last_y, last_x = textures.shape[3] - TAPS, textures.shape[4] - TAPS
+    last_y, last_x = textures.shape[2] - TAPS, textures.shape[3] - TAPS
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for y in range(first * binning, last * binning):
         for v in range(views_v):
@@ -71,16 +69,14 @@ def _follow(
                             c = colour[s, y, x] if stored == 1 else k
                             if back:
                                 w *= frames[s, y // binning, x // binning]
-                            for part in range(parts):
-                                texture = textures[part, layer, c]
-                                share = w * factors[part, v, u]
-                                for i in range(TAPS):
-                                    for j in range(TAPS):
-                                        tap = share * wy[i] * wx[j]
-                                        if back:
-                                            texture[iy + i, ix + j] += tap
-                                        else:
-                                            total += tap * texture[iy + i, ix + j]
+                            texture = textures[layer, c]
+                            for i in range(TAPS):
+                                share = w * wy[i]
+                                for j in range(TAPS):
+                                    if back:
+                                        texture[iy + i, ix + j] += share * wx[j]
+                                    else:
+                                        total += share * wx[j] * texture[iy + i, ix + j]
                         if not back:
                             frames[s, y // binning, x // binning] += total
 
@@ -109,12 +105,52 @@ def _render(disparity, hidden, textures, margin, first, last, out):
                         out[v, u, y, x, c] = value
 
 
+@njit(cache=True, fastmath=True, nogil=True)
+def _steepen(weights, colour, disparity, hidden, slopes, margin, first, last, out):
+    """Set rows first to last - 1 of out (shot, v, u, y, 1, x): weights times what rays change by.
+
+    slopes: (2, c, y, x), derivatives of the nearest texture, padded, along y and x. The change is
+    that by the ray's disparity; none where the ray sees what lies behind.
+    """
+    shots, views_v, views_u, _, stored, columns = weights.shape
+    last_y, last_x = slopes.shape[2] - TAPS, slopes.shape[3] - TAPS
+    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    for y in range(first, last):
+        for v in range(views_v):
+            for u in range(views_u):
+                down, right = np.float32(views_v // 2 - v), np.float32(views_u // 2 - u)
+                for x in range(columns):
+                    if hidden[v, u, y, x] or (down == 0 and right == 0):
+                        continue
+                    for s in range(shots):
+                        change = np.float32(0)
+                        for k in range(stored):
+                            w = weights[s, v, u, y, k, x]
+                            if w == 0:
+                                continue
+                            d = disparity[v, u, y, x]
+                            iy, fy = first_tap(y + d * down, margin, last_y)
+                            ix, fx = first_tap(x + d * right, margin, last_x)
+                            cubic(fy, wy)
+                            cubic(fx, wx)
+                            c = colour[s, y, x] if stored == 1 else k
+                            for i in range(TAPS):
+                                along = np.float32(0)
+                                for j in range(TAPS):
+                                    steep = down * slopes[0, c, iy + i, ix + j]
+                                    steep += right * slopes[1, c, iy + i, ix + j]
+                                    along += wx[j] * steep
+                                change += w * wy[i] * along
+                        out[s, v, u, y, 0, x] = change
+
+
 class Surfaces:
     """Psi of textures on surfaces: forward and adjoint between textures and frames.
 
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
     centre view does not. Textures have the shape `textures_shape`, (layer, c, y, x), padded by
-    `margin` samples on all sides; colours: of them, 1 for a Psi that sees only the first.
+    `margin` samples on all sides; colours: of them, 1 for a Psi that sees only the first. layers: 1
+    where Psi sees nothing hidden.
     """
 
     def __init__(
@@ -124,86 +160,52 @@ class Surfaces:
         hidden: NDArray[np.uint8],
         margin: int,
         colours: int = 3,
+        layers: int = 2,
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
-        self.textures_shape = (2, colours, rows + 2 * margin, columns + 2 * margin)
-        views = psi.light_field_shape[:2]
-        self._even = np.ones((1, *views), dtype=np.float32)
-        steps = np.indices(views, dtype=np.float32)
-        self._slopes = -np.stack([steps[0] - views[0] // 2, steps[1] - views[1] // 2])
+        self.textures_shape = (layers, colours, rows + 2 * margin, columns + 2 * margin)
 
     @cached_property
-    def _matrix(self) -> sparse.csr_array | None:
-        colours = self.textures_shape[1]
-        return assembled(self.psi, self.disparity, self.hidden, self.margin, colours=colours)
+    def _layout(self) -> Layout | None:
+        return laid_out(self.psi, self.disparity, self.hidden, self.margin, self.textures_shape)
 
-    @cached_property
-    def _transposed(self) -> sparse.csc_array | None:
-        return None if self._matrix is None else self._matrix.T
+    def _rays(self, first: int, last: int) -> tuple[Any, ...]:
+        psi = self.psi
+        seen = psi.weights, psi.colour_map, self.disparity, self.hidden
+        return (*seen, self.margin, psi.binning, first, last)
 
-    def _project(self, textures: Array, factors: Array) -> Array:
+    def _project(self, textures: Array) -> Array:
         frames = np.zeros(self.psi.frames_shape, dtype=np.float32)
-        psi, rows = self.psi, self.psi.frames_shape[1]
 
         def work(_: int, first: int, last: int) -> None:
-            _follow(
-                psi.weights,
-                psi.colour_map,
-                self.disparity,
-                self.hidden,
-                factors,
-                self.margin,
-                psi.binning,
-                first,
-                last,
-                False,
-                textures,
-                frames,
-            )
+            _follow(*[*self._rays(first, last), False, textures, frames])
 
-        in_bands(work, rows)
+        in_bands(work, frames.shape[1])
         return frames
 
-    def _back(self, frames: Array, factors: Array) -> Array:
-        psi, rows = self.psi, self.psi.frames_shape[1]
+    def _back(self, frames: Array) -> Array:
+        rows = self.psi.frames_shape[1]
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         # Bands of rows reach the same texture: each adds to its own.
         textures = [
-            np.zeros((len(factors), *self.textures_shape), dtype=np.float32)
+            np.zeros(self.textures_shape, dtype=np.float32)
             for _ in range(min(rows, get_num_threads()))
         ]
 
         def work(band: int, first: int, last: int) -> None:
-            _follow(
-                psi.weights,
-                psi.colour_map,
-                self.disparity,
-                self.hidden,
-                factors,
-                self.margin,
-                psi.binning,
-                first,
-                last,
-                True,
-                textures[band],
-                frames,
-            )
+            _follow(*[*self._rays(first, last), True, textures[band], frames])
 
         in_bands(work, rows, len(textures))
         return sum(textures[1:], start=textures[0])
 
     def forward(self, textures: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of textures (layer, c, y, x)."""
-        if self._matrix is None:
-            return self._project(textures[None], self._even)
-        return (self._matrix @ textures.ravel()).reshape(self.psi.frames_shape)
+        return self._project(textures) if self._layout is None else self._layout.read(textures)
 
     def adjoint(self, frames: Array) -> Array:
         """Return the adjoint of `forward`, (layer, c, y, x)."""
-        if self._transposed is None:
-            return self._back(frames, self._even)[0]
-        return (self._transposed @ frames.ravel()).reshape(self.textures_shape)
+        return self._back(frames) if self._layout is None else self._layout.returned(frames)
 
     def derivative(self, slopes: Array) -> tuple[Callable, Callable]:
         """Return how frames change with the centre view's disparity, and the adjoint of that.
@@ -211,24 +213,22 @@ class Surfaces:
         slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. The first maps
         (y, x), padded, to (shot, pixel_y, pixel_x); layers behind keep their disparity.
         """
-        frames, size = self.psi.frames_shape, self.textures_shape[2:]
-        matrix = assembled(self.psi, self.disparity, self.hidden, self.margin, slopes)
-        if matrix is not None:
-            transposed = matrix.T
-            return (
-                lambda change: (matrix @ change.ravel()).reshape(frames),
-                lambda missed: (transposed @ missed.ravel()).reshape(size),
-            )
+        psi = self.psi
+        steep = np.zeros((*psi.weights.shape[:4], 1, psi.size[1]), dtype=np.float32)
 
-        def forward(change: Array) -> Array:
-            both = np.zeros((2, *self.textures_shape), dtype=np.float32)
-            both[:, 0] = slopes * change
-            return self._project(both, self._slopes)
+        def work(_: int, first: int, last: int) -> None:
+            seen = psi.weights, psi.colour_map, self.disparity, self.hidden
+            _steepen(*seen, slopes, self.margin, first, last, steep)
 
-        def adjoint(missed: Array) -> Array:
-            return (slopes * self._back(missed, self._slopes)[:, 0]).sum(axis=(0, 1))
-
-        return forward, adjoint
+        in_bands(work, psi.size[0])
+        colours = np.zeros((psi.shots, *psi.size), np.uint8)
+        steep_psi = ImagingMatrix(steep, colours, psi.binning)
+        changes = Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1, 1)
+        size = changes.textures_shape[2:]
+        return (
+            lambda change: changes.forward(change.reshape(changes.textures_shape)),
+            lambda missed: changes.adjoint(missed).reshape(size),
+        )
 
     def light_field(self, textures: Array) -> Array:
         """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""

@@ -1,8 +1,8 @@
 """Search the disparities of a capture, from coarse to fine: where, and which, they may be.
 
-Wide patches of every third pixel judge half pixels of disparity, the range growing while its ends
-are wanted. Each tile of the fine search then judges only what the coarse one left possible there,
-so that cost grows with the disparities a scene really has.
+Wide patches of every third pixel judge disparities, half a pixel apart where they are small and one
+beyond, the range growing while its ends are wanted. Each tile of the fine search then judges only
+what the coarse one left possible there, so that cost grows with the disparities a scene really has.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from reconstruction.adaptive.labels import compatibility, posteriors
 Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5
 COARSE_SPACING = 3
-START_PX = 3.0
-"""Disparities searched first, to both sides; the range grows by as much at a time."""
+NEAR_PX, FAR_STEP_PX = 3.0, 1.0
+"""Disparities beyond are judged this much apart."""
+START_PX, GROWTH_PX = 9.0, 3.0
+"""Disparities searched first, to both sides; by how much the range grows at a time."""
 DECISIVE = 5.0
 """Log-likelihood by which a patch must prefer its best disparity to the mean one to count."""
 WANTED = 0.01
@@ -106,6 +108,15 @@ def _deciding(evidence: Array) -> NDArray[np.bool_]:
     return evidence.max(axis=-1) - evidence.mean(axis=-1) > DECISIVE
 
 
+def _reach(first_px: float, last_px: float, step_px: float) -> NDArray[np.float64]:
+    """Return the disparities beyond the first, to the last, a step apart."""
+    return np.arange(first_px + step_px, last_px + 1e-9, step_px)
+
+
+def _spacing(disparities: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.gradient(disparities) if len(disparities) > 1 else np.ones(len(disparities))
+
+
 def coarse(
     data: Data, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
 ) -> Volume:
@@ -113,32 +124,34 @@ def coarse(
     side = coarse_side(data.psi.shots)
     room = (min(data.psi.frames_shape[1:]) - 1) // (side - 1)
     patches = EvidencePatches(side, 3 * side // 2, min(COARSE_SPACING, max(room, 1)))
-    reach = COARSE_STEP_PX * np.floor(min(START_PX, furthest_px) / COARSE_STEP_PX)
-    known = np.arange(-reach, reach + 1e-9, COARSE_STEP_PX)
+    near = np.append(0.0, _reach(0, min(NEAR_PX, furthest_px), COARSE_STEP_PX))
+    beyond = np.concatenate([near, _reach(near[-1], min(START_PX, furthest_px), FAR_STEP_PX)])
+    known = np.concatenate([-beyond[:0:-1], beyond])
     evidence, kind, grid = _judged(data, patches, known, prior)
     while True:
         deciding = _deciding(evidence)
-        chances = posteriors(evidence, compatibility(known, slope_px * patches.stride, jump))
+        pairs = compatibility(known, slope_px * patches.stride, jump, _spacing(known))
+        chances = posteriors(evidence, pairs)
         best = chances.argmax(axis=-1)
         share = [
             float(np.mean(best[deciding] <= 1)) if deciding.any() else 0.0,
             float(np.mean(best[deciding] >= len(known) - 2)) if deciding.any() else 0.0,
         ]
-        more = [
-            (known[0] - np.arange(START_PX, 0, -COARSE_STEP_PX), share[0]),
-            (known[-1] + np.arange(COARSE_STEP_PX, START_PX + 1e-9, COARSE_STEP_PX), share[1]),
-        ]
-        wanted = [
-            part[np.abs(part) <= furthest_px] if ends > WANTED else part[:0] for part, ends in more
-        ]
-        if not sum(len(part) for part in wanted):
+        below, above = (
+            _reach(end, min(end + GROWTH_PX, furthest_px), FAR_STEP_PX)
+            if ends > WANTED
+            else known[:0]
+            for end, ends in zip((-known[0], known[-1]), share, strict=True)
+        )
+        if not len(below) + len(above):
             break
-        added = [_judged(data, patches, part, prior)[0] for part in wanted if len(part)]
-        if len(wanted[0]):
-            evidence = np.concatenate([added.pop(0), evidence], axis=-1)
-        if len(wanted[1]):
-            evidence = np.concatenate([evidence, added.pop(0)], axis=-1)
-        known = np.concatenate([wanted[0], known, wanted[1]])
+        further = -below[::-1], above
+        judged = [
+            _judged(data, patches, part, prior)[0] if len(part) else evidence[..., :0]
+            for part in further
+        ]
+        evidence = np.concatenate([judged[0], evidence, judged[1]], axis=-1)
+        known = np.concatenate([further[0], known, further[1]])
     half = (patches.side - 1) * patches.spacing / 2
     centres = grid[0] + half, grid[1] + half
     return Volume(known, centres, chances, evidence, kind, deciding, max(share))
@@ -154,9 +167,10 @@ def _candidates(
         for at, (first, last) in zip(volume.centres, (rows, columns), strict=True)
     ]
     part = volume.probability[np.ix_(*within)].reshape(-1, len(volume.disparities))
-    possible = volume.disparities[part.max(axis=0) > POSSIBLE]
-    near = np.abs(labels[:, None] - possible[None]).min(axis=1) <= COARSE_STEP_PX + 1e-9
-    return np.flatnonzero(near)
+    possible = part.max(axis=0) > POSSIBLE
+    about = _spacing(volume.disparities)[possible] + 1e-9
+    apart = np.abs(labels[:, None] - volume.disparities[possible][None])
+    return np.flatnonzero((apart <= about).any(axis=1))
 
 
 def fine(

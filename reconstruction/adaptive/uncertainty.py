@@ -69,11 +69,16 @@ def _parts(scene: Scene, doubt: Array) -> Array:
     both = np.stack([np.stack(smooth)] * 2).astype(np.float32)
     seen = np.maximum(scene.surfaces.light_field(both), 0)
     views_v, views_u = seen.shape[:2]
-    v = (np.arange(views_v) - views_v // 2)[:, None, None, None]
-    u = (np.arange(views_u) - views_u // 2)[None, :, None, None]
+    v = (np.arange(views_v, dtype=np.float32) - views_v // 2)[:, None, None, None]
+    u = (np.arange(views_u, dtype=np.float32) - views_u // 2)[None, :, None, None]
     noise, along_y, along_x = (seen[..., i] for i in range(3))
-    slip = (v**2 * along_y + u**2 * along_x) * (doubt + SURE_PX**2)
-    return np.stack([LET_IN * noise, along_y + along_x, slip]).astype(np.float32)
+    parts = np.empty((3, *noise.shape), dtype=np.float32)
+    np.multiply(noise, np.float32(LET_IN), out=parts[0])
+    np.add(along_y, along_x, out=parts[1])
+    np.multiply(v**2, along_y, out=parts[2])
+    parts[2] += u**2 * along_x
+    parts[2] *= doubt + np.float32(SURE_PX**2)
+    return parts
 
 
 def _gathered(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -132,5 +137,5 @@ def deviation(
     # The scale at which 68 % of the held-out readings lie within one deviation, noise included.
     beyond = np.maximum(np.square(missed) - of_readings, 0) / np.maximum(predicted, 1e-20)
     scale = max(float(np.quantile(beyond, WITHIN_ONE)), LEAST_SCALE)
-    variance = scale * (parts[0] + weights[0] * parts[1] + weights[1] * parts[2])
-    return Deviation(np.sqrt(variance).astype(np.float32), count, *map(float, weights))
+    variance = np.tensordot(np.array([scale, *(scale * weights)], np.float32), parts, axes=1)
+    return Deviation(np.sqrt(variance), count, *map(float, weights))
