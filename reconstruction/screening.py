@@ -22,6 +22,10 @@ DARK_SHARE = 0.02
 """Of the brightest shot's brightness, below which a shot is called dark."""
 ALIKE = 0.25
 """Share of the expected squared difference of two shots below which they are called the same."""
+SHOWN = 0.1
+"""Strength at which the difference of two shots shows the one that Psi says, from which on they are
+two: masks that are blurred or elsewhere show weaker than Psi says, a shot that repeats another not
+at all."""
 LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
 GAIN_STEPS = 4
@@ -118,8 +122,10 @@ def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tup
             both = usable[shot] & usable[other]
             if other in found or shot in found or not both.any():
                 continue
-            expected = _square(predicted[shot] - predicted[other], both)
-            if _square(frames[shot] - frames[other], both) < ALIKE * expected:
+            expected = (predicted[shot] - predicted[other])[both].astype(np.float64)
+            seen = (frames[shot] - frames[other])[both].astype(np.float64)
+            square = float(expected @ expected)
+            if float(seen @ seen) < ALIKE * square and float(seen @ expected) < SHOWN * square:
                 misfits = [_square(frames[i] - predicted[i], both) for i in (other, shot)]
                 found.append((other, shot)[int(np.argmax(misfits))])
     return tuple(sorted(found))

@@ -85,6 +85,11 @@ def test_a_mask_that_is_to_stand_still_repeats_its_shots():
     assert seen.double == ()
 
 
+@pytest.mark.parametrize(("fault", "strength"), [("edge-blur", 2), ("mask-distance-error", 200)])
+def test_masks_that_show_weakly_do_not_make_shots_repeat(fault, strength):
+    assert screen(made(fault, strength)).double == ()
+
+
 @pytest.mark.parametrize("percent", [3, 30])
 def test_flicker_is_measured_and_evened(percent):
     one = made("flicker", percent)

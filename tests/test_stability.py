@@ -1,11 +1,11 @@
 """Sweeps until failure: breaking points, curves, and `emmc-rig stability` end to end."""
 
 import csv
-import html.parser
 import json
 import sys
 
 import pytest
+from pages import Page
 
 from emmc_rig import cli
 from emmc_rig.demo import Silent
@@ -51,22 +51,6 @@ def few_steps(monkeypatch):
 def undrawn(monkeypatch):
     """No charts: they take longer than a few steps do."""
     monkeypatch.setattr(stability_command, "_written", lambda run, *_: run.folder)
-
-
-class Page(html.parser.HTMLParser):
-    """Collects ids and what is loaded from elsewhere."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.ids, self.foreign = [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        for name, value in attributes:
-            if name == "id":
-                self.ids.append(value)
-            if name in ("src", "href") and not value.startswith(("data:", "#")):
-                self.foreign.append(value)
 
 
 def ends(found):

@@ -15,6 +15,7 @@ from emmc_rig.simulate import simulate
 from emmc_rig.stability.faults import FAULTS, trial
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction
+from reconstruction.screening import screened
 from reconstruction.tv import TVSettings
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
@@ -53,6 +54,13 @@ def test_masks_of_an_even_scene_show_at_their_full_strength(three):
     np.testing.assert_allclose(found.strength, 1, atol=0.01)
     assert found.lowest == pytest.approx(1, abs=0.02)
     assert found.relief > 0.3
+
+
+def test_a_few_bright_spots_do_not_make_the_masks_seem_weak(three):
+    scene = np.full(three.light_field_shape, 0.05, np.float32)
+    scene[:, :, 4::7, 5::9] = 0.9
+    seen = shadow(relief_in(three, three.forward(scene)))
+    np.testing.assert_allclose(seen.strength, 1, atol=0.03)
 
 
 def test_masks_half_as_strong_show_at_half_strength(three):
@@ -234,6 +242,58 @@ def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
     verdict = judged(worse)
     assert verdict.level == "do not use"
     assert [LEVELS.index(one.level) for one in verdict.reasons] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("found", "by_tv", "by_adaptive"),
+    [
+        ({"bad": 0.06}, "trust", "doubt"),
+        ({"left_out": (1, 2)}, "doubt", "trust"),
+        ({"bad": 0.03}, "trust", "trust"),
+        ({"motion_effect": 0.2, "motion_px": 0.3, "moved_at": (1, 5, 5)}, "trust", "trust"),
+        ({"motion_effect": 0.2, "motion_px": 0.5, "moved_at": (1, 5, 5)}, "doubt", "doubt"),
+        ({"bad": 0.1}, "doubt", "doubt"),
+    ],
+)
+def test_what_misleads_one_method_may_leave_another_unharmed(three, found, by_tv, by_adaptive):
+    clean = clean_evidence(three)
+    for method, level in (("tv", by_tv), ("adaptive-fast", by_adaptive)):
+        verdict = judged(dataclasses.replace(clean, method=method, **found))
+        assert verdict.level == level, verdict.words
+
+
+def test_bad_pixels_that_screening_finds_are_told():
+    verdict = judged_trial("bad-pixels", 20)
+    share = verdict.evidence.bad
+    assert 0.1 < share < 0.2
+    assert f"{share:.1%} of the pixels are bad and not listed" in verdict.words
+
+
+def motion_effect(fault, strength):
+    camera = find_camera("rgbw-bayer-3shots")
+    given = trial(FAULTS[fault], strength, "deep-occlusions", camera, (64, 80), 0, 3)
+    seen = screened(given.psi, given.readings, given.usable)
+    found = relief(given.psi, seen.frames, given.noise_sigma, seen.usable)
+    motion = compared(given.psi, found).motion
+    assert motion is not None
+    return motion.effect
+
+
+def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
+    assert motion_effect("bad-pixels", 3) < 0.02
+    assert motion_effect("camera-motion", 1) > 0.2
+
+
+def test_a_spot_that_one_shot_cannot_see_does_not_pass_for_motion(three):
+    y, x = np.indices(SIZE)
+    waves = 0.3 + 0.1 * np.sin(x / 5) * np.cos(y / 6)
+    picture = waves + 0.6 * np.exp(-((y - 20) ** 2 + (x - 30) ** 2) / 18)
+    scene = np.broadcast_to(picture[..., None], three.light_field_shape).astype(np.float32)
+    usable = everywhere(three)
+    usable[1, 16:21, 28:35] = False
+    found = compared(three, relief_in(three, three.forward(scene), usable=usable)).motion
+    assert found is not None
+    assert found.effect < 0.02
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,7 @@ from simulators.scenes import SCENES
 
 ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
 NONE, ALL = "none", "all"
-REVISION = 2
+REVISION = 3
 BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
 KINDS = (SENSOR, MASK, SHOTS)
 """Of faults that befall a capture: a scene or a design that is hard is no fault of it."""

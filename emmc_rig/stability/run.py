@@ -19,8 +19,7 @@ from emmc_rig.camera_sheet import find_camera
 from emmc_rig.chart.run import dictionary_identity, machine
 from emmc_rig.chart.scores import angular_snr_db
 from emmc_rig.demo import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.journal import Journal, digest_of
+from emmc_rig.journal import Journal, digest_of, kept_when_stopped
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.pictures import telling_lines
 from emmc_rig.reconstruct import open_dictionary
@@ -72,23 +71,17 @@ class StabilityRun:
         layers below do for wrong input; what is done is kept in each case.
         """
         journal = Journal(self.folder / POINTS)
-        try:
+
+        def kept() -> str:
+            return f"{len(self.results)} of {len(points)} points are"
+
+        with kept_when_stopped(self.folder, self.folder, StabilityStopped, kept):
             (self.folder / PICTURES).mkdir(exist_ok=True)
             watcher.begin(STAGE, len(points))
             for (scene, fault, strength), some in groupby(
                 points, lambda point: (point.scene, point.fault, point.strength)
             ):
                 self._measure_trial(scene, fault, strength, list(some), journal, watcher)
-        except KeyboardInterrupt as stop:
-            raise StabilityStopped(
-                f"stopped by Ctrl-C; {len(self.results)} of {len(points)} points are kept in "
-                f"{self.folder}: run the same command again to go on"
-            ) from stop
-        except OSError as fault:
-            raise AppError(
-                f"--out {self.folder}: cannot be written ({fault.strerror or fault}); the points "
-                "done are kept: make room and run the same command again to go on"
-            ) from fault
 
     def _measure_trial(
         self,

@@ -24,8 +24,8 @@ Array = NDArray[np.floating]
 class Evidence:
     """Figures of a capture and of a light field found from it; None where there is nothing to say.
 
-    method: that found it; status: what it said. left_out: shots that screening left out. noise:
-    the readings' deviation over their mean.
+    method: that found it; status: what it said. left_out: shots that screening left out. bad: share
+    of the pixels that it did. noise: the readings' deviation over their mean.
     """
 
     method: str
@@ -46,6 +46,7 @@ class Evidence:
     motion_effect: float | None
     moved_at: tuple[int, int, int] | None
     off: float
+    bad: float
     unusable: float
     saturated: float
     blind: float
@@ -69,7 +70,7 @@ class Evidence:
         return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
-TOLD = ("decided", "at_end", "furthest_px", "share_free")
+TOLD = ("decided", "at_end", "share_free")
 """Parameters of a result that bear on whether it can be trusted."""
 
 
@@ -78,7 +79,8 @@ class Read:
     """frames, usable: (shot, pixel_y, pixel_x), as screened. kept: those kept from the fit.
 
     excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
-    that screening left out, for being dark or for repeating others.
+    that screening left out, for being dark or for repeating others. bad: share of the pixels that
+    it left out, for differing from their neighbours.
     """
 
     frames: Array
@@ -86,6 +88,7 @@ class Read:
     kept: NDArray[np.bool_]
     excluded: Array
     left_out: tuple[int, ...] = ()
+    bad: float = 0.0
 
 
 def gathered(
@@ -120,6 +123,7 @@ def gathered(
         motion_effect=None if moved is None else moved.effect,
         moved_at=None if moved is None else (moved.shot, *moved.place),
         off=pixels.off,
+        bad=read.bad,
         unusable=pixels.unusable,
         saturated=pixels.saturated,
         blind=pixels.blind,

@@ -29,17 +29,23 @@ class Limits:
 
 
 DISPLACED_PX = Limits(0.28, 0.6)
-STRENGTH_LOST = Limits(0.15, 0.35)
+STRENGTH_LOST = Limits(0.19, 0.35)
 """Of the masks' shadow, as a share of what Psi says."""
-VIGNETTING = Limits(0.06, 0.3)
+VIGNETTING = Limits(0.2, 0.5)
 FLICKER = Limits(0.05, 0.15)
 MOTION = Limits(0.075, 0.3)
 """What motion between shots changes, over the mean reading."""
+LEAST_MOTION_PX = 0.35
+"""Below it bright spots at rest pass for motion, as the masks of each shot show them otherwise."""
 OFF = Limits(0.015, 0.05)
+BAD = Limits(0.02, 0.1)
+"""Of the pixels, found bad by screening: where there are so many, others were not found."""
+BAD_FOR_TV = 2.0
+"""Times that limit, as total variation evens out single wrong readings."""
 SATURATED = Limits(0.14, 0.35)
 BLIND = Limits(0.05, 0.25)
-NOISE_SHARE = Limits(0.61, 0.9)
-LEAST_NOISE = 0.1
+NOISE_SHARE = Limits(0.5, 0.9)
+LEAST_NOISE = 0.13
 """Of an even scene noise is all there is to miss, and does no harm."""
 NOISE = Limits(0.3, 0.8)
 """Deviation of the readings over their mean."""
@@ -50,6 +56,9 @@ AT_END = Limits(0.01, 1.0)
 OTHERS = 0.7
 """Of the limits on Psi's errors, for all methods but tv: they lose 3 dB sooner."""
 LEFT_OUT = Limits(0.4, 1.0)
+LEFT_OUT_FOR_SURFACES = Limits(0.7, 1.0)
+"""One shot nearly does for a method that carries one picture to all views."""
+SURFACES = ("adaptive", "adaptive-fast")
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
@@ -110,13 +119,14 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         return
     if e.left_out:
         share = len(e.left_out) / len(e.brightness)
+        limits = LEFT_OUT_FOR_SURFACES if e.method in SURFACES else LEFT_OUT
         shots = ", ".join(str(shot + 1) for shot in e.left_out)
         yield Reason(
             f"{len(e.left_out)} of {len(e.brightness)} shots were left out, dark or the same as "
             f"another: {shots}",
             share,
             "look at lamp and stage, and take them again",
-            LEFT_OUT.level(share),
+            limits.level(share),
         )
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
     bright = [(one or 0.0) if shot in kept else 1.0 for shot, one in enumerate(e.brightness)]
@@ -154,7 +164,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             f"{y}, column {x}",
             e.motion_px,
             "hold scene and camera still, or reconstruct one shot by adaptive",
-            MOTION.level(e.motion_effect),
+            MOTION.level(e.motion_effect) if e.motion_px > LEAST_MOTION_PX else "trust",
         )
 
 
@@ -192,7 +202,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     changes = {name: one for name, one in e.changes.items() if None not in one}
     likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
     drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
-    weak = STRENGTH_LOST.times(_patience(e, 0.4)).level(lost)
+    weak = STRENGTH_LOST.times(_patience(e, 0.85)).level(lost)
     displaced = DISPLACED_PX.times(_patience(e, 0.85)).level(moved)
     if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
         yield Reason(
@@ -203,15 +213,15 @@ def _masks(e: Evidence) -> Iterator[Reason]:
         )
     elif weak != "trust":
         yield Reason(_weakness(weakest[0], likeliest, changes), weakest[0], drift, weak)
-    elif likeliest == "vignetting":
-        darker, deviation, _ = changes[likeliest]
+    elif "vignetting" in changes:
+        darker, deviation, _ = changes["vignetting"]
         assert darker is not None
         assert deviation is not None
         yield Reason(
             f"the outermost rays seem to lose {min(darker, 1):.0%} more than Psi says",
             darker,
             "measure Psi with whiteboards at this aperture, or close the aperture",
-            VIGNETTING.times(_patience(e, 0.6)).level(darker - 2 * deviation),
+            VIGNETTING.times(_patience(e, 0.5)).level(darker - 2 * deviation),
         )
 
 
@@ -237,11 +247,19 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
             "list dead and hot pixels (a dark and a reference frame tell them), or expose less",
             OFF.level(e.off),
         )
+    shots = len(e.strengths)
+    bad = BAD.times(shots**0.75 * (BAD_FOR_TV if e.method == "tv" else 1))
+    yield Reason(
+        f"{e.bad:.1%} of the pixels are bad and not listed",
+        e.bad,
+        "list dead and hot pixels: a dark and a reference frame tell them",
+        bad.level(e.bad),
+    )
     yield Reason(
         f"{e.saturated:.0%} of the readings are saturated",
         e.saturated,
         "expose less, or bracket",
-        SATURATED.level(e.saturated / len(e.strengths) ** 0.25),
+        SATURATED.level(e.saturated / shots**0.25),
     )
     yield Reason(
         f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "

@@ -81,5 +81,5 @@ def _as_fitted(
         return Read(fitted, usable, kept_readings(usable), excluded), ()
     seen = screened(psi, fitted, usable)
     left_out = tuple(sorted((*seen.dark, *seen.double)))
-    read = Read(seen.frames, seen.usable, kept_readings(seen.usable), excluded, left_out)
-    return read, seen.told
+    kept, bad = kept_readings(seen.usable), float(seen.bad.mean())
+    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad), seen.told

@@ -25,6 +25,8 @@ LOCAL_PX = 2.0
 """Deviation of the window over which the scene's texture is judged."""
 DIMMEST = 0.05
 """Share of the typical expected reading below which a pixel tells nothing."""
+DIMMEST_CALM = 0.2
+"""Brightness of calm places over the smooth picture's, by which readings are divided at least."""
 LEAST_RELIEF = 0.02
 """Of the masks, over the readings, below which they tell nothing (a coded aperture has none)."""
 TILE_PX = 24
@@ -35,8 +37,8 @@ class Relief:
     """Readings and masks around the smooth picture, (shot, pixel_y, pixel_x) each.
 
     level: what is expected of evenly grey masks. masks: what the masks add, as a share of it.
-    read: what the readings add; seen: that, without its local mean. good: where both are known.
-    weight: the texture's inverse variance. picture: the smooth picture, (y, x, c).
+    read: what the readings add; seen: that, relative to the calm places around. good: where both
+    are known. weight: the texture's inverse variance. picture: the smooth picture, (y, x, c).
     """
 
     level: NDArray[np.float32]
@@ -113,7 +115,14 @@ def relief(
     rough = averaged(np.square(seen - masks), good, filters, LOCAL_PX)
     least = float(np.median(rough[good])) if good.any() else 1.0
     weight = np.where(good, 1 / np.maximum(rough, 0.3 * least + 1e-12), 0)
-    return Relief(level, masks, read, seen, good, weight.astype(np.float32), picture)
+    # Few bright spots make the smooth picture brighter than the calm places that count most.
+    calm = averaged(weight * (read - masks), good, filters, SMOOTH_PX) / np.maximum(
+        averaged(weight, good, filters, SMOOTH_PX), 1e-12
+    )
+    seen = np.where(good, (1 + read) / np.maximum(1 + calm, DIMMEST_CALM) - 1, 0)
+    return Relief(
+        level, masks, read, seen.astype(np.float32), good, weight.astype(np.float32), picture
+    )
 
 
 def tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:

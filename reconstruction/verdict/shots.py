@@ -18,6 +18,8 @@ from reconstruction.verdict.shadow import Relief, cross_strength, tiles
 Array = NDArray[np.floating]
 BLURS_PX = (0.8, 1.5, 4.0)
 """Of the pictures that are compared: fine ones tell small motions, coarse ones large."""
+OUTLIERS_PX = 3
+"""Side of the window whose median stands for a pixel when motion is told."""
 SAME_VIEWPOINT = 0.1
 """View steps between the mean viewpoints of two shots beyond which parallax passes for motion."""
 
@@ -84,10 +86,15 @@ def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> Motion:
     grey = cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA)
     mean = max(float(grey.mean()), 1e-12)
     worst = Motion()
+    # What is saturated in one shot only would leave a spot in the others.
+    common = np.asarray(found.good[kept].all(axis=0))
+    # A bad pixel stands in every shot, but behind dark cells of the mask it seems far brighter.
+    calm = [
+        np.asarray(cv2.medianBlur(one, OUTLIERS_PX), dtype=np.float32)
+        for one in np.asarray(detail, dtype=np.float32)
+    ]
     for blur in BLURS_PX:
-        pictures = [
-            _blurred(one, good, blur) * grey for one, good in zip(detail, found.good, strict=True)
-        ]
+        pictures = [_blurred(one, common, blur) * grey for one in calm]
         first = pictures[kept[0]]
         for shot in map(int, kept[1:]):
             slope_y, slope_x = np.gradient((first + pictures[shot]) / 2)
