@@ -1,14 +1,16 @@
 """`emmc-rig chart` end to end, and `emmc-rig reconstruct` choosing by it."""
 
 import csv
-import html.parser
 import json
 import os
 import re
+from contextlib import contextmanager
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from pages import Page
 
 from emmc_rig.chart import lock, measure, plan
 from emmc_rig.chart import run as chart_run
@@ -20,7 +22,8 @@ from emmc_rig.chart.peers import Peer
 from emmc_rig.chart.recommend import ADVICE, read_rows
 from emmc_rig.chart.reference import Reference
 from emmc_rig.chart.rows import COLUMNS
-from emmc_rig.chart.run import POINTS, ChartStopped, run_job
+from emmc_rig.chart.run import POINTS, ChartStopped
+from emmc_rig.chart.worker import working
 from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
 from emmc_rig.journal import digest_of
@@ -32,9 +35,14 @@ SIZE = (24, 32)
 LEVELS = {"tv": {"2 steps": {"tv": {"max_steps": 2}}, "default": {"tv": {"max_steps": 9}}}}
 
 
-def at_once(job, *_):
-    """Measure in this process: what it finds is the same, only the memory is not its own."""
-    return measured(job)
+def at_once(measure):
+    """Return a worker that measures in this process: all but the memory is the same."""
+
+    @contextmanager
+    def working(*_):
+        yield SimpleNamespace(measure=measure)
+
+    return working
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +56,7 @@ def quick(monkeypatch):
     """Few settings of total variation alone, measured in this process, by a known yardstick."""
     monkeypatch.setattr(measure, "reference", lambda: Reference(0.01, 0.01))
     monkeypatch.setattr(plan, "VARIATIONS", LEVELS)
-    monkeypatch.setattr(chart_run, "run_job", at_once)
+    monkeypatch.setattr(chart_run, "working", at_once(measured))
 
 
 def settings(**more):
@@ -66,22 +74,6 @@ def command(run):
         return code, out, " ".join(err.split())
 
     return call
-
-
-class Page(html.parser.HTMLParser):
-    """Collects ids and what is loaded from elsewhere."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.ids, self.foreign = [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        for name, value in attributes:
-            if name == "id":
-                self.ids.append(value)
-            if name in ("src", "href") and not value.startswith(("data:", "#")):
-                self.foreign.append(value)
 
 
 def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
@@ -128,13 +120,13 @@ def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
 def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
     calls = []
 
-    def stopping(job, *others):
+    def stopping(job):
         calls.append(job)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return measured(job)
 
-    monkeypatch.setattr(chart_run, "run_job", stopping)
+    monkeypatch.setattr(chart_run, "working", at_once(stopping))
     with pytest.raises(ChartStopped, match="1 of 2 points are kept"):
         run_chart(settings(), tmp_path / "out", Silent())
     run_chart(settings(), tmp_path / "out", Silent())
@@ -177,27 +169,56 @@ def test_growth_is_charted(quick, monkeypatch, tmp_path):
     assert "Growth with the size" in outcome.page.read_text()
 
 
-def test_a_point_is_measured_in_a_process_of_its_own(tmp_path):
+@pytest.fixture
+def job(tmp_path):
+    """Three steps of total variation on a small capture."""
     path, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", SIZE), 0, tmp_path)
-    job = {
+    return {
         "capture": str(path), "settings": {"tv": {"max_steps": 3}}, "method": "tv",
         "needs_dictionary": False, "dictionary": None, "repeats": 2, "enough_s": 60,
         "picture": str(tmp_path / f"{digest}-x.webp"),
     }  # fmt: skip
-    with timing_lock("a test") as held:
-        found = run_job(job, {"NUMBA_NUM_THREADS": "1"}, 300, held)
-        assert found["cores"] == 1
-        assert found["repeats"] == 2
-        assert found["steps"] == 3
-        assert 0 < found["fastest_s"] <= found["seconds"] <= found["slowest_s"]
-        assert 50 < found["base_mib"] <= found["peak_mib"]
-        assert (tmp_path / f"{digest}-truth.webp").is_file()
-        late = run_job(job, {}, 0.01, held)
-        assert late == {"failed": "not done after 0 s"}
-        wrong = {**job, "needs_dictionary": True, "dictionary": str(tmp_path / "none.h5")}
-        told = run_job(wrong, {}, 300, held)
+
+
+def test_a_worker_outlives_what_fails_and_tells_each_jobs_peak(job, tmp_path):
+    large, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", (96, 160)), 0, tmp_path)
+    later = {**job, "capture": str(large), "picture": str(tmp_path / f"{digest}-x.webp")}
+    wrong = {**job, "needs_dictionary": True, "dictionary": str(tmp_path / "none.h5")}
+    with (
+        timing_lock("a test") as held,
+        working({"NUMBA_NUM_THREADS": "1"}, 300, held) as worker,
+    ):
+        first = worker.measure(job)
+        process = worker._process
+        told = worker.measure(wrong)
         assert "none.h5" in told["failed"]
         assert not told["keep"]
+        wide, again = worker.measure(later), worker.measure(job)
+        assert (worker._process is process) == worker.lasting
+    assert first["cores"] == 1
+    assert first["repeats"] == 2
+    assert first["steps"] == 3
+    assert 0 < first["fastest_s"] <= first["seconds"] <= first["slowest_s"]
+    assert 50 < first["base_mib"] <= first["peak_mib"]
+    assert list(tmp_path.glob("*-truth.webp"))
+    # Psi alone takes 5 x 5 x 96 x 160 numbers more.
+    assert again["peak_mib"] < wide["peak_mib"] - 1
+    assert again["peak_mib"] == pytest.approx(first["peak_mib"], rel=0.1)
+    assert again["psnr_db"] == first["psnr_db"]
+
+
+def test_a_job_that_takes_too_long_is_given_up_and_the_next_is_done(job):
+    with timing_lock("a test") as held, working({}, 0.01, held) as worker:
+        assert worker.measure(job) == {"failed": "not done after 0 s"}
+        worker.limit_s = 300
+        assert worker.measure(job)["steps"] == 3
+
+
+def test_a_worker_that_fails_by_itself_says_why(job):
+    with timing_lock("a test") as held, working({}, 300, held) as worker:
+        with pytest.raises(AppError, match="tv: the measuring process failed: KeyError: 'repeats'"):
+            worker.measure({key: job[key] for key in job if key != "repeats"})
+        assert worker.measure(job)["steps"] == 3
 
 
 def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
@@ -212,7 +233,8 @@ def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
 
 
 def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
-    monkeypatch.setattr(chart_run, "run_job", lambda *_: {"failed": "no room", "keep": False})
+    full = at_once(lambda _: {"failed": "no room", "keep": False})
+    monkeypatch.setattr(chart_run, "working", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
         run_chart(settings(), tmp_path / "out", Silent())
     assert not (tmp_path / "out" / POINTS).read_text()

@@ -24,10 +24,10 @@ from emmc_rig.output import command_line, versions, write_metrics
 from simulators.scenes import SCENES
 
 CSV, PAGE, DRAWN = "chart.csv", "chart.html", "charts"
-FAST_SCENES = ("deep-occlusions", "wide-disparity")
+FAST_SCENES = ("near-planar", "deep-occlusions", "wide-disparity")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
 CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-2shots", "rgbw-bayer-3shots", "rgbw-mono")
-FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 3.0, "limit_s": 300.0}
+FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0, "limit_s": 300.0}
 
 
 @dataclass(frozen=True)

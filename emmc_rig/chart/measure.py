@@ -1,7 +1,7 @@
-"""One point in a process of its own: a job as JSON from standard input, its figures to the output.
+"""A process that measures points: jobs as lines of JSON from standard input, figures to the output.
 
 Order matters: imports, frames, a warm-up on a small window (which compiles and loads), the timed
-runs, the peak of memory; only then the truth is read and compared.
+runs, the peak of memory; only then the truth is read and compared. Each job's peak is its own.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import statistics
 import sys
 import time
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
-from emmc_rig.benchmarks.memory import peak_memory_mib
+from emmc_rig.benchmarks.memory import forget_peak, peak_memory_mib
 from emmc_rig.chart.captures import Frames, read_frames, read_truth
 from emmc_rig.chart.peers import PEERS, Given
 from emmc_rig.chart.reference import reference
@@ -36,7 +37,6 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.result import Reconstruction
 
-FAILED = 3
 WARM_UP_PX = 27
 KNOWN = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
 
@@ -46,21 +46,22 @@ def measured(job: dict) -> dict:
 
     seconds: median of the repeats. cpu_seconds: likewise, of all cores together. window_cpu_s: of
     the warm-up's window once it is warm, which tells what does not grow with the picture.
-    peak_mib: resident memory of the process; base_mib: before the timed runs, with Psi and frames.
+    base_mib: resident memory of the process before the timed runs, with Psi and frames; peak_mib:
+    at most during them. dictionary_s: of the one that this process has made.
     """
     frames = read_frames(Path(job["capture"]))
     settings = MethodSettings.model_validate(job["settings"])
     psi, dictionary, dictionary_s = frames.psi, None, 0.0
     if job["needs_dictionary"]:
-        started = time.perf_counter()
-        dictionary = open_dictionary(job["dictionary"], psi.light_field_shape[:2], psi.binning)
-        dictionary_s = time.perf_counter() - started
+        views = psi.light_field_shape[:2]
+        dictionary, dictionary_s = _dictionary(job["dictionary"], views, psi.binning)
     window = _window(frames)
     _solved(job["method"], window, dictionary, settings)
     cpu_started = time.process_time()
     _solved(job["method"], window, dictionary, settings)
     window_cpu_s = time.process_time() - cpu_started
     load, before = os.getloadavg()[0], reference()
+    forget_peak()
     base_mib = peak_memory_mib()
     wall, cpu = [], []
     result = None
@@ -107,6 +108,14 @@ def measured(job: dict) -> dict:
     }
 
 
+@lru_cache(maxsize=1)
+def _dictionary(name: str | None, views: tuple[int, int], binning: int) -> tuple[Dictionary, float]:
+    """Return a dictionary and the seconds that it took to make."""
+    started = time.perf_counter()
+    made = open_dictionary(name, views, binning)
+    return made, time.perf_counter() - started
+
+
 def _solved(
     method: str, frames: Frames, dictionary: Dictionary | None, settings: MethodSettings
 ) -> Reconstruction:
@@ -145,20 +154,22 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def main() -> int:
-    """Do the job on standard input."""
-    job = json.load(sys.stdin)
+def answered(job: dict) -> dict:
+    """Return the figures of a job, or why there are none: these are not kept."""
     try:
         figures = measured(job)
     except KNOWN as fault:
-        print(fault, file=sys.stderr)
-        return FAILED
+        return {"failed": str(fault), "keep": False}
     except MemoryError:
-        print("not enough memory", file=sys.stderr)
-        return FAILED
-    print(json.dumps({key: _plain(value) for key, value in figures.items()}))
-    return 0
+        return {"failed": "not enough memory", "keep": False}
+    return {key: _plain(value) for key, value in figures.items()}
+
+
+def main() -> None:
+    """Do the jobs on standard input until it ends."""
+    for line in sys.stdin:
+        print(json.dumps(answered(json.loads(line))), flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -46,8 +46,8 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 SLOW_METHODS = ("dict-lars", "dict-ista", "dict-fista", "dict-sl0")
-SLOW_LEVELS = ("best", "40 atoms", "stride 3")
-"""What --fast leaves out; the best of total variation is quick enough."""
+BESIDE_FRONT = ("best", "fast", "5 atoms, stride 9", "40 atoms", "stride 3")
+"""Levels that take long, or that the front over all scenes does without: --fast has none."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def configurations(settings: ChartSettings) -> list[Configuration]:
         if settings.fast and method in SLOW_METHODS and method not in settings.methods:
             continue
         for level, changed in VARIATIONS.get(method, {DEFAULT: {}}).items():
-            if settings.fast and level in SLOW_LEVELS and method != "tv":
+            if settings.fast and level in BESIDE_FRONT:
                 continue
             found.append(Configuration(method, level, MethodSettings.model_validate(changed)))
     if settings.rivals:
@@ -166,6 +166,7 @@ _FIXED = {
 }
 """Settings whose work does not depend on how soon they converge, where there are such."""
 _NOT_SWEPT = (*SLOW_METHODS, "tv-dict")
+_NOT_SWEPT_FAST = ("dict-admm", "adaptive-fast")
 
 
 def sweeps(settings: ChartSettings, cores: int) -> list[Sweep]:
@@ -190,7 +191,7 @@ def sweeps(settings: ChartSettings, cores: int) -> list[Sweep]:
     }
     found = []
     for method in METHODS:
-        if method in _NOT_SWEPT or (settings.fast and method == "dict-admm"):
+        if method in _NOT_SWEPT or (settings.fast and method in _NOT_SWEPT_FAST):
             continue
         if settings.methods and method not in settings.methods:
             continue

@@ -1,32 +1,28 @@
 """Measure the points of a chart, each kept as it is done, and go on where a run stopped.
 
-One at a time: every point runs in a fresh process, under the machine's timing lock.
+One at a time, under the machine's timing lock; the points of a configuration share a process.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from emmc_rig import __version__
 from emmc_rig.chart.captures import Capture, kept_capture
 from emmc_rig.chart.lock import timing_lock
-from emmc_rig.chart.measure import FAILED
 from emmc_rig.chart.plan import ChartSettings, Point
+from emmc_rig.chart.worker import Worker, working
 from emmc_rig.demo import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.journal import Journal, digest_of
+from emmc_rig.journal import Journal, digest_of, kept_when_stopped
 
 POINTS, CAPTURES, PICTURES = "points.jsonl", "captures", "pictures"
-REVISION = 1
+REVISION = 2
 """Of what a point's figures are; raised with them, so that older points are measured again."""
 STAGE = "measure the points"
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -80,38 +76,37 @@ class ChartRun:
         points = list(dict.fromkeys(points))
         journal = Journal(self.folder / POINTS)
         (self.folder / PICTURES).mkdir(exist_ok=True)
-        try:
+
+        def kept() -> str:
+            return f"{len(self.results)} of {len(points)} points are"
+
+        with kept_when_stopped(self.folder, self.folder, ChartStopped, kept):
             self._measure(points, journal, watcher)
-        except KeyboardInterrupt as stop:
-            raise ChartStopped(
-                f"stopped by Ctrl-C; {len(self.results)} of {len(points)} points are kept in "
-                f"{self.folder}: run the same command again to go on"
-            ) from stop
-        except OSError as fault:
-            raise AppError(
-                f"--out {self.folder}: cannot be written ({fault.strerror or fault}); the points "
-                "done are kept: make room and run the same command again to go on"
-            ) from fault
+        self.results = {point: self.results[point] for point in points}
 
     def _measure(self, points: Sequence[Point], journal: Journal, watcher: Watcher) -> None:
         watcher.begin(STAGE, len(points))
-        for done, point in enumerate(points):
+        for group in alike(points):
 
-            def wait(who: str, left: int = len(points) - done) -> None:
+            def wait(who: str, left: int = len(points) - len(self.results)) -> None:
                 watcher.begin(f"{STAGE} (after {who})", left)
 
-            path, capture_digest = self.capture(point.capture)
-            inputs = self._inputs(point, capture_digest)
-            digest = digest_of(inputs)
-            picture = self.folder / PICTURES / f"{capture_digest}-{digest}.webp"
-            result = journal.get(digest)
-            if result is None or ("failed" not in result and not picture.is_file()):
-                result = self._measured(point, path, picture, wait)
-                if result.get("keep", True):
-                    journal.add(digest, inputs, result)
-            self.results[point] = result
-            self.pictures[point] = picture
-            watcher.step(told(point, result))
+            with ExitStack() as open_worker:
+                worker = None
+                for point in group:
+                    path, capture_digest = self.capture(point.capture)
+                    inputs = self._inputs(point, capture_digest)
+                    digest = digest_of(inputs)
+                    picture = self.folder / PICTURES / f"{capture_digest}-{digest}.webp"
+                    result = journal.get(digest)
+                    if result is None or ("failed" not in result and not picture.is_file()):
+                        worker = worker or open_worker.enter_context(self._worker(point, wait))
+                        result = self._measured(point, path, picture, worker)
+                        if result.get("keep", True):
+                            journal.add(digest, inputs, result)
+                    self.results[point] = result
+                    self.pictures[point] = picture
+                    watcher.step(told(point, result))
 
     def _inputs(self, point: Point, capture: str) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
@@ -132,9 +127,17 @@ class ChartRun:
             "limit_s": settings.limit_s,
         }
 
-    def _measured(
-        self, point: Point, capture: Path, picture: Path, on_wait: Callable[[str], None]
-    ) -> dict:
+    @contextmanager
+    def _worker(self, point: Point, on_wait: Callable[[str], None]) -> Iterator[Worker]:
+        """Yield what measures a point, and others alike, while nothing else is timed."""
+        cores = str(point.cores or available_cores())
+        with (
+            timing_lock(f"emmc-rig chart in {self.folder}", on_wait=on_wait) as lock,
+            working(dict.fromkeys(THREADS, cores), self.settings.limit_s, lock) as worker,
+        ):
+            yield worker
+
+    def _measured(self, point: Point, capture: Path, picture: Path, worker: Worker) -> dict:
         job = {
             "capture": str(capture),
             "picture": str(picture),
@@ -145,54 +148,15 @@ class ChartRun:
             "repeats": self.settings.repeats,
             "enough_s": self.settings.enough_s,
         }
-        cores = str(point.cores or available_cores())
-        purpose = f"emmc-rig chart in {self.folder}"
-        with timing_lock(purpose, on_wait=on_wait) as lock:
-            return run_job(job, dict.fromkeys(THREADS, cores), self.settings.limit_s, lock)
+        return worker.measure(job)
 
 
-def run_job(job: dict, environment: dict[str, str], limit_s: float, lock: int) -> dict:
-    """Return the figures of a job done by a fresh process; `failed` says why there are none.
-
-    lock: a descriptor that the process holds as well, should this one be killed. A result that
-    may differ the next time has `keep` False.
-    """
-    command = [sys.executable, "-m", "emmc_rig.chart.measure"]
-    with _process(command, environment, lock) as process:
-        try:
-            out, err = process.communicate(json.dumps(job), timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            return {"failed": f"not done after {limit_s:.0f} s"}
-    if process.returncode == 0:
-        return json.loads(out.strip().splitlines()[-1])
-    if process.returncode == FAILED:
-        return {"failed": err.strip().splitlines()[-1], "keep": False}
-    if process.returncode < 0:
-        return {"failed": f"killed by signal {-process.returncode}: memory?", "keep": False}
-    lines = err.strip().splitlines() or ["no message"]
-    raise AppError(f"{job['method']}: the measuring process failed: {lines[-1]}")
-
-
-@contextmanager
-def _process(
-    command: list[str], environment: dict[str, str], lock: int
-) -> Iterator[subprocess.Popen[str]]:
-    """Yield a process that Ctrl-C reaches through us only; kill it at the end."""
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **environment},
-        pass_fds=(lock,),
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+def alike(points: Sequence[Point]) -> list[list[Point]]:
+    """Return the points of each configuration on so many cores together."""
+    groups: dict[object, list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.configuration, point.cores), []).append(point)
+    return list(groups.values())
 
 
 def told(point: Point, result: dict) -> str:

@@ -1,0 +1,19 @@
+"""What tests ask of a written page: its parts, and that it loads nothing from elsewhere."""
+
+import html.parser
+
+
+class Page(html.parser.HTMLParser):
+    """Collects ids and what is loaded from elsewhere."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.foreign = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href") and not value.startswith(("data:", "#")):
+                self.foreign.append(value)
