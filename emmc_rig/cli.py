@@ -21,6 +21,18 @@ from emmc_rig.devices import app as devices
 from emmc_rig.errors import AppError
 from emmc_rig.live.cli import live
 from emmc_rig.model.errors import ModelError
+from emmc_rig.options import (
+    CameraOption,
+    DictionaryOption,
+    MethodOption,
+    MethodsOption,
+    OutOption,
+    SceneOption,
+    ScenesOption,
+    SeedOption,
+    ShotsOption,
+    SizeOption,
+)
 from emmc_rig.progress import console, shown_bars
 from emmc_rig.session.cli import app as session
 from reconstruction.errors import ReconstructionError
@@ -46,27 +58,6 @@ app.add_typer(session, name="session")
 app.command()(capture)
 app.command()(live)
 app.command()(calibrate)
-
-SceneOption = Annotated[
-    str,
-    typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),
-]
-CameraOption = Annotated[
-    str, typer.Option("--camera", help="a shipped camera (see `emmc-rig cameras`) or a YAML file")
-]
-ShotsOption = Annotated[
-    int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
-]
-SizeOption = Annotated[
-    str | None, typer.Option("--size", help="ROWSxCOLUMNS: the middle of a scene, or its size")
-]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
-OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
-MethodOption = Annotated[str, typer.Option("--method", help="see `emmc-rig reconstruct --list`")]
-DictionaryOption = Annotated[
-    str | None,
-    typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
-]
 
 
 def _shown(value: object) -> str:
@@ -341,12 +332,7 @@ def _end_with_verdict(verdict: dict, strict: bool) -> None:
 
 @app.command()
 def chart(
-    scene: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"
-        ),
-    ] = None,
+    scene: ScenesOption = None,
     camera: Annotated[
         list[str] | None,
         typer.Option("--camera", help="a shipped camera or a YAML file; may repeat"),
@@ -354,9 +340,7 @@ def chart(
     fast: Annotated[
         bool, typer.Option("--fast", help="small crops, few points: minutes, not hours")
     ] = False,
-    method: Annotated[
-        list[str] | None, typer.Option("--method", help="only this one; may repeat")
-    ] = None,
+    method: MethodsOption = None,
     scaling: Annotated[
         bool, typer.Option("--scaling/--no-scaling", help="growth with the problem's size")
     ] = True,
@@ -536,12 +520,7 @@ def tables(
 
 @app.command()
 def stability(
-    scene: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"
-        ),
-    ] = None,
+    scene: ScenesOption = None,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -551,9 +530,7 @@ def stability(
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
-    method: Annotated[
-        list[str] | None, typer.Option("--method", help="only this one; may repeat")
-    ] = None,
+    method: MethodsOption = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
     ] = False,

@@ -9,20 +9,26 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from emmc_rig.errors import AppError
 
+EVERY_POINT = "every point that was done is"
+
 
 @contextmanager
 def kept_when_stopped(
-    out: Path, folder: Path, stopped: type[KeyboardInterrupt], what: str = "point"
+    out: Path,
+    folder: Path,
+    stopped: type[KeyboardInterrupt],
+    what: Callable[[], str] = lambda: EVERY_POINT,
 ) -> Iterator[None]:
-    """Say, when Ctrl-C or a full disk ends the block, that what was done is kept.
+    """Say, when Ctrl-C or a full disk ends the block, what is kept.
 
-    out: the folder as asked for, folder: where it is. Raises `stopped` and AppError.
+    out: the folder as asked for, folder: where it is. what: "3 of 10 points are", say. Raises
+    `stopped` and AppError.
     """
     try:
         yield
@@ -30,13 +36,12 @@ def kept_when_stopped(
         raise
     except KeyboardInterrupt as stop:
         raise stopped(
-            f"stopped by Ctrl-C; every {what} that was done is kept in {folder}: "
-            "run the same command again to go on"
+            f"stopped by Ctrl-C; {what()} kept in {folder}: run the same command again to go on"
         ) from stop
     except OSError as fault:
         raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); every {what} that was "
-            "done is kept: make room and run the same command again to go on"
+            f"--out {out}: cannot be written ({fault.strerror or fault}); {what()} kept: "
+            "make room and run the same command again to go on"
         ) from fault
 
 

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from emmc_rig.errors import AppError
+from emmc_rig.options import RigOption, RigSceneOption, RigSizeOption
 
 if TYPE_CHECKING:
     from emmc_rig.rig_config import ImagedRig
@@ -31,15 +32,9 @@ def capture(
     schema: Annotated[
         bool, typer.Option("--schema", help="print the JSON schema of a plan, for editors, and end")
     ] = False,
-    rig: Annotated[
-        str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
-    ] = None,
-    scene: Annotated[
-        str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
-    ] = "deep-occlusions",
-    size: Annotated[
-        str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
-    ] = None,
+    rig: RigOption = None,
+    scene: RigSceneOption = "deep-occlusions",
+    size: RigSizeOption = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
     rays: Annotated[
         int | None, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")

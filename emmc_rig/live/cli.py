@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from emmc_rig.errors import AppError
+from emmc_rig.options import RigOption, RigSceneOption, RigSizeOption
 
 if TYPE_CHECKING:
     from emmc_rig.live.watch import Watch
@@ -18,9 +19,7 @@ EVERYWHERE = ("0.0.0.0", "::")
 
 
 def live(
-    rig: Annotated[
-        str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
-    ] = None,
+    rig: RigOption = None,
     camera: Annotated[
         str | None, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
     ] = None,
@@ -30,12 +29,8 @@ def live(
     design: Annotated[
         str, typer.Option("--design", help="the masks in a simulated rig: see `emmc-rig cameras`")
     ] = "rgbw-bayer-1shot",
-    scene: Annotated[
-        str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
-    ] = "deep-occlusions",
-    size: Annotated[
-        str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
-    ] = None,
+    scene: RigSceneOption = "deep-occlusions",
+    size: RigSizeOption = None,
     host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     read_only: Annotated[

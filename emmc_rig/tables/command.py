@@ -57,7 +57,7 @@ def run_tables(
     folder = open_folder(out, CELLS, "earlier tables")
     source = _source(parts, library, dictionaries, settings, folder)
     run = Run(parts, library, source, settings, folder)
-    with kept_when_stopped(out, folder, TablesStopped, "cell"):
+    with kept_when_stopped(out, folder, TablesStopped, lambda: "every cell that was done is"):
         results = do_cells(run, watcher, clock)
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)

@@ -14,8 +14,7 @@ from pydantic import Field
 
 from emmc_rig import __version__
 from emmc_rig.demo import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.journal import Journal, digest_of
+from emmc_rig.journal import Journal, digest_of, kept_when_stopped
 from emmc_rig.model.settings import Settings
 from emmc_rig.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.tables.dictionaries import Source, TrainingSettings
@@ -210,19 +209,13 @@ def do_cells(
         )
 
     todo = [cell for cell in cells if missing(cell)]
-    try:
-        _do(run, todo, pictured, inputs, digests, journal, watcher, clock)
-    except KeyboardInterrupt as stop:
+
+    def kept() -> str:
         done = sum(journal.get(digest) is not None for digest in digests.values())
-        raise TablesStopped(
-            f"stopped by Ctrl-C; {done} of {len(cells)} cells are kept in {run.folder}: "
-            "run the same command again to go on"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"--out {run.folder}: cannot be written ({fault.strerror or fault}); the cells done "
-            "are kept: make room and run the same command again to go on"
-        ) from fault
+        return f"{done} of {len(cells)} cells are"
+
+    with kept_when_stopped(run.folder, run.folder, TablesStopped, kept):
+        _do(run, todo, pictured, inputs, digests, journal, watcher, clock)
     results = {cell: journal.get(digests[cell]) for cell in cells}
     return {cell: result for cell, result in results.items() if result is not None}
 
