@@ -16,6 +16,10 @@ import tifffile
 Array = np.ndarray
 
 PHASES = {(0, 1, 1, 2): "rggb", (1, 0, 2, 1): "grbg", (1, 2, 0, 1): "gbrg", (2, 1, 1, 0): "bggr"}
+PLACES = (256, 257, 273, 279)
+WHOLE = (tifffile.DATATYPE.SHORT, tifffile.DATATYPE.LONG)
+"""What size, strip offsets and strip lengths may be written as; tifffile reads bytes too."""
+
 SMALLEST_SIDE_PX = 22
 """LibRaw takes anything smaller for a thumbnail."""
 
@@ -57,6 +61,11 @@ def read_in_place(data: bytes, tiff: tifffile.TiffFile) -> tuple[Array, Array, i
     page: Any = tiff.pages.first
     tags = page.tags
     if tiff.byteorder != "<" or len(tiff.pages) != 1 or 50706 not in tags:
+        return None
+    entries = int.from_bytes(data[page.offset : page.offset + 2], "little")
+    if len({tag.code for tag in tags}) != entries:
+        return None  # one that tifffile could not read and passed over, or one twice
+    if any(tags[code].dtype not in WHOLE for code in PLACES if code in tags):
         return None
     if any(tag.code not in FIXED and tag.code not in HARMLESS for tag in tags):
         return None

