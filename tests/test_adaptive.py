@@ -87,6 +87,29 @@ def test_the_evidence_is_the_log_likelihood_of_a_dense_student_t(coded_psi, cfa,
         assert value == pytest.approx(dense.logpdf(data[rows]) - at_zero, abs=2e-2)
 
 
+def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_psi):
+    psi = coded_psi(size=(14, 16))
+    rng = np.random.default_rng(0)
+    data = rng.normal(0, 0.1, psi.frames_shape).astype(np.float32)
+    patches = EvidencePatches(4, 3)
+    corners = np.stack(np.meshgrid(*patches.grid(data.shape[1:]), indexing="ij"), axis=-1)
+    given = psi, data, np.full(data.shape, 1e-4), np.ones(data.shape, bool)
+    where = np.full(corners[..., 0].size, 0.5), corners.reshape(-1, 2), patches.places(1)
+    disparities = np.linspace(-2, 2, 5)
+    long, short, both = (
+        patch_evidence(*given, *where, disparities, prior)
+        for prior in (TexturePrior(4.0), TexturePrior(1.0), TexturePrior(4.0, (1.0,)))
+    )
+    each = [found.log_likelihood.astype(np.float64) for found in (long, short)]
+    np.testing.assert_allclose(
+        both.log_likelihood, np.logaddexp(*each) - np.log(2), rtol=1e-5, atol=1e-4
+    )
+    shorter = each[1].max(axis=1) > each[0].max(axis=1)
+    assert 0 < shorter.mean() < 1
+    assert (long.kind != short.kind).any()
+    np.testing.assert_array_equal(both.kind, np.where(shorter, short.kind, long.kind))
+
+
 def test_psi_of_surfaces_is_psi_of_their_light_field(random_psi, monkeypatch):
     for stored, shots, binning in ((1, 1, 1), (3, 2, 1), (1, 2, 2)):
         psi = random_psi(shots, (3, 3), (10, 12), stored, binning)

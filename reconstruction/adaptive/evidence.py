@@ -6,16 +6,19 @@ luminance and a b k in each chrominance, k(r) = exp((e - sqrt(r^2 + e^2)) / l): 
 natural picture's up to the optics' blur e. The patch's m readings are then Gaussian too, with
 covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evidence) judges d, the
 amplitude a and the colourfulness b alike, and pays for what a model could have explained but
-did not see (Occam's factor, log det).
+did not see (Occam's factor, log det). So it does for l, which differs from leaf to wall: textures
+of several lengths are judged, and the likelihood is their mean. With one length alone a picture
+that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
 
 Operations of a patch: m^2 / 2 (2 + D) S + m R S + (D + 4 H) m^3 / 6 with R rays a pixel (25, or
-25 k^2), S distinct separations of them (81), D disparities, H pairs of amplitude and colourfulness.
+25 k^2), S distinct separations of them (81), D disparities and lengths, 4 H pairs of amplitude and
+colourfulness probed.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import get_num_threads
@@ -33,11 +36,12 @@ PROBES = 4
 class TexturePrior:
     """Covariances of textures: correlation length and blur in samples, and the kinds to judge.
 
-    kinds: (a, b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared
+    finer_px: lengths of further textures that evidence judges, as likely as the first. kinds: (a, b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared
     brightness, and that of a chrominance over that of luminance. The first is next to flat.
     """
 
     length_px: float = 3.0
+    finer_px: tuple[float, ...] = ()
     blur_px: float = 0.7
     kinds: tuple[tuple[float, float], ...] = (
         (3e-5, 0.1),
@@ -123,7 +127,8 @@ def _spectrum(
 @dataclass(frozen=True, eq=False)
 class PatchEvidence:
     """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kind of
-    texture that explains the patch best; kind: (patch,), which of the prior's it is."""
+    texture that explains the patch best, the mean over lengths; kind: (patch,), which of the
+    prior's it is."""
 
     log_likelihood: NDArray[np.float32]
     kind: NDArray[np.int64]
@@ -161,11 +166,17 @@ def patch_evidence(
         + separations[None, None, :, :2]
         - disparities[None, :, None, None] * separations[None, None, :, 2:]
     )
-    tables = (prior.covariance(np.square(apart).sum(axis=-1)) @ back).astype(np.float32)
-    tables = np.pad(tables, ((0, 0), (0, -len(disparities) % TERMS), (0, 0)))
+    square_px = np.square(apart).sum(axis=-1)
+    lengths = (prior.length_px, *prior.finer_px)
+    tables = np.concatenate(
+        [replace(prior, length_px=length).covariance(square_px) @ back for length in lengths],
+        axis=1,
+    ).astype(np.float32)
+    judged = tables.shape[1]
+    tables = np.pad(tables, ((0, 0), (0, -judged % TERMS), (0, 0)))
     probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])
-    out = np.empty((len(filled), len(disparities)), dtype=np.float32)
-    chosen = np.zeros(len(filled), dtype=np.int64)
+    out = np.empty((len(filled), judged), dtype=np.float32)
+    chosen = np.zeros((len(filled), len(lengths)), dtype=np.int64)
     noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
     index = offsets.reshape(len(places), len(places)).astype(np.int64)
@@ -195,4 +206,7 @@ def patch_evidence(
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
         list(pool.map(judge, range(0, len(filled), LANES)))
-    return PatchEvidence(out[:count], chosen[:count])
+    each = out[:count].reshape(count, len(lengths), -1)
+    mean = np.logaddexp.reduce(each, axis=1) - np.float32(np.log(len(lengths)))
+    likeliest = each.max(axis=-1).argmax(axis=1)
+    return PatchEvidence(mean, chosen[np.arange(count), likeliest])

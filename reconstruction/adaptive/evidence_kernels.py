@@ -227,13 +227,14 @@ def evidence(
     out,
     chosen,
 ):
-    """Set out (lane, disparity) to log-likelihoods, constants left out, and chosen (lane,).
+    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane, length).
 
+    A hypothesis is a length of the texture, and a disparity: all disparities of the first, ...
     data, ridge: (shot, pixel_y, pixel_x), readings less those of the mean, their variances.
     corners: (batch, lane, 2) pixels. places: see `_gather`. waves: (wave, ray), of which
     the rays' spectra are made. offsets: (reading, reading), the index of how far two pixels lie
-    apart. tables: (offset, disparity, wave), the texture's correlation, padded with zeros to a
-    multiple of TERMS disparities. amplitudes, chromas: (kind,), variance of luminance,
+    apart. tables: (offset, hypothesis, wave), the texture's correlation, padded with zeros to a
+    multiple of TERMS hypotheses. amplitudes, chromas: (kind,), variance of luminance,
     times scales (lane,), and of a chrominance over that of luminance. probes: indices of
     the disparities at which every kind is judged; out is that of the best of them, `chosen`.
     """
@@ -241,7 +242,7 @@ def evidence(
     readings = places.shape[0]
     m = -(-readings // TERMS) * TERMS
     lanes = corners.shape[0]
-    disparities, rows, spectrum = out.shape[1], tables.shape[1], tables.shape[2]
+    hypotheses, rows, spectrum = out.shape[1], tables.shape[1], tables.shape[2]
     parts = 1 if stored == 1 else 3
     groups = 1 if stored == 1 else 2
     rays = np.zeros((parts, readings, waves.shape[1], lanes), np.float32)
@@ -267,7 +268,7 @@ def evidence(
     for part in range(parts):
         for i in range(readings):
             _mixed(waves, rays[part, i].reshape(-1), lanes, spectra[part, i])
-    sums = np.zeros((disparities, groups, m * (m + 1) // 2, lanes), np.float32)
+    sums = np.zeros((hypotheses, groups, m * (m + 1) // 2, lanes), np.float32)
     meetings = np.empty(spectrum * lanes, np.float32)
     row = np.empty((rows, lanes), np.float32)
     flat_row = row.reshape(-1)
@@ -280,32 +281,36 @@ def evidence(
                 _meet(spectra[part, i], spectra[part, j], lanes, meetings)
                 if part != 1:
                     _mixed(tables[offsets[i, j]], meetings, lanes, flat_row)
-                    for h in range(disparities):
+                    for h in range(hypotheses):
                         sums[h, min(part, 1), first] = row[h]
             first += 1
     matrix = np.zeros((m + 2, m, lanes), np.float32)
     columns = np.zeros((m + 2, TERMS, lanes), np.float32)
     product, square = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
     likelihood = np.empty(lanes, np.float32)
-    best = np.full(lanes, -np.inf, np.float32)
+    best = np.empty(lanes, np.float32)
     strength, chroma = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    for e in range(amplitudes.size):
+    lengths = chosen.shape[1]
+    each = hypotheses // lengths
+    for length in range(lengths):
+        best[:] = -np.inf
+        for e in range(amplitudes.size):
+            for lane in range(lanes):
+                strength[lane] = amplitudes[e] * scales[lane]
+                chroma[lane] = chromas[e]
+            for h in probes:
+                _fill(sums[length * each + h], known, seen, strength, chroma, matrix)
+                _log_likelihood(matrix, measured, freedom, columns, product, square, likelihood)
+                for lane in range(lanes):
+                    if likelihood[lane] > best[lane]:
+                        best[lane] = likelihood[lane]
+                        chosen[lane, length] = e
         for lane in range(lanes):
-            strength[lane] = amplitudes[e] * scales[lane]
-            chroma[lane] = chromas[e]
-        for h in probes:
+            kind = chosen[lane, length]
+            strength[lane] = amplitudes[kind] * scales[lane]
+            chroma[lane] = chromas[kind]
+        for h in range(length * each, (length + 1) * each):
             _fill(sums[h], known, seen, strength, chroma, matrix)
             _log_likelihood(matrix, measured, freedom, columns, product, square, likelihood)
             for lane in range(lanes):
-                if likelihood[lane] > best[lane]:
-                    best[lane] = likelihood[lane]
-                    chosen[lane] = e
-    for lane in range(lanes):
-        kind = chosen[lane]
-        strength[lane] = amplitudes[kind] * scales[lane]
-        chroma[lane] = chromas[kind]
-    for h in range(disparities):
-        _fill(sums[h], known, seen, strength, chroma, matrix)
-        _log_likelihood(matrix, measured, freedom, columns, product, square, likelihood)
-        for lane in range(lanes):
-            out[lane, h] = likelihood[lane]
+                out[lane, h] = likelihood[lane]

@@ -55,7 +55,8 @@ from reconstruction.verdict.shadow import Shadow, relief, shadow
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
-COARSE_LENGTH_PX = 8.0
+COARSE_PX, FINE_PX = (8.0, 2.0), (3.0, 1.5)
+"""Correlation lengths of the textures that the coarse and the fine search judge."""
 DIM, TINY = 0.1, 1e-12
 """Mean brightness below which a scene is reconstructed as if it were so bright: what the settings
 call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
@@ -279,12 +280,14 @@ def _searched(
     data: search.Data, settings: AdaptiveSettings, on_rough: Callable[[], None]
 ) -> search.Volume:
     """Return the disparities that patches and their neighbours agree on, coarse to fine."""
-    wide = TexturePrior(length_px=COARSE_LENGTH_PX, freedom=settings.freedom)
+    coarse, fine = (
+        TexturePrior(length, tuple(finer), freedom=settings.freedom)
+        for length, *finer in (COARSE_PX, FINE_PX)
+    )
     smooth = settings.slope_px, settings.jump
-    rough = search.coarse(data, wide, settings.furthest_px, *smooth)
+    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_rough()
-    prior = TexturePrior(freedom=settings.freedom)
-    return search.fine(data, prior, rough, settings.stride, settings.step_px, *smooth)
+    return search.fine(data, fine, rough, settings.stride, settings.step_px, *smooth)
 
 
 @dataclass(frozen=True, eq=False)
