@@ -36,8 +36,9 @@ PROBES = 4
 class TexturePrior:
     """Covariances of textures: correlation length and blur in samples, and the kinds to judge.
 
-    finer_px: lengths of further textures that evidence judges, as likely as the first. kinds: (a, b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared
-    brightness, and that of a chrominance over that of luminance. The first is next to flat.
+    finer_px: lengths of further textures that evidence judges, as likely as the first. kinds: (a,
+    b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared brightness,
+    and that of a chrominance over that of luminance. The first is next to flat.
     """
 
     length_px: float = 3.0
@@ -168,10 +169,9 @@ def patch_evidence(
     )
     square_px = np.square(apart).sum(axis=-1)
     lengths = (prior.length_px, *prior.finer_px)
-    tables = np.concatenate(
-        [replace(prior, length_px=length).covariance(square_px) @ back for length in lengths],
-        axis=1,
-    ).astype(np.float32)
+    textures = [replace(prior, length_px=length) for length in lengths]
+    tables = [texture.covariance(square_px) @ back for texture in textures]
+    tables = np.concatenate(tables, axis=1).astype(np.float32)
     judged = tables.shape[1]
     tables = np.pad(tables, ((0, 0), (0, -judged % TERMS), (0, 0)))
     probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])

@@ -78,10 +78,10 @@ class AdaptiveSettings(Settings):
     step_px: float = Field(default=0.125, gt=0, description="between disparities judged")
     stride: int = Field(default=4, ge=1, description="pixels between patches that judge")
     slope_px: float = Field(
-        default=0.025, gt=0, description="mean change of the disparity per pixel on one surface"
+        default=0.04, gt=0, description="mean change of the disparity per pixel on one surface"
     )
     jump: float = Field(
-        default=0.02, gt=0, lt=1, description="probability that neighbouring patches differ freely"
+        default=0.05, gt=0, lt=1, description="probability that neighbouring patches differ freely"
     )
     freedom: float = Field(
         default=3.0, gt=0, description="of the Student t of the readings; large: Gaussian"
