@@ -21,7 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,8 @@ from reconstruction.verdict.shadow import Shadow, relief, shadow
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
-COARSE_PX, FINE_PX = (8.0, 2.0), (3.0, 1.5)
-"""Correlation lengths of the textures that the coarse and the fine search judge."""
+COARSE_PX = 8.0, 2.0
+"""Correlation lengths of the textures that the coarse search judges."""
 DIM, TINY = 0.1, 1e-12
 """Mean brightness below which a scene is reconstructed as if it were so bright: what the settings
 call noise and doubt are shares of a picture of order 1. And the least that is told from none."""
@@ -69,6 +69,9 @@ SHADOW = 0.7
 called another's: at least 0.93 on clean captures, 0 to 0.25 with masks 4 samples off."""
 
 
+Length = Annotated[float, Field(gt=0)]
+
+
 class AdaptiveSettings(Settings):
     """Settings of the adaptive method."""
 
@@ -77,6 +80,9 @@ class AdaptiveSettings(Settings):
     )
     step_px: float = Field(default=0.125, gt=0, description="between disparities judged")
     stride: int = Field(default=4, ge=1, description="pixels between patches that judge")
+    lengths_px: tuple[Length, ...] = Field(
+        default=(3.0, 1.5), min_length=1, description="over which textures may be alike, to judge"
+    )
     slope_px: float = Field(
         default=0.04, gt=0, description="mean change of the disparity per pixel on one surface"
     )
@@ -108,10 +114,11 @@ class AdaptiveSettings(Settings):
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
-    """Return the settings of `adaptive-fast`: coarser patches, fewer steps."""
+    """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
     quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
-    coarser = {"step_px": 0.25, "stride": 8, "start_steps": settings.start_steps // 2 or 1}
-    return settings.model_copy(update={**coarser, "texture": quick})
+    coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
+    begun = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
+    return settings.model_copy(update={**coarser, **begun})
 
 
 def reconstruct_adaptive(
@@ -282,7 +289,7 @@ def _searched(
     """Return the disparities that patches and their neighbours agree on, coarse to fine."""
     coarse, fine = (
         TexturePrior(length, tuple(finer), freedom=settings.freedom)
-        for length, *finer in (COARSE_PX, FINE_PX)
+        for length, *finer in (COARSE_PX, settings.lengths_px)
     )
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
