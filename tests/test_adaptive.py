@@ -265,8 +265,8 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
     truth, _, _, found = planted
     error = np.abs(found.light_field - truth)
     sigma = found.maps["sigma"][..., None]
-    # On five crops of real scenes 51 to 86 % lay within one deviation.
-    assert 0.5 < np.mean(error <= sigma) < 0.87
+    # On 14 captures 51 to 77 % lay within one deviation.
+    assert 0.5 < np.mean(error <= sigma) < 0.8
     # The flat part is known better, and said to be.
     for known in (sigma[..., 0], np.sqrt(np.square(error).mean(axis=-1))):
         assert known[..., :12].mean() < 0.9 * known[..., -20:].mean()
