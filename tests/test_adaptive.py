@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.fft import dct
 from scipy.stats import multivariate_t
 
 from emmc_rig.camera_sheet import find_camera
@@ -19,12 +18,6 @@ from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
-from reconstruction.adaptive.shrinkage import (
-    SIDE,
-    _columns_analysed,
-    _columns_synthesised,
-    denoised,
-)
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
@@ -213,27 +206,6 @@ def test_another_object_is_rarer_the_larger_its_disparity():
     np.testing.assert_allclose(pairs, pairs.T)
     jumps = pairs[1, [0, 3, 4]]
     np.testing.assert_allclose(jumps / jumps[0], [1, 1.5, 2])
-
-
-def test_columns_of_blocks_are_analysed_by_the_orthonormal_cosine_transform():
-    block = np.random.default_rng(5).normal(size=(SIDE, SIDE)).astype(np.float32)
-    found = block.ravel().copy()
-    _columns_analysed(found, SIDE)
-    expected = np.asarray(dct(block, axis=0, norm="ortho"))
-    np.testing.assert_allclose(found.reshape(SIDE, SIDE), expected, atol=1e-5)
-    _columns_synthesised(found, SIDE)
-    np.testing.assert_allclose(found, block.ravel(), atol=1e-5)
-
-
-def test_what_repeats_is_kept_and_noise_is_removed():
-    size, sigma = (48, 56), 0.08
-    flat = np.full((3, *size), 0.4, np.float32)
-    np.testing.assert_allclose(denoised(flat, flat, sigma), flat, atol=1e-5)
-    y, x = np.indices(size)
-    stripes = np.repeat((0.3 + 0.4 * ((x + y) // 6 % 2))[None], 3, axis=0).astype(np.float32)
-    noisy = stripes + sigma * np.random.default_rng(4).normal(size=stripes.shape)
-    clean = denoised(noisy.astype(np.float32), noisy.astype(np.float32), sigma)
-    assert psnr_db(clean, stripes) > psnr_db(noisy, stripes) + 8
 
 
 @pytest.fixture(scope="module")
