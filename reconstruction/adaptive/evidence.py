@@ -10,9 +10,9 @@ did not see (Occam's factor, log det). So it does for l, which differs from leaf
 of several lengths are judged, and the likelihood is their mean. With one length alone a picture
 that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
 
-Operations of a patch: m^2 / 2 (2 + D) S + m R S + (D + 4 H) m^3 / 6 with R rays a pixel (25, or
-25 k^2), S distinct separations of them (81), D disparities and lengths, 4 H pairs of amplitude and
-colourfulness probed.
+Operations of a patch: m^2 / 2 (2 + L D) S + m R S + L (D + 4 H) m^3 / 6 with R rays a pixel (25, or
+25 k^2), S distinct separations of them (81), L lengths, D disparities, H pairs of amplitude and
+colourfulness, each probed at 4 of the disparities.
 """
 
 from __future__ import annotations

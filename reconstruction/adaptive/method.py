@@ -117,8 +117,8 @@ def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
     quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
     coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
-    begun = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
-    return settings.model_copy(update={**coarser, **begun})
+    fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
+    return settings.model_copy(update=coarser | fewer)
 
 
 def reconstruct_adaptive(
