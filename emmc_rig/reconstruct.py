@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.chart.recommend import (
+from emmc_rig.advice.recommend import (
     Advice,
     Problem,
     advised,
@@ -24,8 +24,10 @@ from emmc_rig.chart.recommend import (
     parse_wanted,
     read_rows,
 )
-from emmc_rig.chart.reference import reference
+from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import (
     export_pictures,
     focus_disparities,
@@ -36,8 +38,6 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import read_yaml, validated
-from emmc_rig.output import command_line, versions, write_metrics
-from emmc_rig.scene import open_scene
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.cli import app
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.stability import detector
-from emmc_rig.stability.detector import (
+from emmc_rig.study.stability import detector
+from emmc_rig.study.stability.detector import (
     ALL,
     Case,
     cases,

@@ -19,7 +19,7 @@ from emmc_rig.capture.until import Until
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.contact_sheet import events, sheet
+from emmc_rig.pages.session_sheet import events, sheet
 from emmc_rig.session.decisions import decisions
 from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session

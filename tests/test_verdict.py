@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.capture.simulate import simulate
 from emmc_rig.cli import app
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.simulate import simulate
-from emmc_rig.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import FAULTS, trial
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction
 from reconstruction.screening import screened
