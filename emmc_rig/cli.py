@@ -254,7 +254,8 @@ def reconstruct(
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.files.results import result_folder
     from emmc_rig.reconstruct import advice_for, load_settings, run_in_tiles, run_reconstruct
-    from reconstruction.methods import COSTS, METHODS
+    from reconstruction.method import COSTS
+    from reconstruction.methods import METHODS
 
     if list_methods:
         for known in METHODS.values():
