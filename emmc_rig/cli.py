@@ -773,7 +773,7 @@ def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None
 def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
-    from emmc_rig.reconstruct import open_dictionary
+    from emmc_rig.files.dictionaries import open_dictionary
     from emmc_rig.study.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
 
     described = find_camera(camera)

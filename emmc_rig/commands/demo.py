@@ -34,7 +34,7 @@ from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.reconstruct import open_dictionary
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.rig.hardware import simulated_rig
 from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
@@ -48,7 +48,7 @@ Array = NDArray[np.floating]
 class DemoSettings:
     """What to run: scene and camera with their names, size (rows, columns) or None, seed.
 
-    method: see `reconstruction.methods`; dictionary: see `emmc_rig.reconstruct.open_dictionary`.
+    method: see `reconstruction.methods`; dictionary: see `emmc_rig.files.dictionaries`.
     """
 
     scene: str

@@ -86,6 +86,10 @@ def open_scene(
     Raises:
         SceneError: nothing by that name (the message lists the built-in ones), unreadable,
             or smaller than asked for.
+
+    >>> import emmc_rig as emmc
+    >>> emmc.scene("near-planar", size=(24, 32))
+    Scene('near-planar', 5x5 views of 24x32)
     """
     if spec in SCENES:
         shape = _asked_shape(size, views)

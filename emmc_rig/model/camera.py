@@ -215,6 +215,9 @@ class Camera(Settings):
         usable = ~noise.saturated(frames_dn) & (light > 0)
         return SimulatedFrames(readings, deviation, usable, frames_dn, noise_free)
 
+    def __str__(self) -> str:
+        return repr(self)
+
     def __repr__(self) -> str:
         shots, (v, u) = len(self.shots), self.views
         masks = f"{len(self.masks)} mask{'s' * (len(self.masks) != 1)}"
