@@ -1,4 +1,4 @@
-"""Errors of the application, and all that a user can mend: one line, what is wrong and what to do."""
+"""Errors that a user can mend: one line each, what is wrong and what to do."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from reconstruction.errors import ReconstructionError
 
 class AppError(Exception):
     """Root of the application's errors; shown to the user as one line."""
+
+
+class StoppedError(AppError):
+    """Somebody stopped the program; the message says what is kept and how to go on."""
 
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)

@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 import pytest
 import yaml
+from matplotlib import pyplot
 
 import emmc_rig as emmc
 from emmc_rig.files import scenes
@@ -44,7 +45,7 @@ def headless():
     before = matplotlib.get_backend()
     matplotlib.use("agg")
     yield
-    matplotlib.pyplot.close("all")
+    pyplot.close("all")
     matplotlib.use(before)
 
 
@@ -85,7 +86,7 @@ def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, 
     with pytest.raises(emmc.ERRORS, match="say which rig"):
         emmc.capture("plan.yaml")
     session = emmc.capture("plan.yaml", rig)
-    assert repr(session).endswith("9 of 9 frames)")
+    assert repr(session).endswith("12 of 12 frames)")
     assert emmc.capture(session.folder).runs == 1
     calibration = emmc.calibrate(session)
     calibration.save("psi")

@@ -18,10 +18,10 @@ from calibration.parametric import psi_at, shot_stages
 from calibration.placement import SCALARS, Placement
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
+from emmc_rig.files.frames import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.files.frames import FRAMES, PSI, read_frames
 
 CALIBRATION = "calibration.h5"
 

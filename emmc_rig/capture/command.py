@@ -27,7 +27,7 @@ from emmc_rig.capture.plan import (
 from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Unwatched, Watcher
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
@@ -245,10 +245,6 @@ def run_capture(
             return session, Sequencer(session, wish.plan, rig, watcher, control, choose).run()
 
 
-class CaptureStoppedError(AppError):
-    """Somebody stopped the capture; the message says how to go on."""
-
-
 def asked_for(
     plan: Path, rig: Mapping[str, Any] | None, out: Path | None, until_db: float | None
 ) -> Wish:
@@ -272,7 +268,7 @@ def capture_session(
 ) -> tuple[Session, Outcome] | None:
     """Capture what is missing of a wish, and write the session's report; see `run_capture`.
 
-    None where `agreed` says no. Raises CaptureStoppedError when somebody stopped it: what was
+    None where `agreed` says no. Raises StoppedError when somebody stopped it: what was
     captured is kept, and the same call goes on.
     """
     go_on = f"go on with: emmc-rig capture {wish.out}"
@@ -281,7 +277,7 @@ def capture_session(
     except KeyboardInterrupt as stop:
         begun = is_session(wish.out)
         kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
-        raise CaptureStoppedError(f"stopped at once; {kept}") from stop
+        raise StoppedError(f"stopped at once; {kept}") from stop
     if captured is None:
         return None
     session, outcome = captured
@@ -290,7 +286,7 @@ def capture_session(
     except AppError as fault:
         watcher.tell(f"no report: {fault}")
     if not outcome.complete:
-        raise CaptureStoppedError(
+        raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
             f"{go_on}"
         )
@@ -322,7 +318,7 @@ def capture(
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
     Raises:
-        AppError: a plan, rig or folder that cannot be used; CaptureStoppedError by Ctrl-C.
+        AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
         DriverError: what a device says.
     """
     description = None if rig is None else rig.description

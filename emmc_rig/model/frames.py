@@ -40,8 +40,8 @@ class Frames:
     def __repr__(self) -> str:
         shots, rows, columns = self.shape
         return (
-            f"{type(self).__name__}({shots} shot{'s' * (shots > 1)} of {rows}x{columns} pixels, noise "
-            f"{self.noise_sigma:.2g}, {self.usable.mean():.1%} usable)"
+            f"{type(self).__name__}({shots} shot{'s' * (shots > 1)} of {rows}x{columns} pixels, "
+            f"noise {self.noise_sigma:.2g}, {self.usable.mean():.1%} usable)"
         )
 
 

@@ -16,7 +16,6 @@ from emmc_rig.session.session import Session, is_session
 from reconstruction.methods import MethodSettings
 
 
-
 def session_frames(folder: Path) -> tuple[ImagingMatrix, Frames]:
     """Return a session's shots, and the Psi of its whiteboards that they were normalised by.
 

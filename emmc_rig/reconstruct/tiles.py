@@ -57,7 +57,7 @@ def _verdict_of_middle(
     )
 
 
-def run_in_tiles(
+def reconstruct_folder_in_tiles(
     folder: Path,
     out: Path,
     method: str,

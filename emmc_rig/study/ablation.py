@@ -48,9 +48,7 @@ class Ablation:
         return asdict(self)
 
 
-def ablations(
-    scene: str, camera: Camera, size: tuple[int, int], seed: int
-) -> Iterator[Ablation]:
+def ablations(scene: str, camera: Camera, size: tuple[int, int], seed: int) -> Iterator[Ablation]:
     """Yield the whole method, then the method without each piece, then its rivals.
 
     The frames are exposed once. The whole runs twice, so that compiling is not counted.
