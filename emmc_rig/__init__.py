@@ -21,7 +21,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from emmc_rig.version import __version__
 
 if TYPE_CHECKING:
     from emmc_rig.calibrate.session import calibrate

@@ -7,7 +7,6 @@ from typing import Annotated, NoReturn, cast
 
 import typer
 
-from emmc_rig import __version__
 from emmc_rig.commands.calibrate import calibrate
 from emmc_rig.commands.cameras import cameras
 from emmc_rig.commands.capture import capture
@@ -20,8 +19,9 @@ from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
 from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
+from emmc_rig.commands.train import train
 from emmc_rig.errors import ERRORS, StoppedError
-from emmc_rig.reconstruct.training import train
+from emmc_rig.version import __version__
 
 INTERRUPTED = 130
 UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])

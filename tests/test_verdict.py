@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from emmc_rig.cli import app
+from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix

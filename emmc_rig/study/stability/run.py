@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig import __version__
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
@@ -27,6 +26,7 @@ from emmc_rig.study.points import Journal, digest_of, kept_when_stopped
 from emmc_rig.study.stability.faults import FAULTS, camera_for, trial
 from emmc_rig.study.stability.plan import Point, StabilitySettings
 from emmc_rig.study.stability.trial import NotApplicableError, Setup, Trial
+from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.sparse import SparseSettings
