@@ -1,7 +1,9 @@
 """The Python API: the snippet of the documentation, arrays and frames alike, what is shown."""
 
+import doctest
 import subprocess
 import sys
+from importlib import import_module
 from types import FunctionType
 
 import matplotlib
@@ -184,3 +186,20 @@ def test_a_module_loads_only_what_it_needs(module, unwanted):
     code = f"import sys, {module}; print(*sorted(set({unwanted}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "emmc_rig",
+        "emmc_rig.files.cameras",
+        "emmc_rig.files.scenes",
+        "emmc_rig.model.sensing",
+        "emmc_rig.reconstruct.solve",
+        "emmc_rig.rig.rig_config",
+    ],
+)
+def test_the_examples_in_docstrings_give_what_they_show(module):
+    tested = doctest.testmod(import_module(module), extraglobs={})
+    assert tested.attempted > 0
+    assert tested.failed == 0

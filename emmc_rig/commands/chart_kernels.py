@@ -1,4 +1,4 @@
-"""`emmc-rig chart --kernels`: every kernel as a ratio to its memory bound."""
+"""`emmc-rig chart --kernels`: every kernel as a ratio to its memory bound, and start-up times."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
 
     import emmc_rig as emmc
     from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.benchmarks.imports import start_timings
     from emmc_rig.study.benchmarks.kernels import kernel_timings, reconstruction_memory
 
     described = emmc.camera(camera)
@@ -30,10 +31,12 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
                 f"{timing.gigabytes / timing.seconds:.1f}",
                 f"{timing.ratio:.2f}",
             )
+        starts = start_timings(repeats)
         metrics = {
             "camera": camera,
             "size": list(size),
             "kernels": rows,
+            "starts": [start.as_dict() for start in starts],
             "reconstruction_seconds": seconds,
             "reconstruction_peak_gib": peak_gib,
             "command": command_line(),
@@ -42,3 +45,5 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
         write_metrics(folder, metrics)
     Console().print(table)
     typer.echo(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+    for start in starts:
+        typer.echo(f"{start.name}: {start.seconds:.2f} s to start")
