@@ -17,7 +17,8 @@ import yaml
 from programs import program
 
 from emmc_rig.session.listing import sessions_in
-from emmc_rig.session.session import Session, only_program
+from emmc_rig.session.lock import held
+from emmc_rig.session.session import Session
 from emmc_rig.session.storage import part_of
 
 RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
@@ -283,11 +284,12 @@ def test_a_plan_edited_inside_the_session_is_told(captured, run, tmp_path):
 
 
 def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
-    session = Session(captured / "plan-session")
-    with only_program(session):
+    with held(captured / "plan-session"):
         code, _, err = run("capture", captured / "plan-session")
-    assert code == 1
-    assert "another program" in one_line(err)
+        assert code == 1
+        assert f"(process {os.getpid()} on " in one_line(err)
+        assert run("session", "prune", captured / "plan-session")[0] == 1
+        assert run("session", "show", captured / "plan-session")[0] == 0
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write anywhere")

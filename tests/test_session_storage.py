@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
+from emmc_rig.session.lock import held
 from emmc_rig.session.prune import prune
-from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Session, only_program
+from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
 from simulators.disk import PowerCutError, SimulatedDisk
@@ -227,7 +229,8 @@ def test_a_line_after_a_torn_one_is_read(tmp_path):
     assert again.unreadable == 1
 
 
-def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path):
+def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path, monkeypatch):
+    monkeypatch.setattr("secrets.token_hex", lambda count: "0" * 2 * count)
     outside = tmp_path / "outside"
     outside.write_bytes(b"precious")
     target = tmp_path / "frame.dng"
@@ -328,12 +331,10 @@ def test_a_folder_of_frames_that_somebody_removed_is_filled_again(on_disk, tmp_p
 
 
 def test_two_programs_do_not_work_on_one_session(on_disk):
-    with (
-        only_program(on_disk),
-        pytest.raises(AppError, match="another program"),
-        only_program(Session(on_disk.folder)),
-    ):
+    who = rf"held by `.*` \(process {os.getpid()} on .*, since "
+    with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
         pass
+    assert not (on_disk.folder / LOCK).exists()
 
 
 def test_a_folder_that_is_no_session_is_told(tmp_path):

@@ -1,4 +1,7 @@
-"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on."""
+"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on.
+
+Whoever calls holds the session meanwhile (`emmc_rig.session.lock.held`), from before it is read.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import Estimate, estimate
 from emmc_rig.capture.expand import expand
@@ -20,10 +24,11 @@ from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Plan,
-    first_difference,
     load_plan,
     planned_camera,
 )
+from emmc_rig.capture.preflight import refuse_impossible
+from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Watcher
@@ -34,6 +39,7 @@ from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
 from emmc_rig.rig.hardware import Rig
 from emmc_rig.rig.rig_config import Ask, opened_rig
+from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
@@ -41,7 +47,6 @@ from emmc_rig.session.session import (
     Frozen,
     Session,
     is_session,
-    only_program,
     wall_time,
 )
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
@@ -71,23 +76,23 @@ def session_folder(plan_path: Path) -> Path:
 
 
 def wish_from_plan(
-    plan_path: Path, out: Path | None, rig: Mapping[str, Any], until_db: float | None = None
+    plan_path: Path, out: Path, rig: Mapping[str, Any], until_db: float | None = None
 ) -> Wish:
     """Return what a plan file asks for; raises AppError."""
     plan = load_plan(plan_path)
     camera = planned_camera(plan, plan_path.parent)
     text = plan_path.read_text(encoding="utf-8")
-    return Wish(plan_path, plan, text, camera, out or session_folder(plan_path), rig, until_db)
+    return Wish(plan_path, plan, text, camera, out, rig, until_db)
 
 
 def wish_from_session(
-    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None = None
+    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
 ) -> Wish:
-    """Return what a session was begun for; raises AppError."""
+    """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
     session = Session(folder)
     plan = validated(Plan, yaml.safe_load(session.plan_yaml), str(folder), AppError)
     camera = validated(Camera, session.camera, str(folder), CameraError)
-    return Wish(folder, plan, session.plan_yaml, camera, folder, rig or session.rig, until_db)
+    return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
 
 
 def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
@@ -105,27 +110,27 @@ def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
 def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
     """Return the session that the wish goes on with; None where it is to be begun.
 
-    Raises AppError when the folder is in the way, or the session was begun with another plan,
-    camera or rig.
+    Raises AppError when the folder is in the way, or frames were taken by another rig.
     """
     if is_session(wish.out):
         session = Session(wish.out, disk)
-        _refuse_changes(wish, session)
+        if session.stored and json.loads(json.dumps(dict(wish.rig))) != session.rig:
+            raise AppError(
+                f"session {session.folder.name} was begun with another rig: "
+                f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
+            )
         return session
     if (wish.out / HEADER).is_file():
         raise AppError(
             f"{wish.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
         )
     if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
-        raise AppError(
-            f"--out {wish.out}: holds something else than a session; choose another folder"
-        )
+        raise AppError(f"--out {wish.out}: holds something else than a session; name another --out")
     return None
 
 
 def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK) -> Session:
     """Begin the wish's session; raises AppError where it cannot be made."""
-    frozen = Frozen(wish.plan_yaml, _camera_data(wish.camera), dict(wish.rig), frames)
     about = {
         "title": wish.plan.title or wish.plan_path.stem,
         "created": wall_time(),
@@ -133,31 +138,12 @@ def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTE
         "versions": versions(),
         **({} if wish.until_db is None else {"until_db": wish.until_db}),
     }
-    return Session.create(wish.out, frozen, about, disk)
+    return Session.create(wish.out, _frozen(wish, frames), about, disk)
 
 
-def _camera_data(camera: Camera) -> dict[str, Any]:
-    return camera.model_dump(mode="json")
-
-
-def _refuse_changes(wish: Wish, session: Session) -> None:
-    frozen = validated(Plan, yaml.safe_load(session.plan_yaml), str(session.folder), AppError)
-    difference = first_difference(wish.plan, frozen)
-    if difference:
-        raise AppError(
-            f"{wish.plan_path}: was edited since session {session.folder.name} began with it "
-            f"({difference} as there): take the edit back, or name another --out"
-        )
-    if json.loads(json.dumps(_camera_data(wish.camera))) != session.camera:
-        raise AppError(
-            f"{wish.plan.camera}: the camera was edited since session {session.folder.name} began; "
-            "take the edit back, or name another --out"
-        )
-    if json.loads(json.dumps(dict(wish.rig))) != session.rig:
-        raise AppError(
-            f"session {session.folder.name} was begun with another rig: {json.dumps(session.rig)}; "
-            "name the same, or another --out"
-        )
+def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
+    camera = wish.camera.model_dump(mode="json")
+    return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
 
 
 def estimated(frames: tuple[PlannedFrame, ...], plan: Plan, rig: Rig) -> Estimate:
@@ -211,6 +197,32 @@ def disk_faults_told(session: Session) -> Iterator[None]:
         ) from fault
 
 
+@contextmanager
+def way_on_told(wish: Wish, session: Session) -> Iterator[None]:
+    """Say with a fault how to go on; a session without a frame goes, for there is nothing to keep.
+
+    A fault of the plan's is mended in the plan, which may hold for a session that has begun.
+    """
+    try:
+        yield
+    except BaseException as fault:
+        kept = len(session.stored)
+        if not kept:
+            session.forget()
+        if not isinstance(fault, GaveUpError):
+            raise
+        if not is_session(session.folder):
+            way = "nothing was captured; mend it, then run the same command"
+        elif is_session(wish.plan_path):
+            way = (
+                f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
+                f"the plan that you edited: emmc-rig capture COPY.yaml --out {wish.out}"
+            )
+        else:
+            way = f"{kept} frames are kept: mend it, then run the same command"
+        raise AppError(f"{fault}; {way}") from fault
+
+
 def run_capture(
     wish: Wish,
     watcher: Watcher,
@@ -220,7 +232,8 @@ def run_capture(
 ) -> tuple[Session, Outcome] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
-    agreed: is told what it will take. Raises AppError or a `DriverError`.
+    agreed: is told what it will take, once nothing speaks against it. Raises AppError or a
+    `DriverError`.
     """
     control = control or Control()
     if wish.until_db is not None:
@@ -228,19 +241,34 @@ def run_capture(
     with ExitStack() as open_things:
         session = begun_session(wish)
         rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
-        frames = planned_frames(wish, rig) if session is None else still_possible(wish, session)
+        planned = planned_frames(wish, rig)
+        edit = None
+        if session is None:
+            frames = planned
+        elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
+            watcher.tell(edit.words(len(session.stored)))
+            frames = tuple(frame for frame in edit.frames if frame.id not in session.stored)
+        else:
+            frames = still_possible(wish, session)
+        refuse_impossible(rig, frames)
+        if session is not None:
+            refuse_other_camera(session, rig)
         expected = estimated(frames, wish.plan, rig)
         refuse_small_disk(wish.out, expected)
         if not agreed(expected):
             return None
-        session = session or new_session(wish, frames)
-        open_things.enter_context(only_program(session))
-        refuse_other_camera(session, rig)
+        if session is None:
+            session = new_session(wish, planned)
+            open_things.enter_context(held(session.folder))
         with interruptible(control, watcher.tell), disk_faults_told(session):
-            if wish.until_db not in (None, session.target_db):
-                session.note("until", target_db=wish.until_db, wall=wall_time())
-            choose = None if session.target_db is None else Until(session, watcher)
-            return session, Sequencer(session, wish.plan, rig, watcher, control, choose).run()
+            if edit is not None:
+                session = session.amend(_frozen(wish, edit.frames), edit.changes)
+            with way_on_told(wish, session):
+                if wish.until_db not in (None, session.target_db):
+                    session.note("until", target_db=wish.until_db, wall=wall_time())
+                choose = None if session.target_db is None else Until(session, watcher)
+                run = Sequencer(session, wish.plan, rig, watcher, control, choose)
+                return session, run.run()
 
 
 def write_new(path: Path, text: str) -> None:

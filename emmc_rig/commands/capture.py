@@ -13,6 +13,7 @@ from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.capture.command import Wish
     from emmc_rig.rig.rig_config import ImagedRig
 
 OptionalPath = Path | None
@@ -93,7 +94,7 @@ def _run(
     dry_run: bool,
     out: Path | None,
 ) -> None:
-    from emmc_rig.capture.command import run_capture, wish_from_plan, wish_from_session
+    from emmc_rig.capture.command import run_capture, session_folder
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
@@ -101,15 +102,13 @@ def _run(
     from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
     from emmc_rig.rig.rig_config import rig_description
     from emmc_rig.session.decisions import decided_words, ended
+    from emmc_rig.session.lock import held
     from emmc_rig.session.session import REPORT, is_session
 
+    if not plan.exists():
+        raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
     chosen = None if rig is None else rig_description(rig, imaged)
-    if is_session(plan):
-        wish = wish_from_session(plan, chosen, until_db)
-    elif chosen is None:
-        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
-    else:
-        wish = wish_from_plan(plan, out, chosen, until_db)
+    folder = out or (plan if is_session(plan) else session_folder(plan))
     console, control = Console(stderr=True), Control()
     display = CaptureDisplay(console, control)
 
@@ -131,21 +130,23 @@ def _run(
             )
         return not dry_run
 
-    go_on = f"go on with: emmc-rig capture {wish.out}"
-    try:
-        with display.shown():
-            captured = run_capture(wish, display, ask, agreed, control)
-    except KeyboardInterrupt as stop:
-        begun = is_session(wish.out)
-        kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
-        raise CaptureStoppedError(f"stopped at once; {kept}") from stop
-    if captured is None:
-        return
-    session, outcome = captured
-    try:
-        write_sheet(session, session.folder / REPORT, quick_pictures(session))
-    except AppError as fault:
-        display.tell(f"no report: {fault}")
+    go_on = f"go on with: emmc-rig capture {folder}"
+    with held(folder):
+        wish = _wish(plan, folder, chosen, until_db)
+        try:
+            with display.shown():
+                captured = run_capture(wish, display, ask, agreed, control)
+        except KeyboardInterrupt as stop:
+            begun = is_session(folder)
+            kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
+            raise CaptureStoppedError(f"stopped at once; {kept}") from stop
+        if captured is None:
+            return
+        session, outcome = captured
+        try:
+            write_sheet(session, session.folder / REPORT, quick_pictures(session))
+        except AppError as fault:
+            display.tell(f"no report: {fault}")
     if not outcome.complete:
         raise CaptureStoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
@@ -160,3 +161,17 @@ def _run(
     if last is not None:
         typer.echo(decided_words(last))
     typer.echo(f"open {session.folder / REPORT}")
+
+
+def _wish(plan: Path, out: Path, rig: dict[str, Any] | None, until_db: float | None) -> Wish:
+    """Return what is asked for; an edited plan for a session that is there keeps its rig."""
+    from emmc_rig.capture.command import wish_from_plan, wish_from_session
+    from emmc_rig.session.session import Session, is_session
+
+    if is_session(plan):
+        return wish_from_session(plan, rig, until_db, out)
+    if rig is None and is_session(out):
+        rig = Session(out).rig
+    if rig is None:
+        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+    return wish_from_plan(plan, out, rig, until_db)
