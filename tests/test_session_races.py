@@ -154,7 +154,7 @@ def test_two_programs_that_meet_at_a_session_spoil_nothing(place, meet, prepared
     rng = np.random.default_rng(0)
     refused = 0
     for number in range(OFFSETS):
-        folder = place / f"meeting-{number}"
+        folder = place / f"{meeting.replace('/', '-')}-{number}"
         shutil.copytree(prepared[before], folder)
         answer = meet(folder, rng.uniform(0, longest * alone_s), *commands)
         assert_loser_knows(folder, answer, commands)

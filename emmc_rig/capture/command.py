@@ -281,4 +281,6 @@ def write_new(path: Path, text: str) -> None:
     except FileExistsError as fault:
         raise AppError(f"{path}: exists already; name another --out") from fault
     except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+        raise AppError(
+            f"{path}: cannot be written ({fault.strerror}); name another --out"
+        ) from fault

@@ -192,7 +192,7 @@ def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
         return own
     moving = camera.moving_masks or tuple(camera.masks)
     if not moving:
-        raise AppError(f"shots.{place}: the camera has no mask to move")
+        raise AppError(f"shots.{place}: the camera has no mask to move: leave its place out")
     if shot.mask_um is not None:
         offsets = dict.fromkeys(moving, shot.mask_um)
     else:

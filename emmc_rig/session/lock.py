@@ -70,7 +70,10 @@ def _locked(path: Path, folder: Path) -> Iterator[None]:
         descriptor = _acquired(path, folder)
     except OSError as fault:
         made = "written" if is_session(folder) else "made"
-        raise AppError(f"{folder}: cannot be {made} ({fault.strerror})") from fault
+        raise AppError(
+            f"{folder}: cannot be {made} ({fault.strerror}); make that possible, or name another "
+            "folder"
+        ) from fault
     try:
         yield
     finally:
@@ -149,7 +152,9 @@ def _made_above(folder: Path) -> Iterator[None]:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
-        raise AppError(f"{folder}: cannot be made ({fault.strerror})") from fault
+        raise AppError(
+            f"{folder}: cannot be made ({fault.strerror}); name another folder"
+        ) from fault
     try:
         yield
     finally:

@@ -93,7 +93,7 @@ class Session:
                 f"{folder}: no session, it holds no {JOURNAL}; `emmc-rig session list` shows them"
             ) from fault
         except OSError as fault:
-            raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
+            raise AppError(f"{folder}: cannot be read ({fault.strerror}); mend that") from fault
 
     @classmethod
     def create(
@@ -120,7 +120,9 @@ class Session:
                 disk, folder, {**files, JOURNAL: encode_line(begun), f"{FRAMES}/": b""}
             )
         except OSError as fault:
-            raise AppError(f"{folder}: cannot be made ({fault.strerror})") from fault
+            raise AppError(
+                f"{folder}: cannot be made ({fault.strerror}); mend that, or name another folder"
+            ) from fault
         return cls(folder, disk)
 
     def amend(self, frozen: Frozen, changes: Sequence[str]) -> Session:
