@@ -1,5 +1,6 @@
 """What a session keeps through power cuts, full disks and damage: everything it counted."""
 
+import copy
 import errno
 import json
 import os
@@ -350,15 +351,14 @@ def amended(disk):
 def test_a_power_cut_in_an_amendment_leaves_the_plan_before_or_the_one_after(undisturbed):
     _, taken = undisturbed
     rng = np.random.default_rng(3)
-    whole = SimulatedDisk()
-    run_on(whole)
-    before = whole.operations
+    begun_disk = SimulatedDisk()
+    run_on(begun_disk)
+    whole = copy.deepcopy(begun_disk)
     amended(whole)
     held_by = []
-    for cut in range(1, whole.operations - before + 1):
-        disk = SimulatedDisk()
-        run_on(disk)
-        disk.cut_power_at(before + cut)
+    for cut in range(begun_disk.operations + 1, whole.operations + 1):
+        disk = copy.deepcopy(begun_disk)
+        disk.cut_power_at(cut)
         with pytest.raises(PowerCutError):
             amended(disk)
         survived = disk.after_power_cut(rng)
