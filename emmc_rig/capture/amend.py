@@ -1,10 +1,10 @@
 """What an edited plan changes in a session that has begun: frames taken stay, the others follow it.
 
-An edit may change whatever no frame was taken by: exposures, gains, mask places, views, repeats,
-shots at the end of the list; and at any time order, checks, retries, settling and metering level.
-A frame that is taken keeps the exposure that it had, and stays when the edited plan has no such
-frame any more. What it shows must be what the edited plan says that it shows: where the bench
-would stand otherwise, or another gain or camera is wanted, the edit is refused.
+An edit may change everything about frames that are not taken yet, and at any time order, checks,
+retries, settling and metering level. A frame that is taken keeps the exposure that it had, and
+stays when the edited plan has no such frame any more. Refused is an edit that gives a frame taken
+another bench, gain, camera or rig; or a shot of which frames are taken other masks, another filter
+or mask place, or leaves it out.
 """
 
 from __future__ import annotations
