@@ -46,7 +46,8 @@ def summary(folder: Path) -> Summary:
     size = sum(entry["bytes"] for entry in stored.values())
     name = folder.resolve().name
     last = ended(entries)
-    planned = entries[0]["frames"] - (0 if last is None else last["spared_frames"])
+    begun = next(e for e in reversed(entries) if e["kind"] in ("created", "amended"))
+    planned = begun["frames"] - (0 if last is None else last["spared_frames"])
     return Summary(name, title, created, state, len(stored), planned, size)
 
 
