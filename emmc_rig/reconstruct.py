@@ -36,8 +36,9 @@ from emmc_rig.model.lightfield import (
     save_hdf5,
     ssim,
 )
+from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.settings import read_yaml, validated
+from emmc_rig.model.settings import validated
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
