@@ -14,12 +14,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import yaml
-
 from emmc_rig.capture.plan import Plan, differences
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.model.settings import validated
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
@@ -60,7 +59,8 @@ def amendment(
     alone, in order. Raises AppError for an edit that frames already taken contradict.
     """
     folder = session.folder.name
-    before = validated(Plan, yaml.safe_load(session.plan_yaml), str(session.folder), AppError)
+    place = str(session.folder)
+    before = validated(Plan, parse_yaml(session.plan_yaml, place, AppError), place, AppError)
     earlier = validated(Camera, session.camera, str(session.folder), CameraError)
     changes = differences(plan, before)
     if _plain(camera) != _plain(earlier) and not changes:

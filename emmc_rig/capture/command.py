@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import Estimate, estimate
@@ -36,6 +34,7 @@ from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
 from emmc_rig.rig.hardware import Rig
@@ -92,7 +91,9 @@ def wish_from_session(
 ) -> Wish:
     """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
     session = Session(folder)
-    plan = validated(Plan, yaml.safe_load(session.plan_yaml), str(folder), AppError)
+    plan = validated(
+        Plan, parse_yaml(session.plan_yaml, str(folder), AppError), str(folder), AppError
+    )
     camera = validated(Camera, session.camera, str(folder), CameraError)
     return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
 

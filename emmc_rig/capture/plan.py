@@ -13,7 +13,8 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, Shot
-from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
 
 METERING_EXPOSURE_S = 0.01
 SCHEMA_FILE = "plan.schema.json"

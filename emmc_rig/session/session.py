@@ -40,6 +40,7 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
@@ -207,10 +208,14 @@ class Session:
         """Return plan, camera, rig or frames as they hold now: see `frozen_file`."""
         return self.frozen_file(amended_name(name, self.amendments))
 
+    def _data(self, name: str) -> Any:
+        """Return what a file of JSON says, as it was frozen; raises AppError."""
+        return parse_json(self.frozen_file(name), str(self.folder / name), AppError)
+
     @cached_property
     def header(self) -> dict[str, Any]:
         """What session.json says."""
-        return json.loads(self.frozen_file(HEADER))
+        return self._data(HEADER)
 
     @cached_property
     def plan_yaml(self) -> str:
@@ -220,17 +225,23 @@ class Session:
     @cached_property
     def camera(self) -> dict[str, Any]:
         """The camera as planned, plain data of an `emmc_rig.model.camera.Camera`."""
-        return json.loads(self.holding(CAMERA))
+        return self._data(amended_name(CAMERA, self.amendments))
 
     @cached_property
     def rig(self) -> dict[str, Any]:
         """What devices were asked for."""
-        return json.loads(self.holding(RIG))
+        return self._data(amended_name(RIG, self.amendments))
 
     @cached_property
     def frames(self) -> tuple[PlannedFrame, ...]:
         """Every frame to be taken, in the order of the capture."""
-        return tuple(PlannedFrame.from_dict(one) for one in json.loads(self.holding(ORDER)))
+        name = amended_name(ORDER, self.amendments)
+        try:
+            return tuple(PlannedFrame.from_dict(one) for one in self._data(name))
+        except (KeyError, TypeError, IndexError) as fault:
+            raise AppError(
+                f"{self.folder / name}: is no list of frames; restore it from a copy"
+            ) from fault
 
     @cached_property
     def stored(self) -> dict[str, Entry]:
@@ -370,9 +381,7 @@ class Session:
     def _ids(self) -> set[str]:
         """The names of all frames ever planned."""
         earlier = [amended_name(ORDER, number) for number in range(self.amendments)]
-        return {one["id"] for name in earlier for one in json.loads(self.frozen_file(name))}.union(
-            self._places
-        )
+        return {one["id"] for name in earlier for one in self._data(name)}.union(self._places)
 
 
 def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
