@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
@@ -39,10 +39,8 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
-    REPORT,
     Frozen,
     Session,
-    is_session,
     only_program,
     wall_time,
 )
@@ -122,6 +120,7 @@ def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
         raise AppError(
             f"--out {wish.out}: holds something else than a session; choose another folder"
         )
+    refuse_inside_session(wish.out)
     return None
 
 
@@ -282,7 +281,7 @@ def capture_session(
         return None
     session, outcome = captured
     try:
-        write_sheet(session, session.folder / REPORT, quick_pictures(session))
+        write_sheet(session, session.folder, quick_pictures(session))
     except AppError as fault:
         watcher.tell(f"no report: {fault}")
     if not outcome.complete:
@@ -330,12 +329,5 @@ def capture(
 
 def write_new(path: Path, text: str) -> None:
     """Write a new file; raises AppError when one of that name is there, or it cannot be."""
-    try:
-        with open(path, "x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError as fault:
-        raise AppError(f"{path}: exists already; name another --out") from fault
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+    with new_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -8,6 +8,8 @@
         frames.json    every frame to be taken, in the order of the capture
         frames/        00012-shot-02.dng: the camera's own bytes, named by place and frame
         journal.jsonl  what happened
+        report.html    pictures, timeline, events; with metrics.json and files.json
+        calibration/, reconstruction/   what `calibrate` and `reconstruct` made of it
 
 Where a capture ends when the scene needs no more shots, the journal says which are spared: these
 count as not planned (see `decisions`).
@@ -34,6 +36,8 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import FILES, PARTIAL, SESSION_HEADER, SESSION_JOURNAL
+from emmc_rig.files.results import METRICS
 from emmc_rig.session.decisions import spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
@@ -47,16 +51,14 @@ from emmc_rig.session.storage import (
     write_whole,
 )
 
-HEADER, PLAN, CAMERA, RIG, ORDER = (
-    "session.json",
-    "plan.yaml",
-    "camera.json",
-    "rig.json",
-    "frames.json",
-)
+HEADER, JOURNAL = SESSION_HEADER, SESSION_JOURNAL
+PLAN, CAMERA, RIG, ORDER = "plan.yaml", "camera.json", "rig.json", "frames.json"
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
-JOURNAL, FRAMES, REPORT, METRICS = "journal.jsonl", "frames", "report.html", "metrics.json"
-KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS}
+FRAMES, REPORT = "frames", "report.html"
+CALIBRATION, RECONSTRUCTION = "calibration", "reconstruction"
+KNOWN = {
+    *FROZEN, JOURNAL, FRAMES, REPORT, METRICS, CALIBRATION, RECONSTRUCTION, FILES, PARTIAL
+}  # fmt: skip
 FORMAT = 1
 
 
@@ -320,11 +322,6 @@ def only_program(session: Session) -> Iterator[None]:
         if not held:
             raise AppError(f"{session.folder}: another program works on it; wait, or stop that one")
         yield
-
-
-def is_session(folder: Path) -> bool:
-    """Return whether a folder is a session."""
-    return (folder / JOURNAL).is_file() and (folder / HEADER).is_file()
 
 
 def wall_time() -> str:
