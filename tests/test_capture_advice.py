@@ -32,6 +32,7 @@ from emmc_rig.capture.retries import HOPELESS
 from emmc_rig.rig.rig_config import AskingAttendant
 from emmc_rig.session import session as session_module
 from emmc_rig.session.lock import held
+from emmc_rig.session.readings import whiteboards
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SystemDisk
 from emmc_rig.session.verify import verify
@@ -706,6 +707,18 @@ def a_new_plan_where_one_is(bench):
 def a_new_plan_in_no_folder(bench):
     yield bench.refused("capture", "--new", PLAN["camera"], "--out", "nowhere/plan.yaml")
     assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
+
+
+def test_repeats_that_an_edit_made_different_are_averaged_where_most_are_alike(bench):
+    bench.boards(references=3)
+    bench.light.factor = {"reference-s0-white-r1": 10.0}
+    assert "lower whiteboards.exposure_s in the plan" in bench.refused()
+    bench.light.factor = {}
+    bench.boards(references=3, exposure_s=0.01)
+    assert bench.run(*CAPTURE)[0] == 0
+    references = whiteboards(Session(bench.session)).references
+    assert (references[0, "white"].exposure_s, references[0, "white"].count) == (0.01, 2)
+    assert (references[1, "white"].exposure_s, references[1, "white"].count) == (0.01, 3)
 
 
 def sample(kind):
