@@ -66,7 +66,7 @@ def _forked(arguments, folder, name, wait_s):
             os.chdir(folder)
             _child(arguments, name, wait_s)
         except SystemExit as stop:
-            code = stop.code or 0
+            code = int(stop.code or 0)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

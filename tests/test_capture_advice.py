@@ -765,7 +765,7 @@ def texts():
             if isinstance(said, ast.Call) and of_error:
                 raised = [one for one in ast.walk(said) if isinstance(one, ast.Constant)]
                 parts = [one.value for one in raised if isinstance(one.value, str)]
-                yield f"{path.name}:{node.lineno}", [one for one in parts if " " in one.strip()]
+                yield f"{path.name}:{said.lineno}", [one for one in parts if " " in one.strip()]
 
 
 def test_every_text_has_a_walk_and_every_walk_its_text():
