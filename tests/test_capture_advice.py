@@ -49,6 +49,7 @@ SCANNED = (
 NO_CAPTURE = ("direct.py", "simulate.py", "enough.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (
+    ": is no list of frames; restore it from a copy",  # nor then would its SHA-256 be the journal's
     "cannot be metered, the board is dark",  # such a frame is refused as black before
     "was not captured yet; resume it",  # only frames are read that were hashed just before
     "is damaged, its SHA-256 is not the journal's",
