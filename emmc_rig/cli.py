@@ -395,8 +395,9 @@ def chart(
             place, targets = out or Path("emmc-next-shot"), sorted(until or [30.0])
             _chart_next_shot(scene or list(SCENES), through, cut, targets, seed, place)
         return
-    from emmc_rig.study.chart.command import chart_settings, run_chart, shown_charts
-    from emmc_rig.study.chart.run import ChartStopped
+    from emmc_rig.study.chart.charting import run_chart
+    from emmc_rig.study.chart.points import chart_settings
+    from emmc_rig.study.sweep import SweepStopped
 
     place = out or Path("emmc-chart")
     settings = chart_settings(
@@ -406,10 +407,10 @@ def chart(
     try:
         with shown_bars() as bars:
             outcome = run_chart(settings, place, bars)
-    except ChartStopped as stop:
+    except SweepStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
-        for one in shown_charts(outcome.charts):
+        for one in outcome.shown():
             table = Table("the front", "s", "dB", title=one.title, box=SIMPLE)
             for mark in one.front():
                 table.add_row(
@@ -503,15 +504,16 @@ def tables(
     out: OutOption = Path("emmc-tables"),
 ) -> None:
     """Reproduce the paper's tables and figures; run it again to go on where it stopped."""
-    from emmc_rig.study.tables.command import run_tables
+    from emmc_rig.study.sweep import SweepStopped
+    from emmc_rig.study.tables.cell_sweep import FAST, TablesSettings
     from emmc_rig.study.tables.console import shown
-    from emmc_rig.study.tables.run import FAST, TablesSettings, TablesStopped
+    from emmc_rig.study.tables.reproducing import run_tables
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     try:
         with shown_bars() as bars:
             outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
-    except TablesStopped as stop:
+    except SweepStopped as stop:
         _fail(str(stop), INTERRUPTED)
     else:
         for part in shown(outcome.grids, outcome.findings):
@@ -563,11 +565,11 @@ def stability(
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
     from emmc_rig.study.stability.beside import measure_beside
-    from emmc_rig.study.stability.command import run_stability
+    from emmc_rig.study.stability.curves import breaking_rows
+    from emmc_rig.study.stability.fault_points import CAMERA, planned, stability_settings
     from emmc_rig.study.stability.faults import FAULTS
-    from emmc_rig.study.stability.plan import CAMERA, planned, stability_settings
-    from emmc_rig.study.stability.rows import breaking_rows
-    from emmc_rig.study.stability.run import StabilityStopped
+    from emmc_rig.study.stability.sweeping import run_stability
+    from emmc_rig.study.sweep import SweepStopped
 
     if faults:
         table = Table(
@@ -594,7 +596,7 @@ def stability(
             wanted = [name for name, on in switches.items() if on]
             beside = measure_beside(settings, wanted, out, bars)
             outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
-    except StabilityStopped as stop:
+    except SweepStopped as stop:
         _fail(str(stop), INTERRUPTED)
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     table = Table(
@@ -684,7 +686,7 @@ def _chart_next_shot(
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.next_shot import ROWS, next_shots, savings, total_savings
-    from emmc_rig.study.points import open_folder
+    from emmc_rig.study.sweep import open_folder
 
     described = find_camera(camera)
     folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")

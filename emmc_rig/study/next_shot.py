@@ -32,7 +32,7 @@ from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
-from emmc_rig.study.points import Journal, digest_of
+from emmc_rig.study.sweep import Journal, digest_of
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
 
@@ -192,7 +192,7 @@ def next_shots(
 ) -> Iterator[SceneRows]:
     """Yield each scene's rows; those that the folder holds are not measured again.
 
-    folder: see `emmc_rig.study.points.open_folder`. Raises what the layers below do.
+    folder: see `emmc_rig.study.sweep.open_folder`. Raises what the layers below do.
     """
     journal = Journal(folder / ROWS)
     plan = candidate_plan(camera_name, camera, size)
