@@ -691,8 +691,7 @@ def _chart_next_shot(
     described = find_camera(camera)
     folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
     with shown_bars() as bars:
-        bars.begin("capture and judge", None)
-        found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
+        found = next_shots(scenes, camera, described, size, seed, folder, bars)
     names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
     table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]

@@ -67,7 +67,7 @@ def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera
     assert row.recovered > 0.6
     # A second run measures nothing again.
     again = Counted()
-    monkeypatch.setattr(mismatch, "trial", None)
+    monkeypatch.setattr(type(settings), "trial", None)
     assert measure_mismatch(settings, tmp_path, again, ("tv",)) == [row]
     sections = mismatch_sections([row], tmp_path)
     assert f"{row.blind:.2f}" in sections[0].body

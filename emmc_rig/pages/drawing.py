@@ -65,7 +65,8 @@ def plain_log_ticks(axes: Axes, which: str) -> None:
 
 
 def legend_below(figure: Figure, lines: Iterable[Any], names: Iterable[str], columns: int) -> None:
-    """Put a legend of all panels below them."""
+    """Put a legend of all panels below them, in as many columns as fit."""
+    columns = max(1, min(columns, int(figure.get_figwidth() / 2)))
     figure.legend(list(lines), list(names), loc="outside lower center", ncols=columns, **LEGEND)
 
 

@@ -13,8 +13,10 @@ from typing import Literal
 from pydantic import Field
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.settings import Settings
-from emmc_rig.study.stability.faults import FAULTS, Fault, find_fault
+from emmc_rig.study.stability.faults import FAULTS, Fault, find_fault, trial
+from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import check_scene_names
 from reconstruction.methods import find_method
 
@@ -26,8 +28,6 @@ CAMERA = "rgbw-bayer-3shots"
 SIZE, ZOOM = (96, 128), 2
 FAST_SIZE, FAST_ZOOM = (64, 80), 3
 SMALLEST_PX = 16
-BESIDE_SIZE = (96, 128)
-"""Of the crop for what stands beside the sweeps, where the settings have none."""
 
 
 class StabilitySettings(Settings):
@@ -47,6 +47,11 @@ class StabilitySettings(Settings):
     screening: Literal["on", "off", "both"] = "both"
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
+
+    def trial(self, fault: str, strength: float, scene: str) -> Trial:
+        """Return what methods get of a scene with a fault; raises what `faults.trial` does."""
+        camera = find_camera(self.camera)
+        return trial(FAULTS[fault], strength, scene, camera, self.size, self.seed, self.zoom)
 
 
 def stability_settings(

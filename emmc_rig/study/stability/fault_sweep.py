@@ -19,7 +19,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.chart.scores import angular_snr_db
 from emmc_rig.study.stability.fault_points import Point
-from emmc_rig.study.stability.faults import FAULTS, camera_for, trial
+from emmc_rig.study.stability.faults import FAULTS, camera_for
 from emmc_rig.study.stability.trial import Setup, Trial
 from emmc_rig.study.sweep import Results, Sweep, dictionary_identity, digest_of, machine
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
@@ -89,12 +89,8 @@ class StabilitySweep(Sweep[Point]):
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the methods' figures on one trial."""
-        settings, one = self.settings, points[0]
-        camera = find_camera(settings.camera)
-        made = trial(
-            FAULTS[one.fault], one.strength, one.scene, camera, settings.size, settings.seed,
-            settings.zoom,
-        )  # fmt: skip
+        one = points[0]
+        made = self.settings.trial(one.fault, one.strength, one.scene)
         truth = self.truth_picture(one)
         truth.parent.mkdir(exist_ok=True)
         if not truth.is_file():

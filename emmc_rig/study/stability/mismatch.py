@@ -25,13 +25,12 @@ from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.fault_points import BESIDE_SIZE, StabilitySettings
-from emmc_rig.study.stability.fault_sweep import open_dictionary_once
-from emmc_rig.study.stability.faults import find_fault, trial
+from emmc_rig.study.stability.checks import solved
+from emmc_rig.study.stability.fault_points import StabilitySettings
+from emmc_rig.study.stability.faults import find_fault
 from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, reconstruct
 
 SCENARIOS = ("ideal", "mismatched", "oracle", "blind")
 ERRORS = (
@@ -115,13 +114,8 @@ def mended(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, bool]:
 
 
 def _psnr(taken: Trial, psi: ImagingMatrix, method: str) -> float:
-    dictionary = None
-    if METHODS[method].needs_dictionary:
-        dictionary = open_dictionary_once(None, psi.light_field_shape[:2], psi.binning)
     try:
-        found = reconstruct(
-            method, psi, taken.readings, taken.noise_sigma, dictionary, usable=taken.usable
-        )
+        found = solved(replace(taken, psi=psi), method)
     except ReconstructionError:
         return math.nan
     return psnr_db(found.light_field, taken.truth)
@@ -156,7 +150,7 @@ class MismatchSweep(Sweep[MismatchPoint]):
         return {
             **asdict(point),
             "camera": find_camera(settings.camera).model_dump(mode="json"),
-            "size": settings.size or BESIDE_SIZE,
+            "size": settings.size,
             "zoom": settings.zoom,
             "drift": drift_settings(settings.fast).model_dump(),
             "seed": settings.seed,
@@ -169,10 +163,7 @@ class MismatchSweep(Sweep[MismatchPoint]):
     def measured(self, points: Sequence[MismatchPoint], watcher: Watcher) -> Results:
         """Yield the methods' PSNRs by scenario, and what became of Psi."""
         settings, one = self.settings, points[0]
-        moved = trial(
-            find_fault(one.error), one.strength, one.scene, find_camera(settings.camera),
-            settings.size or BESIDE_SIZE, settings.seed, settings.zoom,
-        )  # fmt: skip
+        moved = settings.trial(one.error, one.strength, one.scene)
         blind, told = mended(moved, drift_settings(settings.fast))
         for point in points:
             mismatched = _psnr(moved, moved.psi, point.method)

@@ -22,8 +22,8 @@ from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import swept_disparity
-from emmc_rig.study.stability.fault_points import BESIDE_SIZE, StabilitySettings, strengths
-from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.fault_points import StabilitySettings, strengths
+from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.adaptive.evidence import TexturePrior
@@ -293,7 +293,7 @@ class TheorySweep(Sweep[tuple[str, str, float]]):
             "camera": find_camera(settings.camera).model_dump(mode="json"),
             "fault": (fault, strength),
             "scene": scene,
-            "size": settings.size or BESIDE_SIZE,
+            "size": settings.size,
             "zoom": settings.zoom,
             "methods": self.methods,
             "patches": self.patches,
@@ -302,12 +302,8 @@ class TheorySweep(Sweep[tuple[str, str, float]]):
 
     def measured(self, points: Sequence[tuple[str, str, float]], watcher: Watcher) -> Results:
         """Yield the figures of theory and of the methods."""
-        settings = self.settings
         for scene, fault, strength in points:
-            made = trial(
-                FAULTS[fault], strength, scene, find_camera(settings.camera),
-                settings.size or BESIDE_SIZE, settings.seed, settings.zoom,
-            )  # fmt: skip
+            made = self.settings.trial(fault, strength, scene)
             yield self._figures(Seen.of(made))
 
     def _figures(self, seen: Seen) -> dict[str, float]:
