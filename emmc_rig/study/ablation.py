@@ -7,7 +7,7 @@ with, on the same frames.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.capture.simulate import simulate
@@ -16,6 +16,7 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruct import PSI, open_dictionary, read_capture
+from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
@@ -37,7 +38,7 @@ RIVALS = ("adaptive-fast", "tv", "tv-dict")
 
 
 @dataclass(frozen=True)
-class Ablation:
+class Ablation(Figures):
     """One row: what was left out, its PSNR and seconds, and both less those of the whole."""
 
     name: str
@@ -45,10 +46,6 @@ class Ablation:
     seconds: float
     buys_db: float
     costs_s: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
 
 def ablations(

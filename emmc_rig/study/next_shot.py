@@ -32,6 +32,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
+from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
@@ -81,7 +82,7 @@ class SceneRows:
 
 
 @dataclass(frozen=True)
-class Saving:
+class Saving(Figures):
     """For a scene and a target: where `--until` stops, and how many shots in order reach it.
 
     stopped: the last row taken; reached: whether it states the target. fixed: shots in order until
@@ -93,10 +94,6 @@ class Saving:
     stopped: ShotRow
     reached: bool
     fixed: int | None
-
-    def as_dict(self) -> dict[str, object]:
-        """Return plain data."""
-        return asdict(self)
 
 
 def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> Plan:
