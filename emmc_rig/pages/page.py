@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from emmc_rig import __version__
+from emmc_rig.version import __version__
 
 KINDS = {
     ".png": "image/png",

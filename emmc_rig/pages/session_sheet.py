@@ -86,7 +86,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     sources = {
         "command": session.header["command"],
         **session.header["versions"],
-        **{f"SHA-256 of {name}": digest for name, digest in session.created["sha256"].items()},
+        **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
     }
     sections.append(provenance_section(sources))
     lead = fragment("cards.html", cards=_cards(session))
@@ -232,4 +232,6 @@ def _told(entry: Entry) -> str:
         return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
     if kind == "decided":
         return decided_words(entry)
+    if kind == "amended":
+        return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""

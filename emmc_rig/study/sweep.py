@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
-from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
+from emmc_rig.version import __version__
 
 P = TypeVar("P", bound=Hashable)
 Results = Generator[dict, None, None]

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.pages.page import number
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.chart.scores import angular_snr_db
 from emmc_rig.study.stability.fault_points import Point
 from emmc_rig.study.stability.faults import FAULTS, camera_for

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import colours_of
 from emmc_rig.pages.page import Section, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.stability.curve_drawing import draw_curves
 from emmc_rig.study.stability.curves import Curve, break_row, curves
 from emmc_rig.study.stability.fault_points import (
