@@ -21,13 +21,12 @@ def chart_next_shot(
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.next_shot import ROWS, next_shots, savings, total_savings
-    from emmc_rig.study.points import open_folder
+    from emmc_rig.study.sweep import open_folder
 
     described = emmc.camera(camera)
     folder = open_folder(out, ROWS, "chart --next-shot")
     with shown_bars() as bars:
-        bars.begin("capture and judge", None)
-        found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
+        found = next_shots(scenes, camera, described, size, seed, folder, bars)
     names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
     table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]

@@ -69,9 +69,9 @@ def stability(
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.stability.beside import measure_beside
-    from emmc_rig.study.stability.command import run_stability
-    from emmc_rig.study.stability.plan import CAMERA, planned, stability_settings
-    from emmc_rig.study.stability.rows import breaking_rows
+    from emmc_rig.study.stability.curves import breaking_rows
+    from emmc_rig.study.stability.fault_points import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.sweeping import run_stability
 
     if faults:
         _list_faults()

@@ -44,9 +44,13 @@ def parse_psnr(text: str, option: str) -> float:
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
-    """Write metrics.json; values that are not finite become null, as JSON has none."""
-    text = json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
-    (folder / METRICS).write_text(text, encoding="utf-8")
+    """Write metrics.json, see `metrics_text`."""
+    (folder / METRICS).write_text(metrics_text(metrics), encoding="utf-8")
+
+
+def metrics_text(metrics: Mapping[str, object]) -> str:
+    """Return plain data as JSON; values that are not finite become null, as JSON has none."""
+    return json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
 
 
 def _finite(value: object) -> object:
