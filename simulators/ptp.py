@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from drivers.clock import Clock
+from drivers.dng import encode_dng
 from drivers.errors import PtpFormatError
 from drivers.ptp_codec import (
     EVERYTHING,
@@ -43,7 +44,6 @@ from drivers.ptp_codec import (
     encode_value,
 )
 from drivers.usb import INTERRUPT
-from simulators.dng import encode_dng
 from simulators.faults import Faults
 from simulators.usb import (
     DeviceSpec,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.camera import Camera, RawFileCamera
+from drivers.dng import encode_dng
 from drivers.errors import CameraSettingError, DriverError
 from drivers.folder import FolderCamera
 from drivers.ptp import PtpCamera, PtpSession
@@ -15,7 +16,6 @@ from drivers.u3v import open_u3v
 from drivers.usb import open_device
 from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb

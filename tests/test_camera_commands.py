@@ -11,6 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from drivers.clock import SYSTEM_CLOCK
+from drivers.dng import encode_dng
 from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
@@ -21,7 +22,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.frame_view import frame_figures, histogram, histogram_text, preview
 from emmc_rig.hardware import open_camera, scene_simulator
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.ptp import PtpUsbFunction
 from simulators.usb import SimulatedUsb
 

@@ -1,4 +1,4 @@
-"""DNG files as a camera would write them: a mosaic in, bytes out that LibRaw decodes exactly.
+"""DNG files: a mosaic in, bytes out that LibRaw decodes exactly.
 
 Source: Adobe Digital Negative specification 1.4 (tags 50706 to 50829) and TIFF/EP (CFA tags).
 """
@@ -9,6 +9,8 @@ from fractions import Fraction
 import numpy as np
 import tifffile
 
+from drivers.camera import CameraIdentity
+from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.raw import CFA_TILE_PREFIX
 
 Array = np.ndarray
@@ -22,16 +24,13 @@ BAYER_PATTERNS = {
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
-SMALLEST_SIDE_PX = 22
-"""LibRaw takes anything smaller for a thumbnail."""
-
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 PHOTOMETRIC_TAG, PHOTOMETRIC_CFA, PHOTOMETRIC_LINEAR_RAW = 262, 32803, 34892
 D65 = 21
 IDENTITY_MATRIX = tuple(
     n for row in np.eye(3, dtype=int).tolist() for value in row for n in (value, 1)
 )
-MODEL = "EMMC simulated camera"
+SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
 
 
 def encode_dng(
@@ -40,6 +39,7 @@ def encode_dng(
     black_level_dn: float | Array,
     white_level_dn: int,
     exposure_s: float,
+    identity: CameraIdentity = SIMULATED,
 ) -> bytes:
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
@@ -51,13 +51,13 @@ def encode_dng(
     _check(mosaic, cfa, black, exposure_s)
     exposure = Fraction(exposure_s).limit_denominator(1_000_000)
     tags = [
-        (271, ASCII, 0, "EMMC", True),
-        (272, ASCII, 0, MODEL, True),
+        (271, ASCII, 0, identity.maker, True),
+        (272, ASCII, 0, identity.model, True),
         (274, SHORT, 1, 1, True),
         (33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True),
         (50706, BYTE, 4, (1, 4, 0, 0), True),
         (50707, BYTE, 4, (1, 1, 0, 0), True),
-        (50708, ASCII, 0, MODEL, True),
+        (50708, ASCII, 0, identity.model, True),
         (50717, LONG, 1, int(white_level_dn), True),
     ]
     if cfa == MONO:
