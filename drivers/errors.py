@@ -478,3 +478,12 @@ class FrameLostError(DriverError):
         super().__init__(f"frame lost, {reason}: {advice}")
         self.reason = reason
         self.advice = advice
+
+
+class MicroManagerError(DriverError):
+    """Micro-Manager's core, or a device behind it, said no."""
+
+    def __init__(
+        self, what: str, advice: str = "see the adapter's page at micro-manager.org"
+    ) -> None:
+        super().__init__(what, advice)

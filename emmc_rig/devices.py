@@ -24,7 +24,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.signals import ENDING, handled
 
 if TYPE_CHECKING:
-    from drivers.stage import HostStage
+    from drivers.stage import Stage
 
 app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
 _told = Console(stderr=True)
@@ -251,7 +251,7 @@ def bench(
 
 
 @contextmanager
-def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
+def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
     from drivers.errors import DriverError
     from emmc_rig.hardware import open_stage
@@ -284,7 +284,7 @@ def _signals_interrupt() -> Iterator[None]:
         yield
 
 
-def _show(stage: HostStage) -> None:
+def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
     table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)
