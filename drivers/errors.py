@@ -160,6 +160,13 @@ class SpeedLimitError(DriverError):
         self.top_speed_um_s = top_speed_um_s
 
 
+class SpeedFixedError(DriverError):
+    """The axis has one speed, which cannot be chosen; nothing was sent to the device."""
+
+    def __init__(self, axis: str, advice: str) -> None:
+        super().__init__(f"the speed of {axis} cannot be chosen", advice, axis=axis)
+
+
 class NotHomedError(DriverError):
     """The axis does not know where it is; nothing was sent to the device."""
 

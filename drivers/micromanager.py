@@ -26,6 +26,7 @@ from drivers.errors import (
     FrameLostError,
     MicroManagerError,
     PortGoneError,
+    SpeedFixedError,
 )
 from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.raw import RawFrame, decode_raw
@@ -538,9 +539,7 @@ class MicroManagerStage(HostStage):
     def _apply_speed(self, axis: str, speed_um_s: float) -> None:
         told = self._told
         if not told.speed_property:
-            raise MicroManagerError(
-                f"the speed of {axis} cannot be set", "name the property that does: speed_property"
-            )
+            raise SpeedFixedError(axis, "name the property that holds it: speed_property")
         label, _ = self._place(axis)
         with calling(f"set {told.speed_property}"):
             shown = speed_um_s / told.speed_unit_um_s

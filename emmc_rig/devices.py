@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from emmc_rig.camera_commands import register, simulated_protocol
+from emmc_rig.conformance.command import conform
 from emmc_rig.errors import AppError
 from emmc_rig.signals import ENDING, handled
 
@@ -43,6 +44,7 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 
 register(app)
+app.command()(conform)
 
 
 @app.command("list")

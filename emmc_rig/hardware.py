@@ -389,11 +389,16 @@ def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> 
     choice = parse_camera(spec)
     if choice.kind in CAMERAS:
         return CAMERAS[choice.kind](choice, clock, backend)
-    others = plug_ins(plugins.CAMERAS)
+    others = camera_kinds() - CAMERAS.keys()
     if choice.kind not in others:
-        kinds = ", ".join((CAMERA_KINDS, *(f"{name}:" for name in others)))
+        kinds = ", ".join((CAMERA_KINDS, *(f"{name}:" for name in sorted(others))))
         raise AppError(f"{choice.source}: no such kind of camera; use {kinds}")
     return open_plug_in(plugins.CAMERAS, choice.kind, choice.address, clock, **choice.options)
+
+
+def camera_kinds() -> set[str]:
+    """Return every kind of camera that `--camera` takes; a plug-in replaces none of ours."""
+    return {*CAMERAS, *plug_ins(plugins.CAMERAS)}
 
 
 def _ptp_camera(

@@ -101,18 +101,17 @@ class PluginConfig(_Common):
 
 SerialConfig = ZaberConfig | GrblConfig | AptConfig
 StageConfig = SerialConfig | MicroManagerConfig | PluginConfig
-PROTOCOLS: Mapping[str, type[StageConfig]] = {
+PROTOCOLS: Mapping[str, type[SerialConfig]] = {
     "zaber": ZaberConfig,
     "grbl": GrblConfig,
     "apt": AptConfig,
-    "mm": MicroManagerConfig,
 }
-"""Those of this package; others come by `emmc_rig.plugins`."""
+"""Those with simulated firmware."""
 
 
 def stage_protocols() -> dict[str, type[StageConfig]]:
-    """Return every protocol that `--stage` takes, those of plug-ins last."""
-    return {**PROTOCOLS, **dict.fromkeys(plug_ins(STAGES).keys() - PROTOCOLS.keys(), PluginConfig)}
+    """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
+    return {**dict.fromkeys(plug_ins(STAGES), PluginConfig), "mm": MicroManagerConfig, **PROTOCOLS}
 
 
 def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:

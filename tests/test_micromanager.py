@@ -26,6 +26,7 @@ from drivers.errors import (
     MicroManagerError,
     NotHomedError,
     PortGoneError,
+    SpeedFixedError,
 )
 from drivers.micromanager import (
     CameraSetup,
@@ -183,7 +184,7 @@ def test_the_speed_is_the_devices_where_its_property_is_named():
         assert stage.speed_um_s("mask_x") == 2000.0
         stage.reconnect()
         assert stage.speed_um_s("mask_x") == 2000.0
-    with closing(demo_stage()) as stage, pytest.raises(MicroManagerError, match="speed_property"):
+    with closing(demo_stage()) as stage, pytest.raises(SpeedFixedError, match="speed_property"):
         stage.set_speed_um_s("mask_x", 2000.0)
 
 
