@@ -18,24 +18,22 @@ from emmc_rig.errors import AppError
 STAGES, CAMERAS = "emmc_rig.stages", "emmc_rig.cameras"
 
 
-def plug_ins(group: str) -> dict[str, EntryPoint]:
-    """Return the plug-ins of a group by name; of two with one name, none.
-
-    Which of two packages is meant cannot be known, and a wrong driver moves things.
-    """
-    found = list(entry_points(group=group))
-    names = [one.name for one in found]
-    return {one.name: one for one in found if names.count(one.name) == 1}
+def plug_ins(group: str) -> set[str]:
+    """Return the names of a group's plug-ins."""
+    return set(entry_points(group=group).names)
 
 
 def open_plug_in(group: str, name: str, *arguments: object, **options: Any) -> Any:
     """Return the device that a plug-in's factory opens; it must be closed.
 
     Raises AppError with one line for a plug-in that cannot be loaded, does not take the options,
-    or fails; a `DriverError` of its own passes.
+    or fails, and for a name that two packages use; a `DriverError` of its own passes.
     """
-    entry = plug_ins(group)[name]
-    package = f"plug-in {name} ({entry.dist.name} {entry.dist.version})" if entry.dist else name
+    entry, *others = entry_points(group=group, name=name)
+    if others:
+        packages = " and ".join(_package(one) for one in (entry, *others))
+        raise AppError(f"plug-in {name} is in {packages}: uninstall all but one")
+    package = f"plug-in {name} ({_package(entry)})"
     try:
         factory = entry.load()
     except (ImportError, AttributeError) as fault:
@@ -47,3 +45,7 @@ def open_plug_in(group: str, name: str, *arguments: object, **options: Any) -> A
     except Exception as fault:
         text = " ".join(str(fault).split()) or type(fault).__name__
         raise AppError(f"{package} could not open its device: {text}") from fault
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value

@@ -111,7 +111,11 @@ PROTOCOLS: Mapping[str, type[SerialConfig]] = {
 
 def stage_protocols() -> dict[str, type[StageConfig]]:
     """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
-    return {**dict.fromkeys(plug_ins(STAGES), PluginConfig), "mm": MicroManagerConfig, **PROTOCOLS}
+    return {
+        **dict.fromkeys(sorted(plug_ins(STAGES)), PluginConfig),
+        "mm": MicroManagerConfig,
+        **PROTOCOLS,
+    }
 
 
 def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:
