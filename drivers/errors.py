@@ -494,3 +494,11 @@ class MicroManagerError(DriverError):
         self, what: str, advice: str = "see the adapter's page at micro-manager.org"
     ) -> None:
         super().__init__(what, advice)
+
+
+class GphotoError(DriverError):
+    """libgphoto2, or the camera behind it, said no; `code` is its number."""
+
+    def __init__(self, what: str, code: int, meaning: str, advice: str) -> None:
+        super().__init__(f"libgphoto2 could not {what} ({meaning})", advice)
+        self.code = code

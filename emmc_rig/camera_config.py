@@ -34,6 +34,14 @@ class MicroManagerCamera(Settings):
     properties: dict[str, str | int | float] = Field(default_factory=dict)
 
 
+class GphotoCamera(Settings):
+    """A camera of libgphoto2; see `drivers.gphoto.GphotoCamera`."""
+
+    model: str = ""
+    settings: dict[str, str | int | float] = Field(default_factory=dict)
+    delete: bool = False
+
+
 def parse_camera(spec: str) -> CameraChoice:
     """Return the camera that `KIND:ADDRESS` or the name of a YAML file describes.
 

@@ -35,6 +35,7 @@ from drivers.usb import open_device
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig import plugins
 from emmc_rig.camera_config import CameraChoice, parse_camera
+from emmc_rig.camera_config import GphotoCamera as GphotoCameraConfig
 from emmc_rig.camera_config import MicroManagerCamera as MicroManagerCameraConfig
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, Sensor
@@ -446,6 +447,13 @@ def _open_micromanager(choice: CameraChoice, clock: Clock, backend: Any) -> Came
     return MicroManagerCamera(load_core(choice.address), setup, clock)
 
 
+def _open_gphoto(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    from drivers.gphoto import GphotoCamera
+
+    config = validated(GphotoCameraConfig, choice.options, choice.source, AppError)
+    return GphotoCamera(choice.address, clock=clock, **config.model_dump())
+
+
 def simulated_bus(clock: Clock) -> SimulatedUsb:
     """Return a USB bus, for pyusb, with one simulated still camera."""
     return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
@@ -456,9 +464,13 @@ CAMERAS: dict[str, Callable[[CameraChoice, Clock, Any], CameraDevice]] = {
     "u3v": _open_u3v,
     "folder": _open_folder,
     "simulated": _open_simulated,
+    "gphoto2": _open_gphoto,
     "mm": _open_micromanager,
 }
-CAMERA_KINDS = "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, mm:CONFIG.cfg, folder:DIR, simulated"
+CAMERA_KINDS = (
+    "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, gphoto2:, gphoto2:PORT, mm:CONFIG.cfg, folder:DIR, "
+    "simulated"
+)
 SCENE_SIZE = (240, 320)
 
 

@@ -5,6 +5,7 @@ Listens on this computer only. Source: CIPA DC-005 (PTP over TCP/IP), clauses 2 
 
 from __future__ import annotations
 
+import itertools
 import socket
 import struct
 import threading
@@ -36,6 +37,8 @@ class PtpIpServer:
         self.port: int = self._listener.getsockname()[1]
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._connections = itertools.count(1)
+        self._open: set[int] = set()
         self._start(self._accept)
 
     def __enter__(self) -> PtpIpServer:
@@ -62,15 +65,20 @@ class PtpIpServer:
         """Greet a connection and serve what it turns out to be."""
         with connection, suppress(ConnectionError):
             connection.settimeout(EVENT_POLL_S)
-            kind, _ = self._receive(connection)
+            kind, payload = self._receive(connection)
             if kind == INIT_COMMAND:
                 name = "EMMC simulated camera\x00".encode("utf-16-le")
-                hello = struct.pack("<I", 1) + GUID + name + struct.pack("<I", VERSION)
-                _send(connection, INIT_COMMAND_ACK, hello)
-                self._answer_requests(connection)
-            elif kind == INIT_EVENT:
+                number = next(self._connections)
+                hello = struct.pack("<I", number) + GUID + name + struct.pack("<I", VERSION)
+                self._open.add(number)
+                try:
+                    _send(connection, INIT_COMMAND_ACK, hello)
+                    self._answer_requests(connection)
+                finally:
+                    self._open.discard(number)
+            elif kind == INIT_EVENT and len(payload) == 4:
                 _send(connection, INIT_EVENT_ACK)
-                self._send_events(connection)
+                self._send_events(connection, struct.unpack("<I", payload)[0])
             else:
                 _send(connection, INIT_FAIL, struct.pack("<I", 1))
 
@@ -109,8 +117,9 @@ class PtpIpServer:
         parameters = struct.pack(f"<{len(answer.parameters)}I", *answer.parameters)
         _send(connection, RESPONSE, struct.pack("<HI", answer.code, transaction) + parameters)
 
-    def _send_events(self, connection: socket.socket) -> None:
-        while not self._ended.is_set():
+    def _send_events(self, connection: socket.socket, number: int) -> None:
+        """Send events as long as the command connection of that number lasts: no later one's."""
+        while number in self._open and not self._ended.is_set():
             event = self._camera.wait_event(EVENT_POLL_S)
             if event is None:
                 self._ended.wait(EVENT_POLL_S)
