@@ -3,6 +3,9 @@
 `pytest -m hardware --camera ptp:` runs it against a real one, as `emmc-rig devices conform` does.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -17,6 +20,7 @@ from emmc_rig.conformance.cameras import *  # noqa: F403
 from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from simulators.ptp_canon import EosCameraSimulator
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 
@@ -33,9 +37,9 @@ def raw_file_camera(folder):
     return RawFileCamera(SimulatedRawCamera(see, clock, CFA), SHAPE, CFA, clock=clock)
 
 
-def ptp_camera(folder):
+def ptp_camera(folder, simulator: Callable[..., PtpCameraSimulator] = PtpCameraSimulator):
     clock = ManualClock()
-    bus = SimulatedUsb(clock, PtpUsbFunction(PtpCameraSimulator(see, clock, CFA)))
+    bus = SimulatedUsb(clock, PtpUsbFunction(simulator(see, clock, CFA)))
     device = open_device(PTP_INTERFACE, backend=bus)
     return PtpCamera(PtpSession(PtpUsb(device, clock), clock))
 
@@ -55,6 +59,8 @@ def u3v_camera(folder):
 CAMERAS = {
     "raw file": raw_file_camera,
     "ptp": ptp_camera,
+    "eos": partial(ptp_camera, simulator=EosCameraSimulator),
+    "old eos": partial(ptp_camera, simulator=partial(EosCameraSimulator, old=True)),
     "folder": folder_camera,
     "u3v": u3v_camera,
 }
