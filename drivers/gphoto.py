@@ -51,9 +51,9 @@ class GphotoCamera:
 
     address: a port such as `usb:001,007` or `ptpip:192.168.1.5`; "" takes the first camera found.
     model: libgphoto2's name of it; "" where libgphoto2 finds that out. settings: by libgphoto2's
-    names, set at the start. delete: each picture from the card once it has arrived, with what the
-    camera stored beside it under the same name. The size of a frame is known from the first one,
-    which asking for it takes. Raises `GphotoError`, `CameraSettingError`.
+    names, set at the start. delete: each RAW file from the card once it has arrived; a JPEG beside
+    it stays. The size of a frame is known from the first one, which asking for it takes. Raises
+    `GphotoError`, `CameraSettingError`.
     """
 
     def __init__(
@@ -219,11 +219,7 @@ class GphotoCamera:
         file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
         data = bytes(file.get_data_and_size())
         if self._delete:
-            stem = PurePosixPath(path.name).stem
-            listed = camera.folder_list_files(path.folder)
-            for name in [listed.get_name(i) for i in range(listed.count())]:
-                if PurePosixPath(name).stem == stem:
-                    camera.file_delete(path.folder, name)
+            camera.file_delete(path.folder, path.name)
         return path.name, data
 
     def _forget_events(self) -> None:

@@ -21,36 +21,51 @@ from drivers.errors import (
     RawFrameError,
 )
 from drivers.gphoto import GphotoCamera, seconds_of
+from drivers.ptp_canon import EosOperation
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
 from emmc_rig.hardware import open_camera
+from simulators.clock import ManualClock
+from simulators.ptp import PtpUsbFunction
+from simulators.ptp_canon import EosCameraSimulator
+from simulators.usb import SimulatedUsb
 
 SERVER = """
 import json, sys
 import numpy as np
 from drivers.clock import SystemClock
 from simulators.ptp import PtpCameraSimulator
+from simulators.ptp_canon import EosCameraSimulator
 from simulators.ptpip import PtpIpServer
 
 mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 told = json.loads(sys.argv[1])
-camera = PtpCameraSimulator(
-    lambda exposure_s: mosaic, SystemClock(), "grbg", quality=told["quality"]
-)
+make = EosCameraSimulator if told["eos"] else PtpCameraSimulator
+settings = {"old": True} if told["eos"] == "old" else {}
+camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=told["quality"], **settings)
+asked, respond = [], camera.respond
+
+def noted(request, data):
+    asked.append([request.code, list(request.parameters), data.hex()])
+    return respond(request, data)
+
+camera.respond = noted
 for fault in told["faults"]:
     camera.faults.inject(fault)
 with PtpIpServer(camera) as server:
     print(server.port, flush=True)
     sys.stdin.read()
-    print(sum(bool(data) for _, data in camera.objects.values()))
+    print(json.dumps([sum(bool(data) for _, data in camera.objects.values()), asked]))
 """
 MOSAIC = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 
 
 @contextmanager
-def served(quality="raw", faults=()):
-    """A simulated camera on a port; yields libgphoto2's name of it, and a list of files left."""
-    told = json.dumps({"quality": quality, "faults": faults})
+def served(quality="raw", faults=(), eos=""):
+    """A simulated camera on a port; yields libgphoto2's name of it, and a list of what is known
+    of it when it ended: the number of files left on its card, and all that it was asked.
+    """
+    told = json.dumps({"quality": quality, "faults": faults, "eos": eos})
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, told],
         stdin=subprocess.PIPE,
@@ -59,13 +74,13 @@ def served(quality="raw", faults=()):
     )
     assert process.stdin is not None
     assert process.stdout is not None
-    left = []
+    known = []
     try:
         port = process.stdout.readline().strip()
-        yield f"ptpip:127.0.0.1:{port}:{port}", left
+        yield f"ptpip:127.0.0.1:{port}:{port}", known
     finally:
         out, _ = process.communicate("", timeout=20)
-        left.append(int(out))
+        known.extend(json.loads(out))
 
 
 @pytest.fixture(scope="module")
@@ -117,11 +132,52 @@ def test_settings_are_set_by_libgphoto2s_names_and_all_are_listed(address):
         GphotoCamera(address, settings={"no_such": 1})
 
 
-def test_of_raw_with_jpeg_the_raw_file_is_taken_and_both_are_deleted():
-    with served("raw+jpeg") as (name, left), closing(GphotoCamera(name, delete=True)) as camera:
+def test_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
+    with served("raw+jpeg") as (name, known), closing(GphotoCamera(name, delete=True)) as camera:
         for _ in range(2):
             np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
-    assert left == [0]
+    assert known[0] == 2
+
+
+EOS_CONTROLS = {*EosOperation} - {
+    EosOperation.SET_REMOTE_MODE,
+    EosOperation.SET_EVENT_MODE,
+    EosOperation.GET_EVENT,
+}
+
+
+@pytest.mark.parametrize("age", ["new", "old"])
+def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_makes(age):
+    card = {"capturetarget": "Memory card"}
+    with served(eos=age) as (name, known):
+        for _ in range(2):
+            with closing(GphotoCamera(name, settings=card)) as camera:
+                take(camera)
+    theirs = [one for one in known[1] if one[0] in EOS_CONTROLS and "1cd1" not in one[2]]
+    ours = []
+    clock = ManualClock()
+    body = EosCameraSimulator(lambda exposure_s: MOSAIC, clock, "grbg", old=age == "old")
+    respond = body.respond
+
+    def noted(request, data):
+        ours.append([request.code, list(request.parameters), data.hex()])
+        return respond(request, data)
+
+    body.respond = noted
+    bus = SimulatedUsb(clock, PtpUsbFunction(body))
+    for _ in range(2):
+        with closing(open_camera("ptp:", clock, bus)) as camera:
+            take(camera)
+    assert theirs == [one for one in ours if one[0] in EOS_CONTROLS]
+
+
+def take(camera):
+    """Set what has exactly one code, and expose."""
+    camera.set_exposure_s(0.5)
+    camera.set_gain(4.0)
+    frame = camera.snap()
+    assert frame.mosaic.shape == (40, 48)
+    assert camera.exposure_s == pytest.approx(0.5)
 
 
 def test_a_camera_set_to_jpeg_is_told_so():
@@ -134,11 +190,11 @@ def test_a_camera_set_to_jpeg_is_told_so():
 
 
 def test_a_torn_file_is_no_frame_and_the_next_one_is():
-    with served(faults=["torn_raw"]) as (name, left), closing(GphotoCamera(name)) as camera:
+    with served(faults=["torn_raw"]) as (name, known), closing(GphotoCamera(name)) as camera:
         with pytest.raises(RawFrameError, match="torn"):
             camera.snap()
         np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
-    assert left == [2]
+    assert known[0] == 2
 
 
 def test_no_camera_is_one_line_with_a_remedy():
