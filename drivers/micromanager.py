@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.dng import encode_dng
+from drivers.dng import frame_of_array
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
@@ -29,7 +29,7 @@ from drivers.errors import (
     SpeedFixedError,
 )
 from drivers.plain_dng import SMALLEST_SIDE_PX
-from drivers.raw import RawFrame, decode_raw
+from drivers.raw import RawFrame
 from drivers.stage import (
     DEFAULT_SETTINGS,
     HostStage,
@@ -392,26 +392,15 @@ class MicroManagerCamera:
         mosaic = np.asarray(image, dtype=np.uint16)
         if mosaic.shape != self.shape:
             raise FrameLostError(f"it has {mosaic.shape} pixels instead of {self.shape}")
-        exposure_s = self.exposure_s
-        original = encode_dng(
+        return frame_of_array(
             mosaic,
             self.cfa,
             self._form.black_level_dn,
             self.white_level_dn,
-            exposure_s,
+            self.exposure_s,
             self.identity,
-        )
-        frame = decode_raw(original, self.shape)
-        return RawFrame(
-            mosaic=frame.mosaic,
-            black_level_dn=frame.black_level_dn,
-            white_level_dn=self.white_level_dn,
-            cfa=self.cfa,
-            exposure_s=exposure_s,
-            original=original,
-            sha256=frame.sha256,
-            host_time_s=self._clock.now_s(),
-            metadata={**frame.metadata, **metadata},
+            self._clock.now_s(),
+            metadata,
         )
 
 
