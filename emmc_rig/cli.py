@@ -15,13 +15,12 @@ from rich.table import Column, Table
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig import __version__
-from emmc_rig.calibrate.cli import calibrate
-from emmc_rig.capture.cli import CaptureStoppedError, capture
-from emmc_rig.devices import app as devices
-from emmc_rig.errors import AppError
-from emmc_rig.live.cli import live
-from emmc_rig.model.errors import ModelError
-from emmc_rig.options import (
+from emmc_rig.commands.bars import console, shown_bars
+from emmc_rig.commands.calibrate import calibrate
+from emmc_rig.commands.capture import CaptureStoppedError, capture
+from emmc_rig.commands.devices import app as devices
+from emmc_rig.commands.live import live
+from emmc_rig.commands.options import (
     CameraOption,
     DictionaryOption,
     MethodOption,
@@ -33,8 +32,9 @@ from emmc_rig.options import (
     ShotsOption,
     SizeOption,
 )
-from emmc_rig.progress import console, shown_bars
-from emmc_rig.session.cli import app as session
+from emmc_rig.commands.session import app as session
+from emmc_rig.errors import AppError
+from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
 
 if TYPE_CHECKING:
@@ -67,14 +67,14 @@ def _shown(value: object) -> str:
 def _size(
     text: str | None, option: str = "--size", example: str = "192x256"
 ) -> tuple[int, int] | None:
-    from emmc_rig.output import parse_size
+    from emmc_rig.files.results import parse_size
 
     return parse_size(text, option, example)
 
 
 def _camera(spec: str, shots: int | None) -> Camera:
     """Return a camera by name or file, with as many shots as asked for."""
-    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.files.cameras import find_camera
 
     camera = find_camera(spec)
     return camera if shots is None else camera.with_shots(shots)
@@ -108,9 +108,9 @@ def demo(
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
-    from emmc_rig.demo import DemoSettings, run_demo
+    from emmc_rig.commands.demo import DemoSettings, run_demo
+    from emmc_rig.files.results import result_folder
     from emmc_rig.model.settings import validated
-    from emmc_rig.output import result_folder
     from reconstruction.methods import MethodSettings
 
     described = _camera(camera, shots)
@@ -151,13 +151,13 @@ def cameras(
     ] = None,
 ) -> None:
     """List the cameras known, or draw one: masks, weights, sampling, condition."""
-    from emmc_rig.camera_sheet import (
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.pages.camera_sheet import (
         camera_figures,
         camera_rows,
         draw_camera,
-        find_camera,
     )
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
 
     if name is None:
         table = Table("camera", "sensor", "shots", "masks", "sampling", "light", box=SIMPLE)
@@ -200,8 +200,8 @@ def simulate(
     out: OutOption = Path("emmc-frames"),
 ) -> None:
     """Make frames of a light field through any camera, without a rig."""
-    from emmc_rig.output import result_folder
-    from emmc_rig.simulate import simulate as run
+    from emmc_rig.capture.simulate import simulate as run
+    from emmc_rig.files.results import result_folder
 
     described = _camera(camera, shots)
     with result_folder(out) as folder:
@@ -252,9 +252,10 @@ def reconstruct(
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.output import result_folder
+    from emmc_rig.files.results import result_folder
     from emmc_rig.reconstruct import advice_for, load_settings, run_in_tiles, run_reconstruct
-    from reconstruction.methods import COSTS, METHODS
+    from reconstruction.method import COSTS
+    from reconstruction.methods import METHODS
 
     if list_methods:
         for known in METHODS.values():
@@ -394,8 +395,8 @@ def chart(
             place, targets = out or Path("emmc-next-shot"), sorted(until or [30.0])
             _chart_next_shot(scene or list(SCENES), through, cut, targets, seed, place)
         return
-    from emmc_rig.chart.command import chart_settings, run_chart, shown_charts
-    from emmc_rig.chart.run import ChartStopped
+    from emmc_rig.study.chart.command import chart_settings, run_chart, shown_charts
+    from emmc_rig.study.chart.run import ChartStopped
 
     place = out or Path("emmc-chart")
     settings = chart_settings(
@@ -456,8 +457,8 @@ def train(
     ] = False,
 ) -> None:
     """Train a dictionary of light-field patches; Ctrl-C leaves a checkpoint for --resume."""
-    from emmc_rig.train import InterruptedTrainingError, picture_path, train_settings
-    from emmc_rig.train import train as run
+    from emmc_rig.commands.train import InterruptedTrainingError, picture_path, train_settings
+    from emmc_rig.commands.train import train as run
 
     size, grid = _size(patch, "--patch", "9x9"), _size(views, "--views", "5x5")
     assert size is not None
@@ -502,9 +503,9 @@ def tables(
     out: OutOption = Path("emmc-tables"),
 ) -> None:
     """Reproduce the paper's tables and figures; run it again to go on where it stopped."""
-    from emmc_rig.tables.command import run_tables
-    from emmc_rig.tables.console import shown
-    from emmc_rig.tables.run import FAST, TablesSettings, TablesStopped
+    from emmc_rig.study.tables.command import run_tables
+    from emmc_rig.study.tables.console import shown
+    from emmc_rig.study.tables.run import FAST, TablesSettings, TablesStopped
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     try:
@@ -561,12 +562,12 @@ def stability(
     out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
-    from emmc_rig.stability.beside import measure_beside
-    from emmc_rig.stability.command import run_stability
-    from emmc_rig.stability.faults import FAULTS
-    from emmc_rig.stability.plan import CAMERA, planned, stability_settings
-    from emmc_rig.stability.rows import breaking_rows
-    from emmc_rig.stability.run import StabilityStopped
+    from emmc_rig.study.stability.beside import measure_beside
+    from emmc_rig.study.stability.command import run_stability
+    from emmc_rig.study.stability.faults import FAULTS
+    from emmc_rig.study.stability.plan import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.rows import breaking_rows
+    from emmc_rig.study.stability.run import StabilityStopped
 
     if faults:
         table = Table(
@@ -620,7 +621,13 @@ def _stability_verdicts(
     seed: int,
     out: Path,
 ) -> None:
-    from emmc_rig.stability.detector import detector_settings, run_detector, tables, told, wrong
+    from emmc_rig.study.stability.detector import (
+        detector_settings,
+        run_detector,
+        tables,
+        told,
+        wrong,
+    )
 
     settings = detector_settings(
         fast, scenes or [], camera, faults or [], methods or [], size, seed
@@ -650,9 +657,9 @@ def _stability_verdicts(
 
 
 def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:
-    from emmc_rig.ablation import ablations
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.ablation import ablations
 
     table = Table("adaptive", "dB", "s", "buys dB", "costs s")
     rows = []
@@ -674,10 +681,10 @@ def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, o
 def _chart_next_shot(
     scenes: list[str], camera: str, size: tuple[int, int], until: list[float], seed: int, out: Path
 ) -> None:
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.journal import open_folder
-    from emmc_rig.next_shot import ROWS, next_shots, savings, total_savings
-    from emmc_rig.output import command_line, versions, write_metrics
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.study.next_shot import ROWS, next_shots, savings, total_savings
+    from emmc_rig.study.points import open_folder
 
     described = find_camera(camera)
     folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
@@ -712,9 +719,9 @@ def _chart_next_shot(
 
 
 def _chart_kernels(camera: str, size: str | None, repeats: int, out: Path) -> None:
-    from emmc_rig.benchmarks.kernels import kernel_timings, reconstruction_memory
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.benchmarks.kernels import kernel_timings, reconstruction_memory
 
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
@@ -746,9 +753,9 @@ def _chart_kernels(camera: str, size: str | None, repeats: int, out: Path) -> No
 
 
 def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None:
-    from emmc_rig.benchmarks.variational import variational_timings
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.benchmarks.variational import variational_timings
 
     described, shape = find_camera(camera), _size(size)
     assert shape is not None
@@ -764,10 +771,10 @@ def _chart_peers(camera: str, size: str | None, repeats: int, out: Path) -> None
 
 
 def _chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
-    from emmc_rig.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
-    from emmc_rig.camera_sheet import find_camera
-    from emmc_rig.output import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
     from emmc_rig.reconstruct import open_dictionary
+    from emmc_rig.study.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
 
     described = find_camera(camera)
     atoms = open_dictionary(dictionary, described.views, described.sensor.binning)

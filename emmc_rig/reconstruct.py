@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.chart.recommend import (
+from emmc_rig.advice.recommend import (
     Advice,
     Problem,
     advised,
@@ -24,8 +24,10 @@ from emmc_rig.chart.recommend import (
     parse_wanted,
     read_rows,
 )
-from emmc_rig.chart.reference import reference
+from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import (
     export_pictures,
     focus_disparities,
@@ -36,13 +38,11 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import read_yaml, validated
-from emmc_rig.output import command_line, versions, write_metrics
-from emmc_rig.scene import open_scene
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary
 from reconstruction.methods import MethodSettings, find_method
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import Verdict
@@ -239,7 +239,7 @@ def _judged_middle(
     )
     seen = np.s_[:, rows.start // k : rows.stop // k, columns.start // k : columns.stop // k]
     found = np.asarray(dataset[:, :, rows, columns])
-    result = Reconstruction(method, found, "in tiles", "", 0, (), 0.0, {})
+    result = Reconstruction(method, found, Status.IN_TILES, "", 0, (), 0.0, {})
     screening = (settings or MethodSettings()).screening
     return verdict_of(
         psi.window(rows, columns),
@@ -292,7 +292,7 @@ def run_in_tiles(
         verdict = _judged_middle(method, psi, capture, kept, dataset, settings)
     metrics = {
         "method": method,
-        "status": "in tiles",
+        "status": Status.IN_TILES,
         "advice": "",
         "verdict": verdict.as_dict(),
         "tiles": len(results),

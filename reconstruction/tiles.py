@@ -24,7 +24,8 @@ from emmc_rig.model.sensing import FORMAT, ImagingMatrix
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, patched_weights, reconstruct
+from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.methods.tv_dict import patched_weights
 from reconstruction.result import Reconstruction
 
 OVERLAP = 48

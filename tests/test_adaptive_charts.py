@@ -2,12 +2,12 @@
 
 import pytest
 
-from emmc_rig import ablation, next_shot
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.capture.plan import planned_camera
 from emmc_rig.capture.until import refuse_without_choice
-from emmc_rig.journal import open_folder
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.session.session import Session
+from emmc_rig.study import ablation, next_shot
+from emmc_rig.study.points import open_folder
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 

@@ -33,9 +33,9 @@ from emmc_rig.capture.retries import GaveUpError, Mending, mending
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import simulated_rig
-from emmc_rig.registration import registered
-from emmc_rig.scene import fine_scene
+from emmc_rig.files.scenes import fine_scene
+from emmc_rig.rig.hardware import simulated_rig
+from emmc_rig.rig.registration import registered
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify

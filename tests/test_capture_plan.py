@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.capture.estimate import estimate
 from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
@@ -22,8 +21,9 @@ from emmc_rig.capture.plan import (
     schema_text,
 )
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.results import shown_bytes, shown_seconds
 from emmc_rig.model.camera import shipped_cameras
-from emmc_rig.output import shown_bytes, shown_seconds
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 WINDOW_UM = 40_000.0

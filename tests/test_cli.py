@@ -232,7 +232,7 @@ def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
 
 
 def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
-    from emmc_rig import demo
+    from emmc_rig.commands import demo
 
     for stage in (
         "fine_scene",
@@ -254,7 +254,7 @@ def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
-    from emmc_rig import demo
+    from emmc_rig.commands import demo
 
     def full(*arguments, **settings):
         raise OSError(28, "No space left on device")

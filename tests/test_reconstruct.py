@@ -6,8 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.capture.simulate import simulate
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.reconstruct import (
     load_settings,
@@ -16,7 +17,6 @@ from emmc_rig.reconstruct import (
     run_in_tiles,
     run_reconstruct,
 )
-from emmc_rig.simulate import simulate
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.dictionary import Dictionary

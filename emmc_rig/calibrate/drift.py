@@ -18,9 +18,9 @@ from calibration.parametric import psi_at, shot_stages
 from calibration.placement import SCALARS, Placement
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.reconstruct import FRAMES, read_capture
 
 PSI, CALIBRATION = "psi.h5", "calibration.h5"

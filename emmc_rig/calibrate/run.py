@@ -33,7 +33,6 @@ from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
 from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
 from emmc_rig.calibrate.drift import CALIBRATION, PSI
-from emmc_rig.calibrate.report import write_calibration_report
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Boards,
@@ -42,11 +41,12 @@ from emmc_rig.capture.plan import (
     Plan,
     PlannedShot,
 )
-from emmc_rig.demo import Silent, Watcher
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, versions, write_metrics
+from emmc_rig.pages.calibration_page import write_calibration_report
+from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
 from emmc_rig.session.session import Session
 

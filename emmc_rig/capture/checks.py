@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.capture.plan import Checks
-from emmc_rig.frame_view import thinned
+from emmc_rig.pages.frame_view import thinned
 from emmc_rig.session.planned import PlannedFrame
 
 BRIGHT_PERCENTILE = 99.9

@@ -28,12 +28,12 @@ from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Watcher
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
+from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
-from emmc_rig.output import command_line, shown_bytes, versions
-from emmc_rig.rig_config import Ask, opened_rig
+from emmc_rig.rig.hardware import Rig
+from emmc_rig.rig.rig_config import Ask, opened_rig
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
@@ -51,7 +51,7 @@ DISK_RESERVE_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Wish:
-    """What to capture and where to; rig: see `emmc_rig.rig_config`, None on resuming alike.
+    """What to capture and where to; rig: see `emmc_rig.rig.rig_config`, None on resuming alike.
 
     until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
     """

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, Shot
 from emmc_rig.model.settings import Settings, read_yaml, validated
 

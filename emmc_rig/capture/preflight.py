@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from drivers.camera import Limits
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
+from emmc_rig.rig.hardware import Rig
 from emmc_rig.session.planned import PlannedFrame
 
 ROUNDING = 1e-9
