@@ -12,12 +12,12 @@ from emmc_rig.study.points import open_folder
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
 
-def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(tmp_path, monkeypatch):
+def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch):
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
     camera = find_camera(CAMERA)
-    rows = list(ablation.ablations("deep-occlusions", CAMERA, camera, SIZE, 0, tmp_path))
+    rows = list(ablation.ablations("deep-occlusions", camera, SIZE, 0))
     assert [row.name for row in rows] == [
         "adaptive",
         "without sharpening",

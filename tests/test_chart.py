@@ -10,8 +10,8 @@ import pytest
 from emmc_rig.advice import recommend
 from emmc_rig.advice.recommend import Problem, Row, advised, parse_budget, parse_wanted, read_rows
 from emmc_rig.errors import AppError
+from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.lightfield import replicate_centre
-from emmc_rig.study.benchmarks.memory import peak_memory_mib
 from emmc_rig.study.chart.advice_rows import advice_rows
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
 from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
@@ -170,7 +170,7 @@ def test_a_child_keeps_the_lock_when_its_parent_is_gone(tmp_path):
 
 def test_the_peak_of_memory_is_not_the_parents():
     held = np.ones(200 * 2**17)
-    code = "from emmc_rig.study.benchmarks.memory import peak_memory_mib; print(peak_memory_mib())"
+    code = "from emmc_rig.files.memory import peak_memory_mib; print(peak_memory_mib())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 0 < float(told.stdout) < 150 < peak_memory_mib()
     assert held.nbytes == 200 * 2**20

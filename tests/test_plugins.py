@@ -111,7 +111,7 @@ def test_a_plug_in_that_does_not_work_is_one_line(installed, name, message):
 
 
 def test_a_plug_in_replaces_no_protocol_of_ours_and_two_of_one_name_are_refused(installed):
-    with pytest.raises(AppError, match="one of absent, example, example-simulated, fails, liar"):
+    with pytest.raises(AppError, match="apt, mm, absent, example, example-simulated, fails, liar"):
         open_stage("zaber:")
     put_metadata(installed, "other", {"emmc_rig.stages": {"example": "broken:liar"}})
     with pytest.raises(AppError, match=r"other 1.0.*uninstall all but one"):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.capture.simulate import simulate
 from emmc_rig.cli import app
+from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
@@ -310,7 +310,7 @@ def folders(tmp_path_factory):
     for name in ("right", "wrong"):
         folder = tmp_path_factory.mktemp(name)
         camera = find_camera("rgbw-bayer-2shots")
-        simulate("non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0, folder)
+        simulate_into(folder, "non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0)
         if name == "wrong":
             psi = ImagingMatrix.load(folder / "psi.h5")
             dataclasses.replace(psi, weights=np.roll(psi.weights, 6, axis=(3, 5))).save(

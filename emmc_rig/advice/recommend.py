@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import parse_psnr
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.methods import METHODS, MethodSettings
 
 ADVICE, SHIPPED = "recommended.json", "recommended.json"
@@ -130,6 +132,22 @@ def parse_budget(text: str) -> float:
 def parse_wanted(text: str) -> float:
     """Return the dB of "28dB" or "28"; raise AppError for anything else."""
     return parse_psnr(text, "--want")
+
+
+def advice_for(
+    psi: ImagingMatrix, budget: str | None, want: str | None, chart: Path | None
+) -> Advice:
+    """Return the method to take for frames of this Psi, by a chart and this machine's yardstick.
+
+    budget, want: as typed, such as "30s" and "28dB". chart: the folder of one; None takes the
+    shipped one. Raises AppError for what cannot be read.
+    """
+    budget_s = None if budget is None else parse_budget(budget)
+    wanted_db = None if want is None else parse_wanted(want)
+    rows = read_rows(chart)
+    values = int(np.prod(psi.light_field_shape))
+    problem = Problem(values, psi.shots, psi.colour is not None)
+    return advised(rows, problem, reference().seconds, budget_s, wanted_db)
 
 
 def advised(

@@ -18,12 +18,12 @@ from calibration.parametric import psi_at, shot_stages
 from calibration.placement import SCALARS, Placement
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
+from emmc_rig.files.frames import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruct import FRAMES, read_capture
 
-PSI, CALIBRATION = "psi.h5", "calibration.h5"
+CALIBRATION = "calibration.h5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def run_drift(
     The mended Psi is written even where nothing has drifted: it is then the calibration's own.
     """
     known = read_calibration(known_folder)
-    capture = read_capture(frames_folder)
+    capture = read_frames(frames_folder)
     if capture.readings.shape != known.psi.frames_shape:
         raise AppError(
             f"{frames_folder / FRAMES}: {capture.readings.shape[0]} frames of "

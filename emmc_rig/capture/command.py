@@ -26,18 +26,20 @@ from emmc_rig.capture.plan import (
 )
 from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import Watcher
-from emmc_rig.errors import AppError
+from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
+from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
 from emmc_rig.rig.hardware import Rig
-from emmc_rig.rig.rig_config import Ask, opened_rig
+from emmc_rig.rig.rig_config import Ask, RigChoice, opened_rig
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
+    REPORT,
     Frozen,
     Session,
     is_session,
@@ -241,6 +243,89 @@ def run_capture(
                 session.note("until", target_db=wish.until_db, wall=wall_time())
             choose = None if session.target_db is None else Until(session, watcher)
             return session, Sequencer(session, wish.plan, rig, watcher, control, choose).run()
+
+
+def asked_for(
+    plan: Path, rig: Mapping[str, Any] | None, out: Path | None, until_db: float | None
+) -> Wish:
+    """Return what a plan file asks for, or what a session was begun for; raises AppError.
+
+    rig: see `rig_description`; a session has its own.
+    """
+    if is_session(plan):
+        return wish_from_session(plan, rig, until_db)
+    if rig is None:
+        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+    return wish_from_plan(plan, out, rig, until_db)
+
+
+def capture_session(
+    wish: Wish,
+    watcher: Watcher,
+    ask: Ask,
+    agreed: Callable[[Estimate], bool] = lambda expected: True,
+    control: Control | None = None,
+) -> tuple[Session, Outcome] | None:
+    """Capture what is missing of a wish, and write the session's report; see `run_capture`.
+
+    None where `agreed` says no. Raises StoppedError when somebody stopped it: what was
+    captured is kept, and the same call goes on.
+    """
+    go_on = f"go on with: emmc-rig capture {wish.out}"
+    try:
+        captured = run_capture(wish, watcher, ask, agreed, control)
+    except KeyboardInterrupt as stop:
+        begun = is_session(wish.out)
+        kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
+        raise StoppedError(f"stopped at once; {kept}") from stop
+    if captured is None:
+        return None
+    session, outcome = captured
+    try:
+        write_sheet(session, session.folder / REPORT, quick_pictures(session))
+    except AppError as fault:
+        watcher.tell(f"no report: {fault}")
+    if not outcome.complete:
+        raise StoppedError(
+            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
+            f"{go_on}"
+        )
+    return captured
+
+
+def ask_at_prompt(what: str) -> None:
+    """Ask a person to do something at the bench, and wait until Enter is pressed."""
+    input(f"please {what}, then press Enter ")
+
+
+def capture(
+    plan: str | Path,
+    rig: RigChoice | None = None,
+    *,
+    out: str | Path | None = None,
+    until_db: float | None = None,
+    watcher: Watcher | None = None,
+    ask: Ask = ask_at_prompt,
+) -> Session:
+    """Run a plan on a rig and return its session; run again, it goes on where it stopped.
+
+    Args:
+        plan: a plan (YAML), or the folder of a session to go on with.
+        rig: what `emmc_rig.rig` returns; a session has its own.
+        out: folder of the session (default: PLAN-session beside the plan).
+        until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
+        watcher: is told what is captured.
+        ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
+
+    Raises:
+        AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
+        DriverError: what a device says.
+    """
+    description = None if rig is None else rig.description
+    wish = asked_for(Path(plan), description, None if out is None else Path(out), until_db)
+    captured = capture_session(wish, watcher or Unwatched(), ask)
+    assert captured is not None  # nobody is asked whether to agree
+    return captured[0]
 
 
 def write_new(path: Path, text: str) -> None:

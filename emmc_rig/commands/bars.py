@@ -17,6 +17,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from emmc_rig.errors import StoppedError
+
 if TYPE_CHECKING:
     from reconstruction.result import Progress as SolverProgress
 
@@ -60,7 +62,10 @@ class Bars:
 
 @contextmanager
 def shown_bars() -> Iterator[Bars]:
-    """Yield bars, drawn until the block ends; the last one is filled if it ends well."""
+    """Yield bars, drawn until the block ends; the last one is filled if it ends well.
+
+    A KeyboardInterrupt that says what is kept becomes a StoppedError.
+    """
     with Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -72,5 +77,10 @@ def shown_bars() -> Iterator[Bars]:
         disable=not console.is_terminal,
     ) as progress:
         bars = Bars(progress)
-        yield bars
+        try:
+            yield bars
+        except KeyboardInterrupt as stop:
+            if str(stop):
+                raise StoppedError(str(stop)) from stop
+            raise
         bars.finish()

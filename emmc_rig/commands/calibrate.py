@@ -6,10 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from emmc_rig.commands.bars import shown_bars
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
@@ -63,6 +60,7 @@ def calibrate(
     """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
     from emmc_rig.calibrate.bench import BenchTruth
     from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
+    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.results import parse_size, result_folder
 
@@ -89,6 +87,9 @@ def calibrate(
         map_stage=stage,
     )
     if check is not None:
+        from rich.console import Console
+        from rich.table import Table
+
         from emmc_rig.study.checks.command import run_checks
 
         with result_folder(out) as folder:
@@ -124,13 +125,15 @@ def calibrate(
 
 
 def _calibrate_session(path: Path, route: str, out: Path) -> None:
-    from emmc_rig.calibrate.run import calibrate_session
+    import emmc_rig as emmc
+    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.results import result_folder
-    from emmc_rig.session.session import Session
 
-    captured = Session(path)
+    captured = emmc.Session(path)
     with result_folder(out) as folder, shown_bars() as bars:
-        metrics = calibrate_session(captured, folder, route, bars)
+        calibration = emmc.calibrate(captured, route, watcher=bars)
+        calibration.write(folder)
+    metrics = calibration.metrics
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
     typer.echo(

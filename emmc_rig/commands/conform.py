@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from emmc_rig.errors import AppError
-from emmc_rig.model.settings import read_yaml
 
 SUITES = {"stage": "stages.py", "camera": "cameras.py"}
 
@@ -55,6 +54,7 @@ def conform(
 
 def _suites(device: str) -> list[str]:
     """Return which suites a name asks for; raises AppError for one that names nothing."""
+    from emmc_rig.model.settings import read_yaml
     from emmc_rig.rig.hardware import camera_kinds
     from emmc_rig.rig.stage_config import stage_protocols
 

@@ -7,9 +7,8 @@ import json
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import cv2
 import typer
 from rich.box import SIMPLE
 from rich.console import Console, Group
@@ -18,19 +17,13 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 from rich.table import Table
 from rich.text import Text
 
-from drivers.camera import Camera
-from drivers.raw import RawFrame
 from emmc_rig.capture.keyboard import pressed_keys
 from emmc_rig.errors import AppError
-from emmc_rig.pages.frame_view import (
-    FrameFigures,
-    frame_figures,
-    histogram,
-    histogram_text,
-    preview,
-)
-from emmc_rig.session.frame_file import frame_facts, suffix_of
-from emmc_rig.session.storage import SYSTEM_DISK, write_whole
+
+if TYPE_CHECKING:
+    from drivers.camera import Camera
+    from drivers.raw import RawFrame
+    from emmc_rig.pages.frame_view import FrameFigures
 
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
@@ -82,6 +75,8 @@ def snap(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
+    from emmc_rig.pages.frame_view import frame_figures
+
     with closing(open_camera(_chosen(camera, rig))) as device:
         folder = frames_folder(out)
         choose(device, exposure, gain)
@@ -106,6 +101,8 @@ def live(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
+    from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text
+
     folder = frames_folder(out) if save_every else None
     console = Console()
     device = open_camera(_chosen(camera, rig))
@@ -196,6 +193,12 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     Beside it a preview (PNG) and the facts (JSON). Every file appears whole or not at all, the
     camera's bytes last; no name comes from the camera. Raises AppError.
     """
+    import cv2
+
+    from emmc_rig.pages.frame_view import preview
+    from emmc_rig.session.frame_file import frame_facts, suffix_of
+    from emmc_rig.session.storage import SYSTEM_DISK, write_whole
+
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
     original = stem.with_suffix(suffix_of(frame))

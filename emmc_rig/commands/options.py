@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+DEFAULT_SCENE = "deep-occlusions"
+DEFAULT_CAMERA = "rgbw-bayer-3shots"
 SceneOption = Annotated[
     str,
     typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),

@@ -19,8 +19,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig import __version__
 from emmc_rig.errors import AppError
+from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy import sparse
 
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
     Footprint,
     cell_weights,
@@ -96,7 +97,7 @@ class Shot(Settings):
 
 
 class Camera(Settings):
-    """A camera.
+    """A camera with coded masks: `camera.psi(size)` models it, `camera.expose(scene)` uses it.
 
     total_exposure_s: divided evenly by the number of shots; a shot may name its own instead.
     footprint_splits: see `_transmittances`; more for two masks of cells as fine as their shadow.
@@ -177,6 +178,53 @@ class Camera(Settings):
             return shot.model_copy(update={"offset_um": offsets})
 
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
+
+    def psi(self, size: tuple[int, int]) -> ImagingMatrix:
+        """Return the imaging matrix for light fields of `size` (rows, columns) samples.
+
+        Raises CameraError, see `build_imaging_matrix`.
+        """
+        return build_imaging_matrix(self, size)
+
+    def expose(
+        self,
+        scene: ArrayLike,
+        seed: int | np.random.Generator = 0,
+        psi: ImagingMatrix | None = None,
+    ) -> SimulatedFrames:
+        """Return the frames of a light field (v, u, y, x, c), with the sensor's noise (eq. 14).
+
+        psi: the camera's, where it is at hand; built otherwise. What the same Psi reconstructs
+        looks better than a measurement would: a rig, simulated or real, has its own geometry.
+        """
+        light_field = np.asarray(scene)
+        psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
+        return self.read_out(psi.forward(light_field), seed)
+
+    def read_out(
+        self, noise_free: NDArray[np.floating], seed: int | np.random.Generator = 0
+    ) -> SimulatedFrames:
+        """Return frames with noise whose readings (shot, pixel_y, pixel_x) without it are given."""
+        noise, k = self.sensor.noise, self.sensor.binning
+        light = pixel_light(self, (noise_free.shape[1] * k, noise_free.shape[2] * k))
+        exposures_s = self.exposures_s()[:, None, None]
+        rng = np.random.default_rng(seed)
+        frames_dn = noise.expose_dn(noise_free, exposures_s, light, rng)
+        readings = noise.normalise(frames_dn, exposures_s, light)
+        deviation = np.sqrt(noise.variance(readings, exposures_s, light))
+        usable = ~noise.saturated(frames_dn) & (light > 0)
+        return SimulatedFrames(readings, deviation, usable, frames_dn, noise_free)
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def __repr__(self) -> str:
+        shots, (v, u) = len(self.shots), self.views
+        masks = f"{len(self.masks)} mask{'s' * (len(self.masks) != 1)}"
+        return (
+            f"Camera({self.title!r}, {shots} shot{'s' * (shots > 1)}, {v}x{u} views, "
+            f"{self.sensor.cfa_name}, {masks})"
+        )
 
     def warnings(self) -> list[str]:
         """Return what the model neglects although it matters for this camera."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from emmc_rig import __version__
+from emmc_rig.version import __version__
 
 CAVEATS = '<aside class="warnings" aria-label="How to read this"><h2>How to read this</h2>'
 KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".webp": "image/webp"}

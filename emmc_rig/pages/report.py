@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig import __version__
 from emmc_rig.model.files import write_text
+from emmc_rig.version import __version__
 
 Array = NDArray[np.floating]
 

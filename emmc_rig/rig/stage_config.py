@@ -111,11 +111,8 @@ PROTOCOLS: Mapping[str, type[SerialConfig]] = {
 
 def stage_protocols() -> dict[str, type[StageConfig]]:
     """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
-    return {
-        **dict.fromkeys(sorted(plug_ins(STAGES)), PluginConfig),
-        "mm": MicroManagerConfig,
-        **PROTOCOLS,
-    }
+    known: dict[str, type[StageConfig]] = {**PROTOCOLS, "mm": MicroManagerConfig}
+    return known | dict.fromkeys(sorted(plug_ins(STAGES) - known.keys()), PluginConfig)
 
 
 def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:

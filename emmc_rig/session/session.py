@@ -86,6 +86,10 @@ class Session:
         except OSError as fault:
             raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
 
+    def __repr__(self) -> str:
+        taken, needed = len(self.stored), len(self.needed)
+        return f"Session({str(self.folder)!r}, {taken} of {needed} frames)"
+
     @classmethod
     def create(
         cls,

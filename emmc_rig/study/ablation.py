@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
-from emmc_rig.capture.simulate import simulate
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruct import PSI, open_dictionary, read_capture
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
@@ -51,28 +48,25 @@ class Ablation:
         return asdict(self)
 
 
-def ablations(
-    scene: str, camera_name: str, camera: Camera, size: tuple[int, int], seed: int, folder: Path
-) -> Iterator[Ablation]:
+def ablations(scene: str, camera: Camera, size: tuple[int, int], seed: int) -> Iterator[Ablation]:
     """Yield the whole method, then the method without each piece, then its rivals.
 
-    The frames are made once, by `simulate` into an existing folder. The whole runs twice, so that
-    compiling is not counted.
+    The frames are exposed once. The whole runs twice, so that compiling is not counted.
     """
-    simulate(scene, camera_name, camera, size, seed, folder)
-    capture, psi = read_capture(folder), ImagingMatrix.load(folder / PSI)
     truth = open_scene(scene, size=size, views=camera.views, seed=seed).light_field
+    psi = camera.psi(size)
+    frames = camera.expose(truth, seed, psi)
     dictionary = open_dictionary(None, camera.views, psi.binning)
 
     def run(method: str, settings: MethodSettings) -> tuple[float, float]:
         result = reconstruct(
             method,
             psi,
-            capture.readings,
-            capture.noise_sigma,
+            frames.readings,
+            frames.noise_sigma,
             dictionary,
             settings,
-            capture.usable,
+            frames.usable,
         )
         return psnr_db(result.light_field, truth), result.seconds
 

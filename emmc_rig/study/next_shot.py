@@ -18,7 +18,6 @@ import numpy as np
 import yaml
 
 from calibration.shadow import shadow_mask
-from emmc_rig import __version__
 from emmc_rig.calibrate.bench import WhiteboardBench
 from emmc_rig.calibrate.run import CalibrateSettings, capture_plan, parametric_plan, plan_light
 from emmc_rig.capture.command import Wish, run_capture
@@ -33,6 +32,7 @@ from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
 from emmc_rig.study.points import Journal, digest_of
+from emmc_rig.version import __version__
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
 

@@ -18,11 +18,11 @@ from numba import get_num_threads, njit, prange
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
-from emmc_rig.study.benchmarks.memory import peak_memory_mib
 from emmc_rig.study.benchmarks.timing import median_s
 from reconstruction import kernels as tv_kernels
 from reconstruction.problem import colour_metric

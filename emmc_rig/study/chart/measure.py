@@ -24,11 +24,11 @@ from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
-from emmc_rig.reconstruct import open_dictionary
-from emmc_rig.study.benchmarks.memory import forget_peak, peak_memory_mib
 from emmc_rig.study.chart.captures import Frames, read_frames, read_truth
 from emmc_rig.study.chart.peers import PEERS, Given
 from emmc_rig.study.chart.scores import scored

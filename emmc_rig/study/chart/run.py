@@ -13,13 +13,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from emmc_rig import __version__
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.captures import Capture, kept_capture
 from emmc_rig.study.chart.lock import timing_lock
 from emmc_rig.study.chart.plan import ChartSettings, Point
 from emmc_rig.study.chart.worker import Worker, working
 from emmc_rig.study.points import Journal, digest_of, kept_when_stopped
+from emmc_rig.version import __version__
 
 POINTS, CAPTURES, PICTURES = "points.jsonl", "captures", "pictures"
 REVISION = 2

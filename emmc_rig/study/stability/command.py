@@ -9,11 +9,11 @@ from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.page import Section, provenance_table
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.chart.run import machine
 from emmc_rig.study.points import kept_when_stopped, open_folder
 from emmc_rig.study.stability.curves import Curve, curves

@@ -19,19 +19,19 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from emmc_rig import __version__
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.points import Journal, digest_of, open_folder
 from emmc_rig.study.stability.faults import FAULTS, MASK, SENSOR, SHOTS, Fault, find_fault, trial
 from emmc_rig.study.stability.trial import NotApplicableError, Trial
+from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, find_method

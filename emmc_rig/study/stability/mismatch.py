@@ -20,16 +20,16 @@ from calibration.errors import CalibrationError
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig import __version__
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.points import Journal, digest_of
 from emmc_rig.study.stability.faults import find_fault, trial
 from emmc_rig.study.stability.trial import NotApplicableError, Trial
+from emmc_rig.version import __version__
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, reconstruct
 

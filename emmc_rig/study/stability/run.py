@@ -14,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig import __version__
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.chart.run import dictionary_identity, machine
 from emmc_rig.study.chart.scores import angular_snr_db
 from emmc_rig.study.points import Journal, digest_of, kept_when_stopped
 from emmc_rig.study.stability.faults import FAULTS, camera_for, trial
 from emmc_rig.study.stability.plan import Point, StabilitySettings
 from emmc_rig.study.stability.trial import NotApplicableError, Setup, Trial
+from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.sparse import SparseSettings

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig import __version__
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import centre_view
@@ -26,6 +25,7 @@ from emmc_rig.study.chart.scores import swept_disparity
 from emmc_rig.study.points import Journal, digest_of
 from emmc_rig.study.stability.faults import FAULTS, Fault, trial
 from emmc_rig.study.stability.trial import NotApplicableError, Trial
+from emmc_rig.version import __version__
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct

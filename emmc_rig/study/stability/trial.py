@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.capture.simulate import exposed_readings
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
@@ -121,6 +120,6 @@ def taken(
         clean = change_clean(clean)
     # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
     clean = np.maximum(clean, 0)
-    shots = exposed_readings(setup.camera, size, clean, np.random.default_rng(setup.seed))
+    shots = setup.camera.read_out(clean, setup.seed)
     usable = shots.usable if unusable is None else shots.usable & ~unusable
     return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from pydantic import Field
 
-from emmc_rig import __version__
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.progress import Watcher
@@ -22,6 +21,7 @@ from emmc_rig.study.tables.library import Array, Cut, Library
 from emmc_rig.study.tables.plan import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.study.tables.scores import scored
 from emmc_rig.study.tables.shots import Sensors, Shots
+from emmc_rig.version import __version__
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
