@@ -4,6 +4,9 @@ Needs the extra `micromanager`, whose mm-test-adapters bring a core's demo devic
 SequenceTester, a camera whose pixels spell out where every device was during the exposure.
 """
 
+import re
+import subprocess
+import sys
 from contextlib import ExitStack, closing
 from itertools import islice
 from typing import Any
@@ -37,6 +40,7 @@ from drivers.micromanager import (
 )
 from drivers.raw import decode_raw
 from drivers.unicore import load_rig
+from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.rig.hardware import open_camera, open_stage, simulated_rig
@@ -77,6 +81,31 @@ def places_in(frame):
     """Where the SequenceTester's devices were while its camera exposed the frame."""
     told = decode_image(frame.mosaic.astype(np.uint8))
     return {(one.device, one.property): one.value for one in told.current_state}
+
+
+@pytest.fixture
+def camera():
+    with closing(demo_camera(bit_depth=12, roi=(0, 0, 64, 48))) as opened:
+        yield opened
+
+
+def test_the_suite_finds_that_the_demo_stage_only_says_that_it_was_homed(tmp_path):
+    file = tmp_path / "stage.yaml"
+    file.write_text(
+        f"{{protocol: mm, port: {DEMO}, axes: {{x: XY.x, y: XY.y}}, speed_property: Velocity,"
+        " speed_unit_um_s: 1000, travel_um: {x: [-9000, 9000], y: [-9000, 9000]}}"
+    )
+    program = "from emmc_rig.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "devices", "conform", str(file), "--as", "stage", "--yes"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    failed = re.findall(r"::(test_\w+) FAILED", done.stdout)
+    assert failed == ["test_homing_finds_the_same_place_again"], done.stdout
+    assert done.stdout.count(" PASSED") == 10
 
 
 def test_a_frame_is_what_the_core_gives_kept_as_a_file_that_decodes_to_it():

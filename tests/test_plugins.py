@@ -124,6 +124,8 @@ def test_the_commands_take_a_plug_in_as_any_other_stage(installed, run):
     code, _, error = run("devices", "conform", "nobody:")
     assert (code, error.count("\n")) == (1, 1)
     assert "nobody:" in error
+    code, _, error = run("devices", "conform", "ptp:", "--as", "stage")
+    assert (code, error) == (1, "emmc-rig: --as stage: ptp: is a camera\n")
 
 
 def conform(installed, *arguments, answer=""):

@@ -18,6 +18,9 @@ def conform(
     device: Annotated[
         str, typer.Argument(metavar="NAME", help="as --stage or --camera take it; or simulated")
     ],
+    only: Annotated[
+        str | None, typer.Option("--as", help="stage or camera, where the name is of both")
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="move the stage without asking")] = False,
 ) -> None:
     """Check that a stage or camera does what every one must do; exit code 1 unless it does.
@@ -30,6 +33,10 @@ def conform(
     import pytest
 
     suites = _suites(device)
+    if only is not None:
+        if only not in suites:
+            raise AppError(f"--as {only}: {device} is a {' or a '.join(suites)}")
+        suites = [only]
     if "stage" in suites and not yes and not device.startswith("simulated"):
         question = (
             f"Every axis of {device} will be homed and moved through the middle of its travel. "

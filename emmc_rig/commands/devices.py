@@ -33,7 +33,8 @@ _told = Console(stderr=True)
 StageOption = Annotated[
     str | None,
     typer.Option(
-        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file that wires names to axes"
+        "--stage",
+        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file that wires names",
     ),
 ]
 RigOption = Annotated[
