@@ -1,6 +1,12 @@
 """Sphinx: the pages of docs/, the reference from docstrings, examples whose pictures it makes."""
 
+from pathlib import Path
+
+import typer
+from typer.cli import get_docs_for_click
+
 import emmc_rig
+from emmc_rig.cli import app as command_line
 
 project = "emmc-rig"
 author = "the developers of emmc-rig"
@@ -35,3 +41,16 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "remove_config_comments": True,
 }
+
+
+def write_commands(_: object) -> None:
+    """Write commands.md: every command with its options, from the command line itself."""
+    command = typer.main.get_command(command_line)
+    context = typer.Context(command, info_name="emmc-rig")
+    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Commands")
+    Path(__file__).with_name("commands.md").write_text(text, encoding="utf-8")
+
+
+def setup(app: object) -> None:
+    """Register what happens before pages are read."""
+    app.connect("builder-inited", write_commands)  # type: ignore[attr-defined]

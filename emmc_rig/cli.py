@@ -20,7 +20,7 @@ from emmc_rig.commands.simulate import simulate
 from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
 from emmc_rig.commands.train import train
-from emmc_rig.errors import ERRORS, StoppedError
+from emmc_rig.errors import ERRORS, StoppedError, WrongUsageError
 from emmc_rig.version import __version__
 
 INTERRUPTED = 130
@@ -63,6 +63,8 @@ def main() -> None:
         _fail("stopped by Ctrl-C; nothing was written", INTERRUPTED)
     except StoppedError as stop:
         _fail(str(stop), INTERRUPTED)
+    except WrongUsageError as fault:
+        _fail(str(fault), 2)
     except ERRORS as fault:
         _fail(str(fault), 1)
     except MemoryError:
@@ -73,7 +75,7 @@ def main() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    from emmc_rig.commands.bars import console
+    from emmc_rig.commands.bars import say
 
-    console.print(f"[bold red]emmc-rig:[/] {message}", highlight=False, soft_wrap=True)
+    say("emmc-rig", message, "bold red")
     sys.exit(code)

@@ -12,6 +12,10 @@ class AppError(Exception):
     """Root of the application's errors; shown to the user as one line."""
 
 
+class WrongUsageError(AppError):
+    """An option's value that cannot be read: the command was typed wrongly."""
+
+
 class StoppedError(AppError):
     """Somebody stopped the program; the message says what is kept and how to go on."""
 

@@ -2,7 +2,8 @@
 Speed against accuracy
 ======================
 
-The same frames, several methods. The full comparison is ``emmc-rig chart``; here it is in ten lines.
+The same frames, several methods. The full comparison is
+``emmc-rig chart``; here it is in ten lines.
 """
 
 import matplotlib.pyplot as plt

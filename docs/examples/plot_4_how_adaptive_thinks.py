@@ -36,10 +36,9 @@ for axis in axes.flat:
     axis.set(xticks=[], yticks=[])
 
 # %%
-# How honest is the deviation? Of a Gaussian 68 % of the errors lie within one deviation, 95 % within
-# two.
+# How honest is the deviation? Of a Gaussian 68 % of the errors lie within one deviation, 95 %
+# within two.
 
-error = np.abs(result.light_field - np.asarray(scene)).mean(axis=-1)
 rms = np.sqrt(np.square(result.light_field - np.asarray(scene)).mean(axis=-1))
 for factor in (1, 2):
     print(f"within {factor} deviation(s): {np.mean(rms <= factor * result.sigma):.0%}")
@@ -47,4 +46,5 @@ for factor in (1, 2):
 # %%
 # The disparity against the truth of the rendered scene:
 
-print(f"median error {np.median(np.abs(result.disparity - scene.disparity_px)):.3f} px per view step")
+error_px = np.median(np.abs(result.disparity - scene.disparity_px))
+print(f"median error {error_px:.3f} px per view step")

@@ -27,8 +27,8 @@ gap = abs(np.vdot(forward, frames) - np.vdot(light_field, back))
 print(f"relative gap {gap / (np.linalg.norm(forward) * np.linalg.norm(frames)):.1e}")
 
 # %%
-# SciPy takes Psi as it is. Least squares without any prior explains the frames and recovers nothing:
-# there are twenty-five times fewer readings than unknowns.
+# SciPy takes Psi as it is. Least squares without any prior explains the frames and recovers
+# nothing: there are twenty-five times fewer readings than unknowns.
 
 readings = psi @ scene
 solution = lsqr(aslinearoperator(psi), readings.ravel(), iter_lim=50)[0]

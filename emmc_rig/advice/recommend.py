@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.advice.reference import reference
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.results import parse_psnr
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.methods import METHODS, MethodSettings
@@ -125,7 +125,9 @@ def parse_budget(text: str) -> float:
     """Return the seconds of "30s", "2min", "1h" or "30"; raise AppError for anything else."""
     found = re.fullmatch(_NUMBER + "(s|min|m|h|)", text.strip().lower())
     if found is None or float(found[1]) == 0:
-        raise AppError(f"--budget {text}: write a time above 0, for instance 30s, 2min or 1h")
+        raise WrongUsageError(
+            f"--budget {text}: write a time above 0, for instance 30s, 2min or 1h"
+        )
     return float(found[1]) * _SECONDS[found[2]]
 
 

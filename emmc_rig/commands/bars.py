@@ -16,6 +16,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.text import Text
 
 from emmc_rig.errors import StoppedError
 
@@ -58,6 +59,12 @@ class Bars:
         if self._task is not None:
             done = self._progress.tasks[-1].completed or 1
             self._progress.update(self._task, total=done, completed=done, detail="")
+
+
+def say(label: str, message: object, style: str = "yellow") -> None:
+    """Print one line to standard error; brackets in the message are brackets, not markup."""
+    line = Text.assemble((f"{label}:", style), " ", str(message))
+    console.print(line, highlight=False, soft_wrap=True)
 
 
 @contextmanager

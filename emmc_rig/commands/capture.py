@@ -89,7 +89,7 @@ def _run(
     dry_run: bool,
     out: Path | None,
 ) -> None:
-    from emmc_rig.capture.command import asked_for, capture_session
+    from emmc_rig.capture.command import capture_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
@@ -99,7 +99,6 @@ def _run(
     from emmc_rig.session.session import REPORT
 
     chosen = None if rig is None else rig_description(rig, imaged)
-    wish = asked_for(plan, chosen, out, until_db)
     console, control = Console(stderr=True), Control()
     display = CaptureDisplay(console, control)
 
@@ -122,7 +121,7 @@ def _run(
         return not dry_run
 
     with display.shown():
-        captured = capture_session(wish, display, ask, agreed, control)
+        captured = capture_session(plan, chosen, out, until_db, display, ask, agreed, control)
     if captured is None:
         return
     session, outcome = captured

@@ -107,7 +107,7 @@ def _chart_methods(settings: ChartSettings, place: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.study.chart.command import run_chart, shown_charts
 
     with shown_bars() as bars:
@@ -124,5 +124,5 @@ def _chart_methods(settings: ChartSettings, place: Path) -> None:
             table.add_row(growth.label, growth.axis, f"{growth.exponent:.2f}", expected)
         Console().print(table)
     for line in outcome.left_out:
-        console.print(f"[yellow]left out:[/] {line}", highlight=False)
+        say("left out", line)
     typer.echo(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")

@@ -13,7 +13,7 @@ def chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
     from rich.table import Table
 
     import emmc_rig as emmc
-    from emmc_rig.commands.bars import console
+    from emmc_rig.commands.bars import say
     from emmc_rig.errors import AppError
     from emmc_rig.files.dictionaries import open_dictionary
     from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
@@ -39,7 +39,7 @@ def chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
         try:
             peers = [timing.as_dict() for timing in peer_timings(described, TIMED_SIZE, atoms)]
         except AppError as missing:
-            console.print(f"[yellow]not compared:[/] {missing}", highlight=False)
+            say("not compared", missing)
         metrics = {
             "camera": camera,
             "dictionary": atoms.kind,

@@ -61,7 +61,7 @@ def conform(
 
 def _suites(device: str) -> list[str]:
     """Return which suites a name asks for; raises AppError for one that names nothing."""
-    from emmc_rig.model.settings import read_yaml
+    from emmc_rig.model.reading import read_yaml
     from emmc_rig.rig.hardware import camera_kinds
     from emmc_rig.rig.stage_config import stage_protocols
 

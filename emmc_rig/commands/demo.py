@@ -41,7 +41,7 @@ def demo(
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     import emmc_rig as emmc
-    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.results import parse_size, result_folder
     from emmc_rig.model.settings import validated
@@ -61,7 +61,7 @@ def demo(
         solver=solver,
     )
     for warning in described.warnings():
-        console.print(f"[yellow]warning:[/] {warning}", highlight=False)
+        say("warning", warning)
     with result_folder(out) as folder, shown_bars() as bars:
         metrics = run_demo(settings, folder, bars)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]

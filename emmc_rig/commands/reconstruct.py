@@ -52,7 +52,7 @@ def reconstruct(
     out: OutOption = Path("emmc-reconstruction"),
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.commands.bars import console, say, shown_bars
     from emmc_rig.files.results import result_folder
     from emmc_rig.reconstruct.inputs import load_settings
     from emmc_rig.reconstruct.solve import reconstruct_folder
@@ -99,9 +99,9 @@ def reconstruct(
             lambda step: bars.advance(step), why,
         )  # fmt: skip
     for line in metrics["screening"]:
-        console.print(f"[yellow]screening:[/] {line}", highlight=False, soft_wrap=True)
+        say("screening", line)
     for line in metrics.get("left_out", ()):
-        console.print(f"[cyan]not modelled:[/] {line}", highlight=False, soft_wrap=True)
+        say("not modelled", line, "cyan")
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,7 +47,7 @@ def show(session: Folder) -> None:
     from emmc_rig.files.results import shown_bytes
     from emmc_rig.pages.session_sheet import events
     from emmc_rig.session.listing import summary
-    from emmc_rig.session.session import Session
+    from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
     told, opened = summary(session), Session(session)
@@ -57,6 +58,11 @@ def show(session: Folder) -> None:
     typer.echo(f"  {'frames':<12} {told.stored} of {told.planned}")
     for kind, (done, planned) in counts(opened).items():
         typer.echo(f"  {kind:<12} {done} of {planned}")
+    if opened.amendments:
+        plans = Counter(entry.get("plan", 0) for entry in opened.stored.values())
+        for number in range(opened.amendments + 1):
+            name = amended_name(PLAN, number)
+            typer.echo(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
     leftovers, foreign = opened.strangers()
     if leftovers:
         typer.echo(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
@@ -112,12 +118,13 @@ def prune(
 ) -> None:
     """Remove what a crash left in a session; frames that count and other files stay."""
     from emmc_rig.files.results import shown_bytes
+    from emmc_rig.session.lock import held
     from emmc_rig.session.prune import prune as pruned
-    from emmc_rig.session.session import Session, only_program
+    from emmc_rig.session.session import Session
 
-    opened = Session(session)
-    with only_program(opened):
-        removed, size = pruned(opened, dry_run)
+    Session(session)  # no lock for what is none
+    with held(session):
+        removed, size = pruned(Session(session), dry_run)
     verb = "would remove" if dry_run else "removed"
     for name in removed:
         typer.echo(f"{verb} {name}")

@@ -63,7 +63,7 @@ def stability(
     from rich.console import Console
     from rich.table import Table
 
-    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.stability.beside import measure_beside
     from emmc_rig.study.stability.command import run_stability
@@ -98,7 +98,7 @@ def stability(
     for line in beside.told:
         typer.echo(line)
     for line in outcome.left_out:
-        console.print(f"[yellow]left out:[/] {line}", highlight=False, soft_wrap=True)
+        say("left out", line)
     typer.echo(f"open {outcome.page}")
 
 

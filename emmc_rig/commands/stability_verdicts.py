@@ -24,7 +24,7 @@ def stability_verdicts(
     from rich.console import Console
     from rich.table import Table
 
-    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.study.stability.detector import (
         detector_settings,
         run_detector,
@@ -58,5 +58,5 @@ def stability_verdicts(
     Console().print(table)
     for one in wrong(results):
         kind = "missed" if one.kind == "broken" else "false alarm"
-        console.print(f"[yellow]{kind}:[/] {told(one)}", highlight=False, soft_wrap=True)
+        say(kind, told(one))
     typer.echo(f"open {out / 'verdicts.csv'}")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
-import numpy as np
-
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import stored_arrays
 
 FRAMES, PSI = "frames.h5", "psi.h5"
 
@@ -21,14 +19,9 @@ def read_frames(folder: Path) -> Frames:
             f"{folder}: holds no {FRAMES}; name a folder that `emmc-rig demo`, `simulate` or "
             "`capture` wrote"
         )
-    try:
-        with h5py.File(path, "r") as file:
-            readings, deviation, usable = (
-                np.asarray(file[name]) for name in ("readings", "deviation", "usable")
-            )
-    except (OSError, KeyError) as fault:
-        why = " ".join(str(fault).split())
-        raise AppError(f"{path}: cannot be read ({why}); make the frames again") from fault
+    with stored_arrays(path, AppError, "make the frames again") as stored:
+        names = ("readings", "deviation", "usable")
+        readings, deviation, usable = (stored.array(name) for name in names)
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")

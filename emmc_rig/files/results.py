@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
@@ -77,7 +77,7 @@ def parse_size(
         return None
     rows, cross, columns = text.lower().partition("x")
     if not (cross and rows.isdigit() and columns.isdigit()):
-        raise AppError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
+        raise WrongUsageError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
     return int(rows), int(columns)
 
 
@@ -85,7 +85,7 @@ def parse_psnr(text: str, option: str) -> float:
     """Return the dB of "28dB" or "28"; raises AppError for anything else."""
     found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
     if found is None or not float(found[1]) > 0:
-        raise AppError(f"{option} {text}: write a PSNR, for instance 28dB")
+        raise WrongUsageError(f"{option} {text}: write a PSNR, for instance 28dB")
     return float(found[1])
 
 

@@ -22,6 +22,7 @@ from scipy import sparse
 from emmc_rig.model import kernels
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.reading import stored_arrays
 
 Array = NDArray[np.floating]
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
@@ -324,21 +325,16 @@ class ImagingMatrix:
     @classmethod
     def load(cls, path: Path) -> ImagingMatrix:
         """Read a saved Psi; raises SensingError when it is not one, or damaged."""
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise SensingError(f"{path}: not an imaging matrix of this program")
-                colour = np.asarray(file["colour"]) if "colour" in file else None
-                matrix = cls(
-                    np.asarray(file["weights"]),
-                    colour,
-                    int(np.asarray(file.attrs["binning"])),
-                    str(file.attrs["camera"]),
-                )
-                expected = file.attrs["sha256"]
-        except (OSError, KeyError) as fault:
-            why = " ".join(str(fault).split())
-            raise SensingError(f"{path}: cannot be read as an imaging matrix ({why})") from fault
+        with stored_arrays(path, SensingError, "measure Psi again") as stored:
+            if stored.attributes.get("format") != FORMAT:
+                raise SensingError(f"{path}: not an imaging matrix of this program")
+            matrix = cls(
+                stored.array("weights"),
+                stored.array("colour") if "colour" in stored else None,
+                int(np.asarray(stored.attributes["binning"])),
+                str(stored.attributes["camera"]),
+            )
+            expected = stored.attributes["sha256"]
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix

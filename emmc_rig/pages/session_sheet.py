@@ -281,6 +281,8 @@ def _told(entry: Entry) -> str:
         return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
     if kind == "decided":
         return decided_words(entry)
+    if kind == "amended":
+        return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
 
 
@@ -288,6 +290,6 @@ def _provenance(session: Session) -> str:
     rows = {
         "command": session.header["command"],
         **session.header["versions"],
-        **{f"SHA-256 of {name}": digest for name, digest in session.created["sha256"].items()},
+        **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
     }
     return provenance_table(rows)

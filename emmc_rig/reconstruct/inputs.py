@@ -9,8 +9,9 @@ import numpy as np
 from emmc_rig.errors import AppError
 from emmc_rig.files.frames import PSI, read_frames
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.settings import read_yaml, validated
+from emmc_rig.model.settings import validated
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session, is_session
 from reconstruction.methods import MethodSettings

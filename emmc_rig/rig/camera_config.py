@@ -9,7 +9,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from emmc_rig.errors import AppError
-from emmc_rig.model.settings import Settings, read_yaml
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings
 
 
 @dataclass(frozen=True)

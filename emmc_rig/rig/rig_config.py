@@ -14,7 +14,8 @@ from drivers.clock import SYSTEM_CLOCK
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
 from emmc_rig.rig.hardware import Rig, open_camera, open_stage, simulated_rig
 from simulators.bench import RAYS_PER_VIEW
 

@@ -11,7 +11,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 from drivers.apt import ACTUATORS, DEFAULT_ACTUATOR
 from drivers.stage import StageSettings
 from emmc_rig.errors import AppError
-from emmc_rig.model.settings import Settings, explain, read_yaml
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, explain
 from emmc_rig.rig.plugins import STAGES, plug_ins
 
 Positive = Annotated[float, Field(gt=0)]

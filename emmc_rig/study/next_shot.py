@@ -29,6 +29,7 @@ from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
+from emmc_rig.session.lock import held
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
 from emmc_rig.study.points import Journal, digest_of
@@ -124,7 +125,8 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
     text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
     described = rig_description(SIMULATED, rig)
     wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
-    taken = run_capture(wish, Unwatched(), _nobody)
+    with held(folder):
+        taken = run_capture(wish, Unwatched(), _nobody)
     assert taken is not None
     session, outcome = taken
     if not outcome.complete:
