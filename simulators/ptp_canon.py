@@ -84,9 +84,10 @@ class EosCameraSimulator(PtpCameraSimulator):
         self._button = 0
         self._records: list[bytes] = []
 
-    def _close_session(self, *request: object) -> Answer:
+    def end_session(self) -> None:
+        """Forget what was begun in the session."""
+        super().end_session()
         self._switch_off()
-        return super()._close_session(*request)
 
     def _vendor_answer(
         self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int

@@ -50,9 +50,10 @@ class SonyCameraSimulator(PtpCameraSimulator):
         self._phase = 0
         self._buttons = dict.fromkeys(SonyButton, UP)
 
-    def _close_session(self, *request: object) -> Answer:
+    def end_session(self) -> None:
+        """Forget what was begun in the session."""
+        super().end_session()
         self._hang_up()
-        return super()._close_session(*request)
 
     def _vendor_answer(
         self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int
