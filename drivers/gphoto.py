@@ -112,7 +112,7 @@ class GphotoCamera:
         """Exposure of the next frame, as the camera states it."""
         seconds = seconds_of(self._text(SHUTTER))
         if seconds is None:
-            raise CameraSettingError("exposure", "is not told: turn its mode dial to M")
+            raise CameraSettingError("exposure", "is not known: turn its mode dial to M")
         return seconds
 
     @property
@@ -211,9 +211,9 @@ class GphotoCamera:
                 raise CaptureError(
                     f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
                 )
-            kind, told = camera.wait_for_event(max(1, round(1e3 * left_s)))
+            kind, path = camera.wait_for_event(max(1, round(1e3 * left_s)))
             if kind == gp.GP_EVENT_FILE_ADDED:
-                paths.append(told)
+                paths.append(path)
         (path,) = raw
         # The file's memory goes with the object: it must outlive the copy.
         file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)

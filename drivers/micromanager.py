@@ -112,6 +112,8 @@ class LoadedCore:
     def _load(self) -> None:
         try:
             with calling("load the configuration"):
+                # Not every file begins by unloading what an earlier one left.
+                self.core.unloadAllDevices()
                 self.core.loadSystemConfiguration(self.port)
         except OSError as error:
             raise MicroManagerError(
@@ -189,16 +191,16 @@ class MicroManagerCamera:
     def __init__(
         self,
         loaded: LoadedCore,
-        form: CameraSetup | None = None,
+        setup: CameraSetup | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._loaded = loaded
         self._clock = clock
-        self._form = form = form or CameraSetup()
+        self._setup = setup = setup or CameraSetup()
         self._exposure_s: float | None = None
         self._closed = False
         try:
-            self.label = form.label or loaded.core.getCameraDevice()
+            self.label = setup.label or loaded.core.getCameraDevice()
             if self.label not in loaded.core.getLoadedDevices():
                 raise MicroManagerError(
                     f"{loaded.port} has no camera {self.label!r}",
@@ -317,24 +319,24 @@ class MicroManagerCamera:
 
     def _apply(self) -> None:
         """Set the camera as the configuration says, and read what frames it gives now."""
-        core, form = self._loaded.core, self._form
-        wanted: dict[str, PropertyValue] = dict(form.properties or {})
-        if form.bit_depth is not None:
-            wanted["BitDepth"] = form.bit_depth
-        if form.binning is not None:
-            wanted["Binning"] = form.binning
+        core, setup = self._loaded.core, self._setup
+        wanted: dict[str, PropertyValue] = dict(setup.properties or {})
+        if setup.bit_depth is not None:
+            wanted["BitDepth"] = setup.bit_depth
+        if setup.binning is not None:
+            wanted["Binning"] = setup.binning
         with calling("set the camera"):
             for name, value in wanted.items():
                 self._set_property(name, value)
             core.setCameraDevice(self.label)
             core.clearROI()
-            if form.roi is not None:
-                core.setROI(self.label, *form.roi)
+            if setup.roi is not None:
+                core.setROI(self.label, *setup.roi)
             if self._exposure_s is not None:
                 core.setExposure(self.label, 1e3 * self._exposure_s)
             left, top, width, height = core.getROI(self.label)
             components, depth = core.getNumberOfComponents(), core.getImageBitDepth()
-        if form.roi is not None and form.roi != (left, top, width, height):
+        if setup.roi is not None and setup.roi != (left, top, width, height):
             raise CameraSettingError("ROI", f"became {left}, {top}, {width}, {height}")
         if components != 1 or depth > 16:
             raise CameraSettingError(
@@ -342,10 +344,10 @@ class MicroManagerCamera:
             )
         if min(width, height) < SMALLEST_SIDE_PX:
             raise CameraSettingError("frame", f"is smaller than {SMALLEST_SIDE_PX} pixels")
-        if form.cfa != "mono" and wanted.get("Binning", 1) != 1:
+        if setup.cfa != "mono" and wanted.get("Binning", 1) != 1:
             raise CameraSettingError("binning", "would add pixels of different colours")
         self.shape = (height, width)
-        self.cfa = _shifted(form.cfa, top, left)
+        self.cfa = _shifted(setup.cfa, top, left)
         self.white_level_dn = (1 << depth) - 1
 
     def _set_property(self, name: str, value: PropertyValue) -> None:
@@ -385,8 +387,8 @@ class MicroManagerCamera:
                 raise FrameLostError("no frame came from the camera")
             self._clock.sleep(POLL_S)
         image, tags = core.popNextImageAndMD()
-        told = {str(name): str(value) for name, value in dict(tags).items()}
-        return self._frame(image, told)
+        metadata = {str(name): str(value) for name, value in dict(tags).items()}
+        return self._frame(image, metadata)
 
     def _frame(self, image: np.ndarray, metadata: Mapping[str, str]) -> RawFrame:
         mosaic = np.asarray(image, dtype=np.uint16)
@@ -395,7 +397,7 @@ class MicroManagerCamera:
         return frame_of_array(
             mosaic,
             self.cfa,
-            self._form.black_level_dn,
+            self._setup.black_level_dn,
             self.white_level_dn,
             self.exposure_s,
             self.identity,
@@ -417,10 +419,11 @@ class StageSetup:
     """What a Micro-Manager stage cannot say of itself.
 
     axes: our names, and where they are: `XY.x`, `XY.y`, or the label of a one-axis stage; None
-    takes all, by those names. travel_um: lowest and highest place, by our names. homes: False for
-    an encoder that always knows where it is, or a stage that was homed in Micro-Manager; True
-    homes by the adapter. speed_property, speed_unit_um_s: the property that holds the speed, and
-    its unit. speed_um_s: what the axes move at where there is none, for time limits.
+    takes all, by those names. travel_um: lowest and highest place, by our names. homes: True homes
+    by the adapter; False is for an encoder that always knows where it is, or a stage that was
+    homed in Micro-Manager: homing it, after an unplug, moves nothing. speed_property,
+    speed_unit_um_s: the property that holds the speed, and its unit. speed_um_s: what the axes
+    move at where there is none, for time limits.
     """
 
     axes: Mapping[str, str] | None
@@ -441,17 +444,17 @@ class MicroManagerStage(HostStage):
     def __init__(
         self,
         loaded: LoadedCore,
-        travel: StageSetup,
+        setup: StageSetup,
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
     ) -> None:
         self._closed = False
         try:
             found = stage_axes(loaded)
-            self._places = travel.axes or {place: place for place in found}
+            self._places = setup.axes or {place: place for place in found}
             super().__init__(self._places, (loaded,), clock, settings)
             self._loaded = loaded
-            self._told = travel
+            self._setup = setup
             self._homed: set[str] = set()
             for axis, place in self._places.items():
                 if place not in found:
@@ -459,7 +462,7 @@ class MicroManagerStage(HostStage):
                         f"{loaded.port} has no axis {place!r} for {axis}",
                         f"name one of {', '.join(found)}",
                     )
-                if axis not in travel.travel_um:
+                if axis not in setup.travel_um:
                     raise MicroManagerError(
                         f"Micro-Manager does not tell how far {axis} may go",
                         f"state travel_um: {{{axis}: [LOWEST, HIGHEST]}} in a YAML file",
@@ -518,26 +521,24 @@ class MicroManagerStage(HostStage):
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move: the device's where a property holds it."""
         label, _ = self._place(axis)
-        told = self._told
-        if not told.speed_property:
-            return told.speed_um_s
-        with calling(f"read {told.speed_property}"):
-            shown = self._loaded.core.getProperty(label, told.speed_property)
-        return float(shown) * told.speed_unit_um_s
+        setup = self._setup
+        if not setup.speed_property:
+            return setup.speed_um_s
+        with calling(f"read {setup.speed_property}"):
+            shown = self._loaded.core.getProperty(label, setup.speed_property)
+        return float(shown) * setup.speed_unit_um_s
 
     def _apply_speed(self, axis: str, speed_um_s: float) -> None:
-        told = self._told
-        if not told.speed_property:
+        setup = self._setup
+        if not setup.speed_property:
             raise SpeedFixedError(axis, "name the property that holds it: speed_property")
         label, _ = self._place(axis)
-        with calling(f"set {told.speed_property}"):
-            shown = speed_um_s / told.speed_unit_um_s
-            self._loaded.core.setProperty(label, told.speed_property, shown)
+        with calling(f"set {setup.speed_property}"):
+            shown = speed_um_s / setup.speed_unit_um_s
+            self._loaded.core.setProperty(label, setup.speed_property, shown)
 
     def _configure(self) -> None:
         self._homed.clear()
-        if not self._told.homes:
-            self._not_trusted.clear()
 
     def _read(self, axis: str) -> Reading:
         label, coordinate = self._place(axis)
@@ -548,13 +549,13 @@ class MicroManagerStage(HostStage):
             else:
                 place_um = core.getXYPosition(label)[coordinate]
             moving = core.deviceBusy(label)
-        return Reading(place_um, not self._told.homes or axis in self._homed, moving)
+        return Reading(place_um, not self._setup.homes or axis in self._homed, moving)
 
     def _readings_are_checked(self, axis: str) -> bool:
         return True
 
     def _start_home(self, axes: tuple[str, ...]) -> None:
-        if not self._told.homes:
+        if not self._setup.homes:
             return
         labels = {self._place(axis)[0] for axis in axes}
         together = {axis for axis in self._axes if self._place(axis)[0] in labels}
@@ -597,7 +598,7 @@ class MicroManagerStage(HostStage):
             return self._loaded.core.deviceBusy(label)
 
     def _travel_um(self, axis: str) -> tuple[float, float]:
-        return self._told.travel_um[axis]
+        return self._setup.travel_um[axis]
 
     def _place(self, axis: str) -> tuple[str, int | None]:
         """Return the device's label, and the coordinate of a stage with two."""

@@ -244,6 +244,17 @@ def test_the_stage_is_where_it_was_sent_when_the_camera_exposes(sequence_tester)
         assert places_in(camera.snap())["TZStage", "ZPositionUm"] == place_um
 
 
+def test_an_encoder_that_knows_its_place_is_confirmed_after_a_reconnect(sequence_tester):
+    _, stage = sequence_tester
+    stage.move_to_um({"z": 40.0})
+    stage.reconnect()
+    with pytest.raises(NotHomedError, match="connection was lost"):
+        stage.position_um("z")
+    stage.home()
+    assert stage.is_homed("z")
+    stage.move_to_um({"z": 41.0})
+
+
 def test_a_hardware_sequence_exposes_a_frame_at_every_place(sequence_tester):
     camera, stage = sequence_tester
     places_um = [20.0, 25.0, 30.0, 47.5]

@@ -67,8 +67,10 @@ def _suites(device: str) -> list[str]:
 
     if device.endswith((".yaml", ".yml")):
         read = read_yaml(Path(device), AppError)
-        told = read if isinstance(read, dict) else {}
-        found = [suite for suite, key in (("stage", "protocol"), ("camera", "kind")) if key in told]
+        settings = read if isinstance(read, dict) else {}
+        found = [
+            suite for suite, key in (("stage", "protocol"), ("camera", "kind")) if key in settings
+        ]
     else:
         name = device.partition(":")[0]
         stages = {*stage_protocols(), "simulated"}

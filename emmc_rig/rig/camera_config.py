@@ -15,7 +15,7 @@ from emmc_rig.model.settings import Settings
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """A kind of camera, what tells it from others, and what else it is told."""
+    """A kind of camera, which one of its kind, and its other settings; `source` for messages."""
 
     kind: str
     address: str = ""
@@ -23,7 +23,7 @@ class CameraChoice:
     source: str = ""
 
 
-class MicroManagerCamera(Settings):
+class MicroManagerCameraConfig(Settings):
     """A camera of a Micro-Manager configuration; see `drivers.micromanager.CameraSetup`."""
 
     label: str = ""
@@ -35,7 +35,7 @@ class MicroManagerCamera(Settings):
     properties: dict[str, str | int | float] = Field(default_factory=dict)
 
 
-class GphotoCamera(Settings):
+class GphotoCameraConfig(Settings):
     """A camera of libgphoto2; see `drivers.gphoto.GphotoCamera`."""
 
     model: str = ""

@@ -39,9 +39,12 @@ from emmc_rig.model.camera import Camera, Sensor
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.settings import validated
 from emmc_rig.rig import plugins
-from emmc_rig.rig.camera_config import CameraChoice, parse_camera
-from emmc_rig.rig.camera_config import GphotoCamera as GphotoCameraConfig
-from emmc_rig.rig.camera_config import MicroManagerCamera as MicroManagerCameraConfig
+from emmc_rig.rig.camera_config import (
+    CameraChoice,
+    GphotoCameraConfig,
+    MicroManagerCameraConfig,
+    parse_camera,
+)
 from emmc_rig.rig.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.rig.stage_config import (
     USUAL_MICROSTEP_UM,

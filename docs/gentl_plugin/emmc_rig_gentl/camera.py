@@ -95,9 +95,9 @@ class GenTlCamera:
         self._nodes.PixelFormat.value = self._format.name
         self.cfa = self._format.cfa
         self.shape: tuple[int, int] = (self._nodes.Height.value, self._nodes.Width.value)
-        told = ("DeviceVendorName", "DeviceModelName", "DeviceSerialNumber", "DeviceVersion")
+        names = ("DeviceVendorName", "DeviceModelName", "DeviceSerialNumber", "DeviceVersion")
         self.identity = CameraIdentity(
-            *(str(getattr(self._node(name), "value", "")) for name in told)
+            *(str(getattr(self._node(name), "value", "")) for name in names)
         )
 
     @property
