@@ -65,7 +65,7 @@ def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     few = tmp_path / "few-views.yaml"
     few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
     camera = find_camera(str(few))
-    folder = open_folder(tmp_path / "out", next_shot.ROWS, "shots")
+    folder = open_folder(tmp_path / "out", next_shot.ROWS, "chart --next-shot")
     told = []
 
     def measured():

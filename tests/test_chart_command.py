@@ -249,7 +249,7 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
         (["--camera", "no-camera"], "no-camera"),
         (["--size", "big"], "write ROWSxCOLUMNS"),
         (["--size", "8x8"], "needs 16x16"),
-        (["--out", "mine"], "something else than an earlier chart"),
+        (["--out", "mine"], "something else than an earlier `emmc-rig chart`"),
     ],
 )
 def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, told):

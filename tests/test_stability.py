@@ -50,7 +50,7 @@ def few_steps(monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """No charts: they take longer than a few steps do."""
-    monkeypatch.setattr(stability_command, "_written", lambda run, *_: run.folder)
+    monkeypatch.setattr(stability_command, "_write", lambda *_: None)
 
 
 def ends(found):
@@ -264,5 +264,5 @@ def test_wrong_input_is_one_line_and_leaves_nothing_half_written(
 def test_another_folder_s_content_is_left_alone(few_steps, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(AppError, match="holds something else than an earlier sweep"):
+    with pytest.raises(AppError, match="holds something else than an earlier `emmc-rig stability`"):
         run_stability(quick(), tmp_path / "mine", Silent())

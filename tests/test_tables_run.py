@@ -87,7 +87,7 @@ def scenes(tmp_path_factory):
 
 def a_run(scenes, out, parts=(PART,), settings=TINY, source=None):
     library = Library(scene_specs(scenes), settings.cuts, settings.seed)
-    folder = open_folder(out, CELLS, "earlier tables")
+    folder = open_folder(out, CELLS, "tables")
     source = source or LeaveOneOut(library, settings.training, folder / "dictionaries")
     return Run(tuple(parts), library, source, settings, folder)
 
@@ -324,14 +324,14 @@ def test_binned_pixels_take_the_dictionary_whose_patches_they_divide(tmp_path):
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     (tmp_path / "cat.jpg").write_text("meow")
     with pytest.raises(AppError, match="holds something else"):
-        open_folder(tmp_path, CELLS, "earlier tables")
+        open_folder(tmp_path, CELLS, "tables")
     with pytest.raises(AppError, match="a file of that name"):
-        open_folder(tmp_path / "cat.jpg", CELLS, "earlier tables")
+        open_folder(tmp_path / "cat.jpg", CELLS, "tables")
     assert [path.name for path in tmp_path.iterdir()] == ["cat.jpg"]
 
 
 def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
-    folder = open_folder(tmp_path / "out", CELLS, "earlier tables")
+    folder = open_folder(tmp_path / "out", CELLS, "tables")
     journal = Journal(folder / CELLS)
     journal.add("a", {}, {"psnr_db": 1.0})
     journal.add("b", {}, {"psnr_db": 2.0})

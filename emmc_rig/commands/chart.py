@@ -78,9 +78,9 @@ def chart(
     one_camera = (camera or [ONE_SHOT])[0]
     timed = shape or TIMED_SIZE, repeats or TIMED_CALLS
     if solvers:
-        chart_solvers(one_camera, dictionary, out or Path("emmc-kernels"))
+        chart_solvers(one_camera, dictionary, out or Path("emmc-solvers"))
     elif peers:
-        chart_peers(one_camera, *timed, out or Path("emmc-kernels"))
+        chart_peers(one_camera, *timed, out or Path("emmc-peers"))
     elif kernels:
         chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
     elif ablation:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -180,9 +180,12 @@ def serve(
 ) -> None:
     """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
     from drivers.clock import SYSTEM_CLOCK
+    from emmc_rig.files.folders import refuse_inside_session
     from emmc_rig.rig.hardware import simulated_firmware
     from simulators.wire import PtyServer, TcpServer
 
+    if link is not None:
+        refuse_inside_session(link.parent)
     firmware = simulated_firmware(protocol, SYSTEM_CLOCK)
     if tcp is None:
         server = PtyServer(firmware, link)
@@ -214,42 +217,44 @@ def bench(
     out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
 ) -> None:
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
     from emmc_rig.study.benchmarks.u3v import u3v_timings
 
-    timings = stage_timings(repeats)
-    table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
-    for one in timings:
-        table.add_row(
-            one.protocol,
-            one.command,
-            f"{one.exchanges:g}",
-            f"{one.milliseconds:.3f}",
-            f"{one.milliseconds / one.exchanges:.3f}",
-        )
-    Console().print(table)
-    picture = picture_timing()
-    typer.echo(
-        f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
-        f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times rawpy "
-        "alone"
-    )
-    streams = list(u3v_timings())
-    for one in streams:
+    with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
+        timings = stage_timings(repeats)
+        table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
+        for one in timings:
+            table.add_row(
+                one.protocol,
+                one.command,
+                f"{one.exchanges:g}",
+                f"{one.milliseconds:.3f}",
+                f"{one.milliseconds / one.exchanges:.3f}",
+            )
+        Console().print(table)
+        picture = picture_timing()
         typer.echo(
-            f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, {one.gigabytes_per_s:.2f} GB/s"
+            f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
+            f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times "
+            "rawpy alone"
         )
-    if out is not None:
-        metrics = {
-            "stage_commands": [one.as_dict() for one in timings],
-            "picture": picture.as_dict(),
-            "usb3_vision": [one.as_dict() for one in streams],
-            "command": command_line(),
-            "versions": versions(),
-        }
-        with result_folder(out) as folder:
+        streams = list(u3v_timings())
+        for one in streams:
+            typer.echo(
+                f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
+                f"{one.gigabytes_per_s:.2f} GB/s"
+            )
+        if folder is not None:
+            metrics = {
+                "stage_commands": [one.as_dict() for one in timings],
+                "picture": picture.as_dict(),
+                "usb3_vision": [one.as_dict() for one in streams],
+                "command": command_line(),
+                "versions": versions(),
+            }
             write_metrics(folder, metrics)
 
 

@@ -56,7 +56,10 @@ def stability(
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
-    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="folder to write (default: emmc-stability or emmc-verdicts)"),
+    ] = None,
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
     from rich.box import SIMPLE
@@ -74,8 +77,10 @@ def stability(
         _list_faults()
         return
     if verdicts:
-        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, out)
+        place = out or Path("emmc-verdicts")
+        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, place)
         return
+    out = out or Path("emmc-stability")
     settings = stability_settings(
         fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,

@@ -6,6 +6,7 @@ The page is one file that opens offline and asks for nothing.
 from __future__ import annotations
 
 import base64
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib import resources
@@ -15,7 +16,9 @@ import cv2
 
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import metrics_text, shown_bytes
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import shown_bytes, write_metrics
+from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import preview, thinned
 from emmc_rig.pages.page import Section, framed, provenance_table, table_head, text
 from emmc_rig.pages.timeline import (
@@ -31,8 +34,7 @@ from emmc_rig.session.decisions import decided_words, decisions, ended
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
-from emmc_rig.session.session import METRICS, Session
-from emmc_rig.session.storage import write_whole
+from emmc_rig.session.session import REPORT, Session
 from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
@@ -50,15 +52,12 @@ HEADINGS = {
 }
 
 
-def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> None:
-    """Write the page, and metrics.json beside it, each whole or not at all; raises AppError."""
-    page = sheet(session, pictures)
-    figures = metrics_text(session_metrics(session))
-    try:
-        write_whole(session.disk, path.with_name(METRICS), figures.encode())
-        write_whole(session.disk, path, page.encode())
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+def write_sheet(session: Session, out: Path, pictures: int = MOST_PICTURES) -> None:
+    """Write report.html and metrics.json into the session, or another folder; raises AppError."""
+    own = Path(os.path.realpath(out)) == Path(os.path.realpath(session.folder))
+    with result_folder(out, "session sheet", belongs_to=session.folder, adds=own) as folder:
+        write_text(folder / REPORT, sheet(session, pictures))
+        write_metrics(folder, session_metrics(session))
 
 
 def quick_pictures(session: Session) -> int:

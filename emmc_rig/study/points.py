@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_edited, refuse_inside_session
 
 EVERY_POINT = "every point that was done is"
 
@@ -51,20 +52,26 @@ def digest_of(inputs: Mapping[str, object]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
 
 
-def open_folder(out: Path, name: str, what: str) -> Path:
+def open_folder(out: Path, name: str, command: str) -> Path:
     """Return the folder of a journal called `name`, created where missing.
 
-    what: what the folder holds, in words. Raises AppError when it holds something else.
+    What is drawn and written of the points is replaced later by `result_folder`; what that would
+    refuse is refused here, before anything is measured.
+
+    Raises AppError when the folder holds something else, or results that somebody edited, and
+    where a session is.
     """
+    refuse_inside_session(out)
     out = Path(os.path.abspath(out))
     if out.is_file():
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
     if out.is_dir() and any(out.iterdir()) and not (out / name).is_file():
         raise AppError(
-            f"--out {out}: the folder holds something else than {what}; "
+            f"--out {out}: the folder holds something else than an earlier `emmc-rig {command}`; "
             "choose another folder or empty it"
         )
     try:
+        refuse_edited(out, command)
         out.mkdir(parents=True, exist_ok=True)
         with open(out / name, "ab"):
             pass

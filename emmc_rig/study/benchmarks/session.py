@@ -27,6 +27,7 @@ from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.pages.timeline import overlap, run_entries
 from emmc_rig.rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line
@@ -317,6 +318,7 @@ def _forget(paths: list[Path]) -> None:
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
+    refuse_inside_session(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix="emmc-bench-") as scratch:

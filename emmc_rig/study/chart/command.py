@@ -9,6 +9,7 @@ from pathlib import Path
 
 from emmc_rig.advice.recommend import ADVICE, saved
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
@@ -87,7 +88,7 @@ def run_chart(
         raise AppError(f"nothing to chart: {'; '.join(left_out)}")
     for capture in dict.fromkeys(point.capture for point in points):
         capture.described()
-    folder = open_folder(out, POINTS, "an earlier chart")
+    folder = open_folder(out, POINTS, "chart")
     run = ChartRun(settings, folder)
     with kept_when_stopped(out, folder, ChartStopped):
         run.prepare(points, watcher)
@@ -102,17 +103,19 @@ def run_chart(
         if all("failed" in result for result in results.values()):
             raise AppError(f"nothing could be measured: {left_out[0]}")
         found, grown = charts(results), growths(swept, run.results)
-        (folder / DRAWN).mkdir(exist_ok=True)
         colours = colours_of(found)
-        drawn = {chart: draw_chart(chart, colours, folder / DRAWN) for chart in found}
-        drawn_growths = draw_growths(grown, folder / DRAWN)
-        seconds = clock() - started
-        provenance = _provenance(run, seconds)
-        text = page(run, _about(run, results, left_out), drawn, grown, drawn_growths, provenance)
-        write_text(folder / CSV, csv_text(run.results))
-        write_text(folder / ADVICE, saved(advice_rows(results), provenance))
-        write_text(folder / PAGE, text)
-        write_metrics(folder, _metrics(run, found, grown, left_out, seconds))
+        with result_folder(folder, "chart", adds=True) as new:
+            (new / DRAWN).mkdir()
+            drawn = {chart: draw_chart(chart, colours, new / DRAWN) for chart in found}
+            drawn_growths = draw_growths(grown, new / DRAWN)
+            seconds = clock() - started
+            provenance = _provenance(run, seconds)
+            about = _about(run, results, left_out)
+            text = page(run, about, drawn, grown, drawn_growths, provenance)
+            write_text(new / CSV, csv_text(run.results))
+            write_text(new / ADVICE, saved(advice_rows(results), provenance))
+            write_text(new / PAGE, text)
+            write_metrics(new, _metrics(run, found, grown, left_out, seconds))
     return Outcome(found, grown, left_out, folder / PAGE, seconds)
 
 

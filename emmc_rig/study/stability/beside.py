@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import result_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Watcher
@@ -57,7 +58,7 @@ class Beside:
     told: list[str]
 
 
-def _theory(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Beside:
+def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
     chosen = TheorySettings(
         settings.fast, settings.scenes, settings.camera, settings.size or DEFAULT_SIZE,
         settings.zoom, seed=settings.seed,
@@ -69,7 +70,7 @@ def _theory(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Besi
         {"scene": one.scene, "fault": one.fault, "strength": one.strength, **one.figures}
         for one in points
     ]
-    write_text(folder / "theory.csv", _csv(rows))
+    write_text(new / "theory.csv", _csv(rows))
     every = compared(points, chosen.methods)
     mean, root = oracle_offset(every)
     verdicts = [
@@ -94,24 +95,24 @@ def _theory(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Besi
         f"theory: the bound says where a method breaks in {agreed} of {len(verdicts)} curves; "
         f"the oracle lies {mean:+.2f} dB from it"
     )
-    sections = theory_sections(points, chosen.methods, folder / DRAWN)
+    sections = theory_sections(points, chosen.methods, new / DRAWN)
     return Beside(sections, {"theory": metrics}, [line])
 
 
 NOT_PREDICTED = ("sooner", "later", "only", "not measured")
 
 
-def _numerics(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Beside:
+def _numerics(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
     found = measure_numerics(watcher, settings.fast)
     rows = [asdict(one) for one in found.findings]
-    write_text(folder / "numerics.csv", _csv(rows))
+    write_text(new / "numerics.csv", _csv(rows))
     verdicts = [one.verdict for one in found.findings]
     weak, broken = verdicts.count(WEAK), verdicts.count(BROKEN)
     line = f"numerics: {len(rows)} checks, {weak} weak, {broken} broken"
-    return Beside([numerics_section(found, folder / DRAWN)], {"numerics": rows}, [line])
+    return Beside([numerics_section(found, new / DRAWN)], {"numerics": rows}, [line])
 
 
-def _mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Beside:
+def _mismatch(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
     chosen = MismatchSettings(
         settings.fast, settings.scenes, settings.camera, settings.size or DEFAULT_SIZE,
         settings.zoom, QUICK_METHODS if settings.fast else METHODS_JUDGED, settings.seed,
@@ -128,15 +129,15 @@ def _mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> Be
         }
         for one in found
     ]
-    write_text(folder / "mismatch.csv", _csv(rows))
+    write_text(new / "mismatch.csv", _csv(rows))
     share = recovered_share(found, of_oracle=True)
     line = "mismatch: next to nothing is lost"
     if share is not None:
         line = f"mismatch: blind mending gives back {share:.0%} of what knowing Psi gives back"
-    return Beside(mismatch_sections(found, folder / DRAWN), {"mismatch": rows}, [line])
+    return Beside(mismatch_sections(found, new / DRAWN), {"mismatch": rows}, [line])
 
 
-PARTS: dict[str, Callable[[StabilitySettings, Path, Watcher], Beside]] = {
+PARTS: dict[str, Callable[[StabilitySettings, Path, Path, Watcher], Beside]] = {
     "theory": _theory,
     "numerics": _numerics,
     "mismatch": _mismatch,
@@ -154,13 +155,16 @@ def measure_beside(
     if not parts:
         return Beside([], {}, [])
     find_camera(settings.camera)  # raises before anything is written
-    folder = open_folder(out, POINTS, "an earlier sweep")
+    folder = open_folder(out, POINTS, "stability")
     sections, metrics, lines = [], {}, []
-    with kept_when_stopped(out, folder, StabilityStopped):
-        (folder / DRAWN).mkdir(exist_ok=True)
+    with (
+        kept_when_stopped(out, folder, StabilityStopped),
+        result_folder(folder, "stability", adds=True) as new,
+    ):
+        (new / DRAWN).mkdir()
         for name, measure in PARTS.items():
             if name in parts:
-                found = measure(settings, folder, watcher)
+                found = measure(settings, folder, new, watcher)
                 sections += found.sections
                 metrics |= found.metrics
                 lines += found.told

@@ -10,6 +10,7 @@ from pathlib import Path
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.page import Section, provenance_table
@@ -60,7 +61,7 @@ def run_stability(
         METHODS[name].needs_dictionary for name in chosen_methods(settings)
     ):
         open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
-    folder = open_folder(out, POINTS, "an earlier sweep")
+    folder = open_folder(out, POINTS, "stability")
     run = StabilityRun(settings, folder)
     run.measure_all(points, watcher)
     found = curves(run.results)
@@ -76,21 +77,25 @@ def run_stability(
         ),
     ]
     watcher.begin("draw", None)
-    with kept_when_stopped(out, folder, StabilityStopped):
-        path = _written(run, found, left_out, more, figures or {}, clock() - started)
-    return Outcome(found, left_out, path, clock() - started)
+    with (
+        kept_when_stopped(out, folder, StabilityStopped),
+        result_folder(folder, "stability", adds=True) as new,
+    ):
+        _write(run, new, found, left_out, more, figures or {}, clock() - started)
+    return Outcome(found, left_out, folder / PAGE, clock() - started)
 
 
-def _written(
+def _write(
     run: StabilityRun,
+    folder: Path,
     found: Sequence[Curve],
     left_out: Sequence[str],
     more: Sequence[Section],
     figures: Mapping[str, object],
     seconds: float,
-) -> Path:
-    folder, colours = run.folder, colours_of(found)
-    (folder / DRAWN).mkdir(exist_ok=True)
+) -> None:
+    colours = colours_of(found)
+    (folder / DRAWN).mkdir()
     kinds = dict.fromkeys(fault.kind for fault in FAULTS.values())
     tables, drawn = [], []
     scenes = dict.fromkeys(curve.scene for curve in found)
@@ -113,7 +118,6 @@ def _written(
     write_text(folder / BREAKS_CSV, breaks_csv(found))
     write_text(folder / PAGE, text)
     write_metrics(folder, {**_metrics(run, found, left_out, seconds), **figures})
-    return folder / PAGE
 
 
 def _about(run: StabilityRun, left_out: Sequence[str]) -> list[str]:

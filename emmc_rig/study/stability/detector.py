@@ -22,6 +22,7 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
@@ -178,7 +179,7 @@ def measure(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Jud
 
     Raises AppError for a folder that cannot be written, and what the layers below do.
     """
-    folder = open_folder(out, ROWS, "earlier verdicts")
+    folder = open_folder(out, ROWS, "stability --verdicts")
     journal, rows = Journal(folder / ROWS), {}
     wanted = cases(settings)
     watcher.begin("judge", len(wanted))
@@ -344,20 +345,19 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
     results = measure(settings, out, watcher)
     if not results:
         raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
-    write_text(out / CSV, csv_text(results))
     found = {
         f"{fault}, {method}": {**asdict(tally), "found": tally.found, "alarms": tally.false_alarms}
         for (fault, method), tally in tables(results).items()
     }
-    write_metrics(
-        out,
-        {
-            "results": len(results),
-            "tallies": found,
-            "wrong": [told(one) for one in wrong(results)],
-            "settings": settings.model_dump(mode="json"),
-            "command": command_line(),
-            "versions": versions(),
-        },
-    )
+    metrics = {
+        "results": len(results),
+        "tallies": found,
+        "wrong": [told(one) for one in wrong(results)],
+        "settings": settings.model_dump(mode="json"),
+        "command": command_line(),
+        "versions": versions(),
+    }
+    with result_folder(out, "stability --verdicts", adds=True) as folder:
+        write_text(folder / CSV, csv_text(results))
+        write_metrics(folder, metrics)
     return results

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
@@ -54,7 +55,7 @@ def run_tables(
     started = clock()
     parts = chosen_parts(only)
     library = Library(scene_specs(scenes), settings.cuts, settings.seed)
-    folder = open_folder(out, CELLS, "earlier tables")
+    folder = open_folder(out, CELLS, "tables")
     source = _source(parts, library, dictionaries, settings, folder)
     run = Run(parts, library, source, settings, folder)
     with kept_when_stopped(out, folder, TablesStopped, lambda: "every cell that was done is"):
@@ -62,18 +63,19 @@ def run_tables(
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)
         findings = judge(results, library.names)
-        (folder / DRAWN).mkdir(exist_ok=True)
-        charts = draw_charts(folder / DRAWN, results, library.names)
-        figures = draw_figures(folder / DRAWN, run, results)
-        seconds = clock() - started
-        provenance = _provenance(run, dictionaries, seconds)
-        text = page(
-            "The paper's tables and figures, reproduced",
-            _about(run, len(results)), found, findings, charts, figures, provenance,
-        )  # fmt: skip
-        write_text(folder / CSV, csv_text(run, results))
-        write_text(folder / PAGE, text)
-        write_metrics(folder, _metrics(run, dictionaries, results, findings, seconds))
+        with result_folder(folder, "tables", adds=True) as new:
+            (new / DRAWN).mkdir()
+            charts = draw_charts(new / DRAWN, results, library.names)
+            figures = draw_figures(new / DRAWN, run, results)
+            seconds = clock() - started
+            provenance = _provenance(run, dictionaries, seconds)
+            text = page(
+                "The paper's tables and figures, reproduced",
+                _about(run, len(results)), found, findings, charts, figures, provenance,
+            )  # fmt: skip
+            write_text(new / CSV, csv_text(run, results))
+            write_text(new / PAGE, text)
+            write_metrics(new, _metrics(run, dictionaries, results, findings, seconds))
     return Outcome(found, findings, folder / PAGE, seconds)
 
 
