@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
 CameraSpec = Annotated[
-    str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+    str,
+    typer.Option(
+        "--camera", help="ptp:, u3v:, gphoto2:, mm:CONFIG.cfg, folder:DIR, simulated or a YAML file"
+    ),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")

@@ -20,11 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 from emmc_rig.capture.signals import ENDING, handled
+from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
-    from drivers.stage import HostStage
+    from drivers.stage import Stage
 
 app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
 _told = Console(stderr=True)
@@ -32,7 +33,8 @@ _told = Console(stderr=True)
 StageOption = Annotated[
     str | None,
     typer.Option(
-        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file that wires names to axes"
+        "--stage",
+        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file that wires names",
     ),
 ]
 RigOption = Annotated[
@@ -43,6 +45,7 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 
 register(app)
+app.command()(conform)
 
 
 @app.command("list")
@@ -256,7 +259,7 @@ def bench(
 
 
 @contextmanager
-def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
+def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
     from drivers.errors import DriverError
     from emmc_rig.rig.hardware import open_stage
@@ -289,7 +292,7 @@ def _signals_interrupt() -> Iterator[None]:
         yield
 
 
-def _show(stage: HostStage) -> None:
+def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
     table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)

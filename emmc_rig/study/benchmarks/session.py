@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import SYSTEM_CLOCK
+from drivers.dng import encode_dng
 from drivers.raw import RawFrame, decode_raw
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.plan import Plan, planned_camera
@@ -37,7 +38,6 @@ from emmc_rig.session.storage import SYSTEM_DISK, Disk
 from emmc_rig.session.verify import PIECE_BYTES, THREADS, verify
 from emmc_rig.study.benchmarks.timing import Figures
 from simulators.disk import SimulatedDisk
-from simulators.dng import encode_dng
 from simulators.still import PreparedCamera, StillStage
 
 LARGE_SHAPE = (4000, 6000)

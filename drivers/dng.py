@@ -1,15 +1,19 @@
-"""DNG files as a camera would write them: a mosaic in, bytes out that LibRaw decodes exactly.
+"""DNG files: a mosaic in, bytes out that LibRaw decodes exactly.
 
 Source: Adobe Digital Negative specification 1.4 (tags 50706 to 50829) and TIFF/EP (CFA tags).
 """
 
 import io
+from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import tifffile
 
-from drivers.raw import CFA_TILE_PREFIX
+from drivers.camera import CameraIdentity
+from drivers.plain_dng import SMALLEST_SIDE_PX
+from drivers.raw import CFA_TILE_PREFIX, RawFrame, decode_raw
 
 Array = np.ndarray
 
@@ -22,16 +26,13 @@ BAYER_PATTERNS = {
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
-SMALLEST_SIDE_PX = 22
-"""LibRaw takes anything smaller for a thumbnail."""
-
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 PHOTOMETRIC_TAG, PHOTOMETRIC_CFA, PHOTOMETRIC_LINEAR_RAW = 262, 32803, 34892
 D65 = 21
 IDENTITY_MATRIX = tuple(
     n for row in np.eye(3, dtype=int).tolist() for value in row for n in (value, 1)
 )
-MODEL = "EMMC simulated camera"
+SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
 
 
 def encode_dng(
@@ -39,27 +40,30 @@ def encode_dng(
     cfa: str,
     black_level_dn: float | Array,
     white_level_dn: int,
-    exposure_s: float,
+    exposure_s: float | None,
+    identity: CameraIdentity = SIMULATED,
 ) -> bytes:
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
     `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
     LibRaw's sake and carries its name beside it. `black_level_dn` is a whole number, or `(2, 2)`
-    of them in mosaic order; a monochrome DNG has but one. Raises `ValueError`.
+    of them in mosaic order; a monochrome DNG has but one. `exposure_s`: None where it is not known.
+    Raises `ValueError`.
     """
     black = np.broadcast_to(np.asarray(black_level_dn), (2, 2))
     _check(mosaic, cfa, black, exposure_s)
-    exposure = Fraction(exposure_s).limit_denominator(1_000_000)
     tags = [
-        (271, ASCII, 0, "EMMC", True),
-        (272, ASCII, 0, MODEL, True),
+        (271, ASCII, 0, identity.maker, True),
+        (272, ASCII, 0, identity.model, True),
         (274, SHORT, 1, 1, True),
-        (33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True),
         (50706, BYTE, 4, (1, 4, 0, 0), True),
         (50707, BYTE, 4, (1, 1, 0, 0), True),
-        (50708, ASCII, 0, MODEL, True),
+        (50708, ASCII, 0, identity.model, True),
         (50717, LONG, 1, int(white_level_dn), True),
     ]
+    if exposure_s is not None:
+        exposure = Fraction(exposure_s).limit_denominator(1_000_000)
+        tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
     if cfa == MONO:
         tags.append((50714, LONG, 1, int(black[0, 0]), True))
     else:
@@ -96,7 +100,29 @@ def encode_dng(
     return file.getvalue()
 
 
-def _check(mosaic: Array, cfa: str, black: Array, exposure_s: float) -> None:
+def frame_of_array(
+    mosaic: Array,
+    cfa: str,
+    black_level_dn: float,
+    white_level_dn: int,
+    exposure_s: float | None,
+    identity: CameraIdentity,
+    host_time_s: float,
+    metadata: Mapping[str, str],
+) -> RawFrame:
+    """Return the frame of a camera that gives arrays, kept as the DNG that it decodes from."""
+    original = encode_dng(mosaic, cfa, black_level_dn, white_level_dn, exposure_s, identity)
+    frame = decode_raw(original, mosaic.shape)
+    return replace(
+        frame,
+        white_level_dn=white_level_dn,
+        exposure_s=exposure_s,
+        host_time_s=host_time_s,
+        metadata={**frame.metadata, **metadata},
+    )
+
+
+def _check(mosaic: Array, cfa: str, black: Array, exposure_s: float | None) -> None:
     if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
         raise ValueError(f"a mosaic is uint16 (y, x), not {mosaic.dtype} {mosaic.shape}")
     if min(mosaic.shape) < SMALLEST_SIDE_PX:
@@ -110,5 +136,5 @@ def _check(mosaic: Array, cfa: str, black: Array, exposure_s: float) -> None:
         raise ValueError(f"black levels {black.tolist()} are not whole numbers of DN")
     if cfa == MONO and np.any(black != black[0, 0]):
         raise ValueError(f"a monochrome DNG has one black level, not {black.tolist()}")
-    if not exposure_s > 0:
+    if exposure_s is not None and not exposure_s > 0:
         raise ValueError(f"an exposure of {exposure_s:g} s is not positive")
