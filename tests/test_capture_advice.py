@@ -24,6 +24,7 @@ from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
 
 import drivers.errors
 import emmc_rig
+from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from emmc_rig import cli
 from emmc_rig.capture import command, sequencer
@@ -36,7 +37,6 @@ from emmc_rig.session.readings import whiteboards
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SystemDisk
 from emmc_rig.session.verify import verify
-from simulators.dng import encode_dng
 
 HOUSE = Path(emmc_rig.__file__).parent
 SCANNED = (
