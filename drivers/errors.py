@@ -160,6 +160,13 @@ class SpeedLimitError(DriverError):
         self.top_speed_um_s = top_speed_um_s
 
 
+class ScaleError(DriverError):
+    """The length of an axis's step is unknown or contradicted; nothing was moved."""
+
+    def __init__(self, axis: str, what: str, advice: str) -> None:
+        super().__init__(f"{axis} must not move, {what}", advice, axis=axis)
+
+
 class NotHomedError(DriverError):
     """The axis does not know where it is; nothing was sent to the device."""
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from drivers import grbl_codec as codec
-from drivers.apt import AptAxis, AptStage
+from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.apt_codec import Id
 from drivers.grbl import GrblStage
 from drivers.stage import DEFAULT_SETTINGS
@@ -19,6 +19,7 @@ from simulators.grbl import GrblController
 from simulators.wire import PtyServer, TcpServer
 from simulators.zaber import AxisSpec, ZaberChain
 
+Z825_MOTOR = ACTUATORS["z825"]
 WIRES = ("memory", "pty", "tcp")
 MEMORY_TIMEOUT_S = 0.5
 WIRE_TIMEOUT_S = 0.05
@@ -140,7 +141,7 @@ class AptRig(Rig):
         return AptController(self.clock)
 
     def make_from(self, settings):
-        return AptStage({"mask_x": AptAxis(self.transport)}, self.clock, settings)
+        return AptStage({"mask_x": AptAxis(self.transport, Z825_MOTOR)}, self.clock, settings)
 
     def true_um(self, axis):
         return self.device.position_um()

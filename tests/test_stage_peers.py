@@ -82,7 +82,7 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
             axis.generic_command("sing")
         assert devices[1].generic_command("get system.serial").data == "73003"
 
-        axis.settings.set("maxspeed", 5_000_000.0)
+        axis.settings.set("maxspeed", 1_000_000.0)
         devices[0].all_axes.home()
         chain.faults.inject("stall")
         with pytest.raises(refusals.MovementFailedException, match="FS"):

@@ -178,7 +178,7 @@ def serve(
     """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
     from drivers.clock import SYSTEM_CLOCK
     from emmc_rig.files.folders import refuse_inside_session
-    from emmc_rig.rig.hardware import simulated_firmware
+    from emmc_rig.rig.hardware import SIMULATED_SCALES, simulated_firmware
     from simulators.wire import PtyServer, TcpServer
 
     if link is not None:
@@ -193,7 +193,7 @@ def serve(
         server = TcpServer(firmware, host, int(number))
     try:
         with _signals_interrupt(), server:
-            typer.echo(f"{protocol}:{server.port}")
+            typer.echo(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
             while True:
                 time.sleep(1.0)
     except OSError as fault:
