@@ -1,20 +1,28 @@
 """An axis whose scale is unknown, or contradicted, never moves; one that is known goes there."""
 
+import io
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import yaml
 
+from calibration.errors import CalibrationError
+from calibration.stage_scale import fit_step_length
 from drivers.apt import ACTUATORS
+from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import ScaleError, SpeedLimitError
 from drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
 from drivers.stage import StageSettings
 from drivers.zaber import ZaberStage
+from emmc_rig.commands.stage_scale import measure, scale_settings, shadow_reader
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import open_stage
-from emmc_rig.stage_config import parse_stage
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.rig.hardware import STAGE_AXES, open_stage, simulated_rig
+from emmc_rig.rig.stage_config import parse_stage
 from simulators.clock import ManualClock
 from simulators.grbl import BENCH_AXES, GrblController
+from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 COARSE = AxisSpec(travel_um=150_000.0, microstep_um=0.49609375, backlash_um=0.0)
@@ -166,3 +174,99 @@ def test_settings_behind_a_port_are_those_of_a_file(tmp_path):
     assert parse_stage("zaber:p,microstep_um=0.5,settle_s=1") == parse_stage(
         str(tmp_path / "rig.yaml")
     )
+
+
+def test_a_ruler_measures_the_step_that_nobody_knew():
+    device = chain(COARSE)
+    opened = stage(device, in_microsteps=True)
+    steps, readings = measure(opened, "x", 20_000, 5, lambda _: device.position_um(1, 1) + 77.0)
+    assert max(steps) - min(steps) == pytest.approx(20_000, abs=1)
+    found = fit_step_length(steps, readings)
+    assert found.um_per_step == pytest.approx(COARSE.microstep_um, rel=1e-5)
+    assert not found.reversed
+    assert scale_settings(parse_stage("zaber:p"), opened, "x", found.um_per_step) == {
+        "microstep_um": {"x": pytest.approx(0.496094)},
+        "resolution": {"x": 64},
+    }
+
+
+def test_the_shadow_of_the_mask_measures_the_step_in_the_cameras_frames():
+    camera, size = find_camera("moving-colour-mask"), (96, 128)
+    scene = np.full((*camera.views, *size, 3), 0.5, np.float32)
+    rig, _ = simulated_rig(camera, scene, size, seed=0, rays_per_view=8)
+    rig.attendant.set_lamp("white")
+    rig.attendant.place("whiteboard")
+    axes = ("aperture_x", "aperture_y", "mask_y")
+    rig.stage.home(axes)
+    centred_um = {axis: rig.zero_um[axis] for axis in axes}
+    rig.stage.move_to_um(centred_um | {"aperture_x": centred_um["aperture_x"] + rig.window_um})
+    counted = ZaberStage(
+        rig.chain.transport(), STAGE_AXES, clock=rig.clock, settings=SLOPPY, in_microsteps=True
+    )
+    mask, sensor = camera.masks["mask"], camera.sensor
+    um_per_pixel = sensor.sample_pitch_um * sensor.binning
+    um_per_pixel *= 1 - mask.distance_mm / camera.lens.distance_mm
+    reader = shadow_reader(rig.camera, um_per_pixel)
+    found = fit_step_length(*measure(counted, "mask_x", 20_000, 5, reader))
+    assert found.um_per_step == pytest.approx(AxisSpec().microstep_um, rel=0.01)
+    assert abs(found.um_per_step - AxisSpec().microstep_um) < 3 * found.deviation_um
+    rig.attendant.set_lamp("off")
+    with pytest.raises(CalibrationError, match="no common shadow"):
+        measure(counted, "mask_x", 20_000, 3, shadow_reader(rig.camera, um_per_pixel))
+
+
+@pytest.mark.parametrize(
+    ("steps", "readings", "told"),
+    [
+        ([0, 100], [0, 1], "read at least 3"),
+        ([5, 5, 5], [0, 1, 2], "do not differ"),
+        ([0, 100, 200], [0, float("nan"), 2], "no number"),
+        ([0, 100, 200, 300], [3, 0, 2, 1], "do not follow the axis"),
+    ],
+)
+def test_readings_that_measure_nothing_are_refused(steps, readings, told):
+    with pytest.raises(CalibrationError, match=told):
+        fit_step_length(steps, readings)
+
+
+@pytest.fixture
+def quick_port():
+    spec = replace(COARSE, travel_um=25_000.0, max_speed_um_s=90_000.0, acceleration_um_s2=1e7)
+    with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): spec})) as server:
+        yield server.port
+
+
+def test_the_command_asks_then_measures_and_writes_a_file_that_opens_the_stage(
+    run, quick_port, monkeypatch, tmp_path
+):
+    port = f"zaber:{quick_port}"
+    assert run("devices", "info", "--stage", port)[0] == 1
+    monkeypatch.setattr("sys.stdin", io.StringIO("n\n"))
+    assert run("devices", "scale", "1.1", 10_000, "--stage", port)[0] == 1
+    answers = ["y", *(f"{100 + 2480.47 * number:.0f}" for number in range(3))]
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
+    command = ("scale", "1.1", 10_000, "--stage", port, "--places", 3, "--out", "rig.yaml")
+    code, out, err = run("devices", *command)
+    assert code == 0, err
+    assert "0.4961 um a count" in out
+    written = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    assert written["microstep_um"] == {"1.1": 0.4961}
+    assert written["resolution"] == {"1.1": 64}
+    assert run("devices", "info", "--stage", "rig.yaml")[0] == 0
+    code, _, err = run("devices", *command)
+    assert (code, "exists: name another file" in err) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["1.1", 5], 1, "too few"),
+        (["1.1", 10**9, "--yes"], 1, "counts of travel"),
+        (["mask_x", 500, "--yes"], 1, "use one of 1.1"),
+        (["1.1", 500, "--camera", "simulated"], 2, "belong together"),
+    ],
+)
+def test_a_wrong_call_of_scale_is_one_line(run, quick_port, arguments, code, told):
+    result = run("devices", "scale", *arguments, "--stage", f"zaber:{quick_port}")
+    assert result[0] == code
+    assert told in result[2]

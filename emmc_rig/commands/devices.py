@@ -21,6 +21,7 @@ from rich.table import Table
 
 from emmc_rig.capture.signals import ENDING, handled
 from emmc_rig.commands.device_cameras import register, simulated_protocol
+from emmc_rig.commands.stage_scale import register as register_scale
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 
 register(app)
+register_scale(app)
 
 
 @app.command("list")
@@ -192,7 +194,7 @@ def serve(
             raise AppError(f"--tcp {tcp}: write HOST:PORT, for instance 127.0.0.1:5000")
         server = TcpServer(firmware, host, int(number))
     try:
-        with _signals_interrupt(), server:
+        with signals_interrupt(), server:
             typer.echo(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
             while True:
                 time.sleep(1.0)
@@ -266,7 +268,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
     if rig is not None:
         simulated_protocol(rig)
     logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)
-    with _signals_interrupt(), open_stage(rig or stage or "") as opened:
+    with signals_interrupt(), open_stage(rig or stage or "") as opened:
         try:
             yield opened
         except KeyboardInterrupt as stop:
@@ -279,7 +281,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
 
 
 @contextmanager
-def _signals_interrupt() -> Iterator[None]:
+def signals_interrupt() -> Iterator[None]:
     """Let a request to end, or a closed terminal, act as Ctrl-C does."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
