@@ -163,6 +163,12 @@ class PtpCameraSimulator:
             self._due = None
             self.events.clear()
 
+    def end_session(self) -> None:
+        """Close the session, if one is open; its events go with it, a picture is still stored."""
+        with self._lock:
+            self.session = 0
+            self.events.clear()
+
     def wait_event(self, timeout_s: float) -> Message | None:
         """Return the next event, letting time pass until it comes; None: none in time."""
         with self._lock:
@@ -184,6 +190,8 @@ class PtpCameraSimulator:
         _, exposure_s, transaction = self._due
         self._due = None
         self._store_shot(exposure_s, transaction)
+        if not self.session:
+            self.events.clear()
 
     def respond(self, request: Message, data: bytes) -> Answer:
         """Carry out a request; `data` is what came with it."""
@@ -225,7 +233,7 @@ class PtpCameraSimulator:
         return Answer()
 
     def _close_session(self, *request: object) -> Answer:
-        self.session = 0
+        self.end_session()
         return Answer()
 
     def _storage_ids(self, *request: object) -> Answer:

@@ -511,14 +511,15 @@ def compared(genapi, node, ours, name):
 
 @pytest.mark.peers
 def test_descriptions_of_real_cameras_read_as_in_emvas_library(peer_files):
-    """Values, availability, access and limits of some nodes of each, on empty memory.
+    """Values, availability, access and limits of some nodes of every fourth one, on empty memory.
 
-    EMMC_PEER_NODES=0 compares every node, in a minute.
+    EMMC_PEER_NODES=0 compares every node of every one, in a minute or two.
     """
     genapi = pytest.importorskip("genicam.genapi")
     every = int(os.environ.get("EMMC_PEER_NODES", "30"))
     counted, different = Counter(), []
-    for path in sorted((peer_files / "genicam").glob("*.xml.xz")):
+    paths = sorted((peer_files / "genicam").glob("*.xml.xz"))
+    for path in paths[:: 4 if every else 1]:
         xml = lzma.decompress(path.read_bytes())
         xml = xml[xml.index(b"<") :]
         memory = Memory(b"")
