@@ -154,13 +154,14 @@ class PtpCameraSimulator:
         self._last_handle = FOLDER
         self._shots = 0
         self._due: tuple[float, float, int] | None = None
+        self._orphaned = False
         self._lock = threading.RLock()
 
     def power_up(self) -> None:
         """Forget the session and a capture under way; the card keeps its files."""
         with self._lock:
             self.session = 0
-            self._due = None
+            self._due, self._orphaned = None, False
             self.events.clear()
 
     def end_session(self) -> None:
@@ -168,6 +169,7 @@ class PtpCameraSimulator:
         with self._lock:
             self.session = 0
             self.events.clear()
+            self._orphaned = self._due is not None
 
     def wait_event(self, timeout_s: float) -> Message | None:
         """Return the next event, letting time pass until it comes; None: none in time."""
@@ -189,9 +191,10 @@ class PtpCameraSimulator:
             return
         _, exposure_s, transaction = self._due
         self._due = None
+        before = self.events.copy()
         self._store_shot(exposure_s, transaction)
-        if not self.session:
-            self.events.clear()
+        if self._orphaned:
+            self.events, self._orphaned = before, False
 
     def respond(self, request: Message, data: bytes) -> Answer:
         """Carry out a request; `data` is what came with it."""
