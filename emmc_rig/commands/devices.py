@@ -220,6 +220,7 @@ def bench(
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
+    from emmc_rig.study.benchmarks.trigger import trigger_timing
     from emmc_rig.study.benchmarks.u3v import u3v_timings
 
     with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
@@ -246,10 +247,17 @@ def bench(
                 f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
                 f"{one.gigabytes_per_s:.2f} GB/s"
             )
+        trigger = trigger_timing()
+        typer.echo(
+            f"a frame at each step, {trigger.vibration_ms:g} ms of vibration, "
+            f"{trigger.exposure_ms:g} ms of exposure (simulated): {trigger.asked_ms:.1f} ms asked "
+            f"for, {trigger.triggered_ms:.1f} ms triggered by the stage's arrival"
+        )
         if folder is not None:
             metrics = {
                 "stage_commands": [one.as_dict() for one in timings],
                 "picture": picture.as_dict(),
+                "trigger": trigger.as_dict(),
                 "usb3_vision": [one.as_dict() for one in streams],
                 "command": command_line(),
                 "versions": versions(),
