@@ -28,6 +28,8 @@ _PORT_FAILURES = (serial.SerialException, OSError, _TermiosError)
 """What pyserial lets through when the port breaks; the terminal's own error is no OSError."""
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ECONNREFUSED, errno.EHOSTUNREACH)
+IN_USE = b"Port already in use"
+"""What ser2net, and the simulators' TCP server, say to a second client before they hang up."""
 QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
@@ -231,6 +233,9 @@ class SerialTransport:
             self._unread += self._serial.read(max(1, self._serial.in_waiting))
         except _PORT_FAILURES as error:
             raise PortGoneError(self.port) from error
+        finally:
+            if "://" in self.port and IN_USE in self._unread:
+                raise PortBusyError(self.port, IN_USE.decode(), "another program over the network")
 
     def _take(self, count: int) -> bytes:
         message = bytes(self._unread[:count])

@@ -369,3 +369,18 @@ def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
     assert code == 0
     assert "frame-0001.dng: 240x320 rggb" in told.replace("\n", "")
     assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320
+
+
+def test_a_request_to_end_serving_is_not_called_ctrl_c():
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
+    command = [*PROGRAM, "serve", "zaber"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("zaber:")
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "no longer serving (SIGTERM)" in err
+    assert "Ctrl-C" not in err

@@ -7,6 +7,7 @@ Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -193,8 +194,13 @@ def serve(
         if not (host and number.isdecimal() and int(number) < 2**16):
             raise AppError(f"--tcp {tcp}: write HOST:PORT, for instance 127.0.0.1:5000")
         server = TcpServer(firmware, host, int(number))
+
+    def ended(number: int, frame: FrameType | None) -> None:
+        _told.print(f"emmc-rig: no longer serving ({signal.Signals(number).name})")
+        raise typer.Exit(128 + number)
+
     try:
-        with signals_interrupt(), server:
+        with handled(ended, ENDING), server:
             typer.echo(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
             while True:
                 time.sleep(1.0)
