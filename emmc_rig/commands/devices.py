@@ -155,17 +155,30 @@ def jog(
     to: Annotated[bool, typer.Option("--to", help="move to this place, not by it")] = False,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
+    signal_on: Annotated[
+        int | None,
+        typer.Option("--signal", min=1, help="digital output that rises on arrival (Zaber)"),
+    ] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
     """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
+    from drivers.zaber import ZaberStage
+
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
         if home_first:
             opened.home([axis])
-        move = opened.move_to_um if to else opened.move_by_um
-        typer.echo(f"{axis} at {move({axis: distance_um})[axis]:.3f} um")
+        if signal_on is not None:
+            if not isinstance(opened, ZaberStage):
+                raise AppError("--signal: only Zaber devices raise an output on arrival")
+            target_um = distance_um + (0.0 if to else opened.position_um(axis))
+            at_um = opened.move_and_signal_um(axis, target_um, signal_on)
+        else:
+            move = opened.move_to_um if to else opened.move_by_um
+            at_um = move({axis: distance_um})[axis]
+        typer.echo(f"{axis} at {at_um:.3f} um")
 
 
 @app.command()
@@ -308,7 +321,7 @@ def signals_interrupt() -> Iterator[None]:
 def _show(stage: HostStage) -> None:
     from drivers.errors import NotHomedError
 
-    table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)
+    table = Table("axis", "homed", "position um", "limits um", "speed um/s", "up to", box=SIMPLE)
     for axis in stage.axes:
         low_um, high_um = stage.limits_um(axis)
         try:
@@ -316,6 +329,11 @@ def _show(stage: HostStage) -> None:
         except NotHomedError:
             homed, position = "no", "unknown"
         table.add_row(
-            axis, homed, position, f"{low_um:g} to {high_um:g}", f"{stage.speed_um_s(axis):g}"
+            axis,
+            homed,
+            position,
+            f"{low_um:g} to {high_um:g}",
+            f"{stage.speed_um_s(axis):g}",
+            f"{stage.top_speed_um_s(axis):g}",
         )
     Console().print(table)
