@@ -58,6 +58,7 @@ def scale(
     from calibration.stage_scale import fit_step_length
     from drivers.errors import DriverError
     from emmc_rig.commands.devices import signals_interrupt
+    from emmc_rig.files.folders import refuse_inside_session
     from emmc_rig.rig.hardware import open_camera, open_stage
     from emmc_rig.rig.stage_config import parse_stage
 
@@ -65,8 +66,10 @@ def scale(
         raise AppError(f"{counts} counts are too few to measure: move at least {SMALLEST_COUNT}")
     if (camera is None) != (um_per_pixel is None):
         raise typer.BadParameter("--camera and --um-per-pixel belong together")
-    if out is not None and out.exists():
-        raise AppError(f"{out} exists: name another file")
+    if out is not None:
+        refuse_inside_session(out.parent)
+        if out.exists():
+            raise AppError(f"{out} exists: name another file")
     config = parse_stage(stage)
     settings = {"approach_um": APPROACH_SHARE * counts}
     try:
