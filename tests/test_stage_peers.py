@@ -21,7 +21,7 @@ from simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 QUICK = AxisSpec(max_speed_um_s=200_000.0, acceleration_um_s2=2e7)
 
 

@@ -71,8 +71,8 @@ def test_aravis_takes_exact_frames_from_the_simulated_camera_through_libusb(peer
             assert frame["whole"]
             assert frame["equal"]
             assert frame["format"] == "BayerGB12p"
-        blocks = [frame["block"] for frame in frames]
-        assert blocks == sorted(set(blocks))
+        # The second may begin with a frame of the first that was still under way.
+        assert len({frame["block"] for frame in frames}) == len(frames)
 
 
 def test_our_driver_takes_exact_frames_through_libusb(peer):

@@ -94,6 +94,11 @@ def acquired(camera, stream):
         )
         stream.push_buffer(buffer)
     camera.stop_acquisition()
+    late = []
+    while (buffer := stream.try_pop_buffer()) is not None:
+        late.append(buffer)
+    for buffer in late:
+        stream.push_buffer(buffer)
     return frames
 
 
