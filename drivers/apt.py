@@ -40,22 +40,23 @@ FAULTS_BY_BIT: Mapping[StatusBit, tuple[type[AxisFaultError], str]] = {
 
 @dataclass(frozen=True)
 class Actuator:
-    """A motor with its encoder: counts for each micrometre, and how far it travels from home."""
+    """A motor with its encoder: counts for each micrometre, travel from home, fastest speed."""
 
     counts_per_um: float
     travel_um: float
+    top_speed_um_s: float
 
 
 ACTUATORS = {
-    "z806": Actuator(34.304, 6_000.0),
-    "z812": Actuator(34.304, 12_000.0),
-    "z825": Actuator(34.304, 25_000.0),
-    "mts25-z8": Actuator(34.304, 25_000.0),
-    "mts50-z8": Actuator(34.304, 50_000.0),
-    "z825b": Actuator(34.55496, 25_000.0),
+    "z806": Actuator(34.304, 6_000.0, 2_600.0),
+    "z812": Actuator(34.304, 12_000.0, 2_600.0),
+    "z825": Actuator(34.304, 25_000.0, 2_600.0),
+    "mts25-z8": Actuator(34.304, 25_000.0, 2_400.0),
+    "mts50-z8": Actuator(34.304, 50_000.0, 2_400.0),
+    "z825b": Actuator(34.55496, 25_000.0, 2_600.0),
 }
-"""Counts per millimetre from "Scaling parameters" of the protocol document, by stage."""
-DEFAULT_ACTUATOR = "z825"
+"""By stage: counts per millimetre from "Scaling parameters" of the protocol document, travel and
+maximum velocity from the data sheets. No controller tells which one is plugged in."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class AptAxis:
     """
 
     transport: Transport
-    actuator: Actuator = ACTUATORS[DEFAULT_ACTUATOR]
+    actuator: Actuator
     destination: int = codec.USB_UNIT
     channel: int = 1
 
@@ -197,7 +198,7 @@ class AptStage(HostStage):
             raise CommandRefusedError(Id.MOT_SET_VELPARAMS.name, reply, axis, advice)
 
     def _top_speed_um_s(self, axis: str) -> float:
-        return (2**31 - 1) / codec.velocity_units(1.0, self._channels[axis].actuator.counts_per_um)
+        return self._channels[axis].actuator.top_speed_um_s
 
     def _homing_speed_um_s(self, axis: str) -> float:
         return self._home_speeds_um_s[axis]
@@ -374,7 +375,8 @@ def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> codec.Hardwar
 
     Raises `TransportTimeoutError` or `GarbledReplyError` when none is there.
     """
-    channel = _Channel("the controller", AptAxis(transport), {transport: _Link(transport, clock)})
+    anything = AptAxis(transport, next(iter(ACTUATORS.values())))
+    channel = _Channel("the controller", anything, {transport: _Link(transport, clock)})
     return codec.decode_info(channel.query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False))
 
 

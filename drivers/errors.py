@@ -2,6 +2,15 @@
 
 from typing import Self
 
+SHOWN_BYTES = 48
+
+
+def _shown(raw: bytes) -> str:
+    """Return bytes for a message: all of a few, the beginning and the number of many."""
+    if len(raw) <= SHOWN_BYTES:
+        return repr(raw)
+    return f"{raw[:SHOWN_BYTES]!r}... ({len(raw)} bytes)"
+
 
 class DriverError(Exception):
     """Root of the drivers' errors; shown to the user as one line.
@@ -92,7 +101,7 @@ class TransportTimeoutError(DriverError):
     """No complete answer arrived in time; `partial` is what did arrive."""
 
     def __init__(self, port: str, timeout_s: float, partial: bytes = b"") -> None:
-        got = f"only {partial!r}" if partial else "nothing"
+        got = f"only {_shown(partial)}" if partial else "nothing"
         super().__init__(
             f"{port} answered {got} within {timeout_s:g} s", "check power, baud rate and address"
         )
@@ -105,7 +114,9 @@ class GarbledReplyError(DriverError):
     """Bytes arrived that are not a valid message, or contradict each other."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
-        super().__init__(f"garbled reply {raw!r} ({reason})", "check the cable and the baud rate")
+        super().__init__(
+            f"garbled reply {_shown(raw)} ({reason})", "check the cable and the baud rate"
+        )
         self.raw = raw
         self.reason = reason
 
@@ -165,6 +176,13 @@ class SpeedFixedError(DriverError):
 
     def __init__(self, axis: str, advice: str) -> None:
         super().__init__(f"the speed of {axis} cannot be chosen", advice, axis=axis)
+
+
+class ScaleError(DriverError):
+    """The length of an axis's step is unknown or contradicted; nothing was moved."""
+
+    def __init__(self, axis: str, what: str, advice: str) -> None:
+        super().__init__(f"{axis} must not move, {what}", advice, axis=axis)
 
 
 class NotHomedError(DriverError):

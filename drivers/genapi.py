@@ -18,13 +18,15 @@ from functools import lru_cache
 from typing import Literal, Protocol, TypeVar
 from xml.etree import ElementTree
 
+import numpy as np
+
 from drivers.errors import CameraDescriptionError, CameraSettingError
 from drivers.genapi_formula import Formula, Number
 
 XML_LIMIT = 32 << 20
 TEXT_LIMIT = 4096
 DEPTH_LIMIT = 40
-WORK_LIMIT = 2000
+WORK_LIMIT = 20_000
 """Nodes that one access may visit: a description can make the count grow without bound."""
 
 Value = int | float | str | bool
@@ -91,6 +93,7 @@ class Features:
         self._port = port
         self._nodes = _read_nodes(xml)
         self._kept: dict[str, Number] = {}
+        self._accesses: dict[int, Access] = {}
         self._work = 0
         self._depth = 0
 
@@ -99,11 +102,11 @@ class Features:
 
     def has(self, name: str) -> bool:
         """Whether the camera describes the feature and offers it now."""
-        return name in self._nodes and self._asked(name, self._offered)
+        return name in self._nodes and len(self._asked(name, self._access)) > 1
 
     def is_writable(self, name: str) -> bool:
         """Whether the feature is there and may be changed now."""
-        return name in self._nodes and self._asked(name, self._writable)
+        return name in self._nodes and WRITE in self._asked(name, self._access)
 
     def value(self, name: str) -> Value:
         """Return a number, a truth, a text, or the name of a choice."""
@@ -144,6 +147,7 @@ class Features:
     def _asked(self, name: str, answer: Callable[[_Node], _Answer]) -> _Answer:
         self._work = 0
         self._depth = 0
+        self._accesses.clear()
         try:
             return answer(self._node(name))
         except (ArithmeticError, LookupError, RecursionError, ValueError, struct.error) as error:
@@ -182,7 +186,8 @@ class Features:
     def _text(self, node: _Node) -> str:
         with self._step(node):
             if node.kind == "StringReg":
-                raw = self._port.read(self._address(node), self._length(node, TEXT_LIMIT))
+                length = self._length(node, TEXT_LIMIT, least=0)
+                raw = self._port.read(self._address(node), length) if length else b""
                 return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
             if node.kind == "String":
                 target = node.text("pValue")
@@ -299,9 +304,9 @@ class Features:
             raise CameraDescriptionError(f"{node.name} lies at {address:#x}")
         return address
 
-    def _length(self, node: _Node, most: int) -> int:
+    def _length(self, node: _Node, most: int, least: int = 1) -> int:
         length = int(self._linked(node, "Length", 0))
-        if not 0 < length <= most:
+        if not least <= length <= most:
             raise CameraDescriptionError(f"{node.name} is {length} bytes long")
         return length
 
@@ -355,6 +360,8 @@ class Features:
     def _limits(self, node: _Node) -> Limits:
         with self._step(node):
             if node.kind in ("Converter", "IntConverter"):
+                if (node.text("Slope") or "").strip() == "Varying":
+                    return _OPEN["Integer" if node.kind == "IntConverter" else "Float"]
                 ends = self._limits(self._node(node.text("pValue")))
                 low, high = sorted(self._formula(node, "FormulaFrom", {"TO": end}) for end in ends)
             elif node.kind in _REGISTERS:
@@ -371,13 +378,14 @@ class Features:
             return low, high
 
     def _register_limits(self, node: _Node) -> Limits:
-        if node.kind == "FloatReg":
-            return _OPEN["Float"]
         length = self._length(node, 8)
+        if node.kind == "FloatReg":
+            most = float(np.finfo(np.float32).max) if length == 4 else math.inf
+            return -most, most
         width = _bits(node, length)[1] if node.kind == "MaskedIntReg" else 8 * length
         if (node.text("Sign") or "").strip() == "Signed":
             return -(1 << width - 1), (1 << width - 1) - 1
-        return 0, (1 << width) - 1
+        return 0, min((1 << width) - 1, _OPEN["Integer"][1])
 
     def _entries(self, node: _Node) -> Iterator[_Node]:
         return (item.node for item in node.all("EnumEntry") if item.node is not None)
@@ -385,37 +393,66 @@ class Features:
     def _choices(self, node: _Node) -> tuple[str, ...]:
         if node.kind != "Enumeration":
             raise CameraDescriptionError(f"{node.name} ({node.kind}) has no choices")
-        return tuple(entry.name for entry in self._entries(node) if self._offered(entry))
+        return tuple(entry.name for entry in self._entries(node) if READ in self._access(entry))
 
-    def _offered(self, node: _Node) -> bool:
-        with self._step(node):
-            for tag in ("pIsImplemented", "pIsAvailable"):
-                condition = node.text(tag)
-                if condition is not None and not self._number(self._node(condition)):
-                    return False
-            target = node.text("pValue")
-            return target is None or self._offered(self._node(target))
+    def _access(self, node: _Node) -> Access:
+        """Return what may be done with a node now, and whether the camera has it at all.
 
-    def _writable(self, node: _Node) -> bool:
+        It is there while its own conditions hold, what its formula, its address or its limits
+        are worked out from can be read, and something of an enumeration or a category is there.
+        It can do no more than the node that holds its value.
+        """
+        known = self._accesses.get(id(node))
+        if known is None:
+            self._accesses[id(node)] = EVERYTHING  # of a node that its own conditions lead to
+            known = self._accesses[id(node)] = self._worked_out_access(node)
+        return known
+
+    def _worked_out_access(self, node: _Node) -> Access:
         with self._step(node):
-            modes = (node.text("AccessMode"), node.text("ImposedAccessMode"))
-            if node.kind in ("SwissKnife", "IntSwissKnife", "Category") or "RO" in modes:
-                return False
-            lock = node.text("pIsLocked")
-            if lock is not None and self._number(self._node(lock)):
-                return False
-            for tag in ("pIsImplemented", "pIsAvailable"):
-                condition = node.text(tag)
-                if condition is not None and not self._number(self._node(condition)):
-                    return False
-            target = self._target(node) if node.kind in _PLAIN else None
-            if node.kind in ("Converter", "IntConverter", "Command"):
-                name = node.text("pValue")
-                target = None if name is None else self._node(name)
-            return target is None or self._writable(target)
+            if not self._holds(node.text("pIsImplemented")):
+                return ABSENT
+            access = self._own_access(node)
+            if not self._holds(node.text("pIsAvailable")):
+                access &= UNAVAILABLE
+            for one in self._inputs(node):
+                access &= EVERYTHING_OF[self._access(one) & READABLE]
+            if node.kind == "Enumeration":
+                entries = (self._access(entry) for entry in self._entries(node))
+                access &= EVERYTHING_OF[frozenset().union(*entries) & READABLE]
+            elif node.kind == "Category":
+                features = [self._access(self._node(one.text)) for one in node.all("pFeature")]
+                return READABLE if any(features) else ABSENT
+            target = self._target(node) if node.kind in _HOLDING else None
+            return access if target is None else access & self._access(target)
+
+    def _holds(self, condition: str | None) -> bool:
+        """Return whether a condition holds; one that cannot be read does not."""
+        if condition is None:
+            return True
+        node = self._node(condition)
+        return READ in self._access(node) and bool(self._number(node))
+
+    def _own_access(self, node: _Node) -> Access:
+        """Return what the node's own element allows."""
+        access = READABLE if node.kind in _COMPUTED else EVERYTHING
+        for tag in ("AccessMode", "ImposedAccessMode"):
+            access &= ACCESS_MODES.get((node.text(tag) or "").strip(), EVERYTHING)
+        lock = node.text("pIsLocked")
+        if lock is not None and self._number(self._node(lock)):
+            access &= READABLE
+        return access
+
+    def _inputs(self, node: _Node) -> Iterator[_Node]:
+        """Yield the nodes that a formula, an address or limits are worked out from."""
+        for item in node.items:
+            if item.tag in _INPUTS:
+                yield self._node(item.text)
+            elif item.tag == "IntSwissKnife" and item.node is not None:
+                yield item.node
 
     def _set(self, node: _Node, value: Value) -> None:
-        if not self._writable(node):
+        if WRITE not in self._access(node):
             raise CameraSettingError(node.name, "cannot be changed now: stop the acquisition first")
         if node.kind in ("StringReg", "String"):
             self._set_text(node, str(value))
@@ -465,7 +502,7 @@ class Features:
     def _execute(self, node: _Node) -> None:
         if node.kind != "Command":
             raise CameraDescriptionError(f"{node.name} ({node.kind}) is no command")
-        if not self._writable(node):
+        if WRITE not in self._access(node):
             raise CameraSettingError(node.name, "cannot be carried out now")
         order = self._linked(node, "CommandValue", 1)
         self._store(self._node(node.text("pValue")), order)
@@ -561,6 +598,17 @@ def _bits(node: _Node, length: int) -> tuple[int, int]:
     return low, high - low + 1
 
 
+HAS, READ, WRITE = "has", "reads", "writes"
+Access = frozenset[str]
+"""What a camera has of a feature, and what it lets be done with it now."""
+ABSENT: Access = frozenset()
+UNAVAILABLE, READABLE = Access((HAS,)), Access((HAS, READ))
+EVERYTHING = Access((HAS, READ, WRITE))
+ACCESS_MODES = {"RO": READABLE, "WO": Access((HAS, WRITE)), "RW": EVERYTHING}
+EVERYTHING_OF = {READABLE: EVERYTHING, UNAVAILABLE: UNAVAILABLE, ABSENT: ABSENT}
+"""What may be left of a node by what it is worked out from."""
+_INPUTS = ("pVariable", "pAddress", "pIndex", "pMin", "pMax", "pInc")
+_COMPUTED = ("SwissKnife", "IntSwissKnife", "Category", "EnumEntry")
 _ENDS = ("LSB", "MSB")
 _ORDERS: dict[str, Literal["little", "big"]] = {"<": "little", ">": "big"}
 _FLOATS = {4: "f", 8: "d"}
@@ -573,6 +621,7 @@ _PLAIN: dict[str, Callable[[str], Number]] = {
     "Command": _integer,
 }
 """Nodes that hold a value or name the node that does, and how a value in the XML is read."""
+_HOLDING = (*_PLAIN, "String", "Converter", "IntConverter")
 _OPEN: dict[str, Limits] = {
     "Integer": (-(1 << 63), (1 << 63) - 1),
     "Float": (-math.inf, math.inf),

@@ -3,8 +3,10 @@
 Nothing of the text is ever run as code. Order and meaning of the operators are those of EMVA's
 reference implementation (GenApi 3.5, package `genicam`), which are not C's: comparisons, `&&`,
 `||` and `?:` are equal in rank, and so are `**`, shifts and the operators on bits, which bind
-most; equals go from left to right. `=` is equality, `<>` inequality; integers have 64 bits and
-divide towards zero.
+most; equals go from left to right. A minus before a number or a variable belongs to that alone,
+before anything else to all that follows: `-(5)+3` is -8. `=` is equality, `<>` inequality;
+integers have 64 bits and divide towards zero; in floating point LN(0) is minus infinity, and what
+has no value is not a number.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 Number = int | float
 Lookup = Callable[[str], Number]
 Evaluate = Callable[["_Scope"], Number]
@@ -22,7 +26,7 @@ Join = Callable[["_Scope", Number, Evaluate], Number]
 """What a binary operator does with the value on its left; its right side may go unasked."""
 
 LENGTH_LIMIT = 10_000
-DEPTH_LIMIT = 50
+DEPTH_LIMIT = 80
 
 _TOKEN = re.compile(
     r"\s*(?:(0[xX][0-9a-fA-F]+)|(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
@@ -50,20 +54,20 @@ FUNCTIONS: dict[str, Callable[..., Number]] = {
     "SGN": lambda x: (x > 0) - (x < 0),
     "NEG": lambda x: -x,
     "ABS": lambda x: abs(x),
-    "SQRT": math.sqrt,
-    "SIN": math.sin,
-    "COS": math.cos,
-    "TAN": math.tan,
-    "ASIN": math.asin,
-    "ACOS": math.acos,
-    "ATAN": math.atan,
-    "EXP": math.exp,
-    "LN": math.log,
-    "LG": math.log10,
+    "SQRT": np.sqrt,
+    "SIN": np.sin,
+    "COS": np.cos,
+    "TAN": np.tan,
+    "ASIN": np.arcsin,
+    "ACOS": np.arccos,
+    "ATAN": np.arctan,
+    "EXP": np.exp,
+    "LN": np.log,
+    "LG": np.log10,
     "TRUNC": lambda x: math.trunc(x),
     "FLOOR": math.floor,
     "CEIL": math.ceil,
-    "ROUND": lambda x: math.floor(abs(x) + 0.5) * (1 if x >= 0 else -1),
+    "ROUND": lambda x, places=0: _rounded(x, places),
 }
 
 
@@ -81,6 +85,12 @@ class _Scope:
         if self.integers:
             return _wrapped(value) if isinstance(value, int) else value
         return float(value)
+
+    def called(self, function: Callable[..., Number], *values: Number) -> Number:
+        """Return a function's value; in integers what has none is an error."""
+        with np.errstate(all="raise" if self.integers else "ignore"):
+            found = function(*values)
+        return found.item() if isinstance(found, np.generic) else found
 
 
 class Formula:
@@ -147,13 +157,21 @@ class Formula:
         self._depth += 1
         if self._depth > DEPTH_LIMIT:
             raise FormulaError("the formula is nested deeper than allowed")
-        operand = self._signed()
+        takes_all = symbol == "-" and not self._is_plain()
+        operand = self._choice() if takes_all else self._signed()
         self._depth -= 1
         if symbol == "-":
             return lambda scope: -operand(scope)
         if symbol == "~":
             return lambda scope: scope.number(~_integer(operand(scope)))
         return operand
+
+    def _is_plain(self) -> bool:
+        """Return whether a number or a variable comes next, or another sign."""
+        kind, text = self._tokens[self._at] if self._at < len(self._tokens) else ("", "")
+        if kind == "name":
+            return text not in FUNCTIONS or self._tokens[self._at + 1 :][:1] != [("symbol", "(")]
+        return kind == "number" or text in ("-", "+")
 
     def _single(self) -> Evaluate:
         if self._takes("("):
@@ -169,9 +187,13 @@ class Formula:
         if kind != "name":
             raise FormulaError(f"{text!r} is out of place in a formula")
         if text in FUNCTIONS and self._takes("("):
-            function, operand = FUNCTIONS[text], self._choice()
+            function, operands = FUNCTIONS[text], [self._choice()]
+            if text == "ROUND" and self._takes(","):
+                operands.append(self._choice())
             self._needs(")")
-            return lambda scope: scope.number(function(operand(scope)))
+            return lambda scope: scope.number(
+                scope.called(function, *(operand(scope) for operand in operands))
+            )
         if text in CONSTANTS:
             constant = CONSTANTS[text]
             return lambda scope: constant
@@ -254,7 +276,16 @@ def _power(base: Number, exponent: Number, integers: bool) -> Number:
     if integers and isinstance(base, int) and isinstance(exponent, int) and exponent >= 0:
         # Reduced on the way: the whole power could have more digits than memory.
         return pow(base, exponent, 1 << 64)
-    return math.pow(base, exponent)
+    with np.errstate(all="raise" if integers else "ignore"):
+        return float(np.power(float(base), float(exponent)))
+
+
+def _rounded(value: Number, places: Number) -> Number:
+    """Return the nearest number of so many decimal places, halves away from zero."""
+    if not math.isfinite(value):
+        return value
+    scale = 10.0 ** int(places)
+    return math.floor(abs(value) * scale + 0.5) / scale * (1 if value >= 0 else -1)
 
 
 def _integer(value: Number) -> int:

@@ -12,6 +12,7 @@ from drivers.errors import (
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
+    ScaleError,
     StalledError,
     TransportTimeoutError,
 )
@@ -32,6 +33,10 @@ POLL_S = 0.05
 AXIS_LETTERS = "XYZABC"
 REPORT_STEP_UM = 1.0
 """Reports have three decimals of a millimetre."""
+FACTORY_STEPS_PER_MM = 250.0
+"""What `$100` to `$105` hold before anybody has set them (Grbl's defaults.h, generic)."""
+SCALES_AGREE = 1e-3
+"""Relative; Grbl shows three decimals of steps per millimetre."""
 ALL_AXES = "every axis"
 REFUSAL_ADVICE = {
     5: "switch homing on ($22=1) and wire its limit switches",
@@ -57,9 +62,11 @@ class GrblStage(HostStage):
 
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
     not tell whether it was homed, so every axis must be homed after connecting. Homing some of
-    the axes needs firmware that homes them one by one (option H of `$I`). Construction waits up
-    to `boot_s` for the controller to start; it moves nothing. Raises `TransportTimeoutError` when
-    it does not answer.
+    the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
+    controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
+    be, without which the firmware's default counts as never set. `any_scale` skips that: only to
+    measure it. Construction waits up to `boot_s` for the controller to start; it moves nothing.
+    Raises `ScaleError`, or `TransportTimeoutError` when the controller does not answer.
     Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
     """
 
@@ -70,6 +77,8 @@ class GrblStage(HostStage):
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
         boot_s: float = BOOT_S,
+        steps_per_mm: Mapping[str, float] | None = None,
+        any_scale: bool = False,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         for letter in axes.values():
@@ -78,12 +87,21 @@ class GrblStage(HostStage):
         self._transport = transport
         self._letters = dict(axes)
         self._boot_s = boot_s
+        self._stated_steps_per_mm = dict(steps_per_mm or {})
+        self._any_scale = any_scale
+        for axis in self._stated_steps_per_mm:
+            self._require_axis(axis)
         self._start_up()
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move; it is the host's to choose, up to the axis's `$110`."""
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
+
+    def steps_per_mm(self, axis: str) -> float:
+        """Return what the controller takes for a millimetre, its `$100` and following."""
+        self._require_axis(axis)
+        return self._positive(codec.STEPS_PER_MM, axis)
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
@@ -101,7 +119,8 @@ class GrblStage(HostStage):
         self._distrust_all("it was not homed since it was connected")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
-            step_um = 1e3 / self._positive(codec.STEPS_PER_MM, axis)
+            self._check_scale(axis)
+            step_um = 1e3 / self.steps_per_mm(axis)
             check_tolerance(axis, self._settings.tolerance_um, step_um + REPORT_STEP_UM)
 
     def _read(self, axis: str) -> Reading:
@@ -174,6 +193,26 @@ class GrblStage(HostStage):
         seek_um_s = self._controller.settings.get(codec.HOMING_SEEK, 0.0) / 60 * 1e3
         top_um_s = self._top_speed_um_s(axis)
         return min(seek_um_s, top_um_s) if seek_um_s > 0 else top_um_s
+
+    def _check_scale(self, axis: str) -> None:
+        steps_per_mm, stated = self.steps_per_mm(axis), self._stated_steps_per_mm.get(axis)
+        setting = f"${codec.STEPS_PER_MM + self._index(axis)}"
+        if self._any_scale:
+            return
+        if stated is None and steps_per_mm == FACTORY_STEPS_PER_MM:
+            raise ScaleError(
+                axis,
+                f"{setting}={steps_per_mm:g} steps per mm is the firmware's default",
+                f"set {setting} to what motor and screw make, or confirm it as steps_per_mm in "
+                "the stage's YAML file after `emmc-rig devices scale`",
+            )
+        if stated is not None and abs(stated / steps_per_mm - 1) > SCALES_AGREE:
+            raise ScaleError(
+                axis,
+                f"{stated:g} steps per mm were stated, but the controller has "
+                f"{setting}={steps_per_mm:g}",
+                f"send it `{setting}={stated:g}`, or correct steps_per_mm",
+            )
 
     def _index(self, axis: str) -> int:
         return AXIS_LETTERS.index(self._letters[axis])

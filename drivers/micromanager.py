@@ -8,6 +8,7 @@ MMDevice, interface version 75: exposures in ms, places in um.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -527,6 +528,18 @@ class MicroManagerStage(HostStage):
         with calling(f"read {setup.speed_property}"):
             shown = self._loaded.core.getProperty(label, setup.speed_property)
         return float(shown) * setup.speed_unit_um_s
+
+    def _top_speed_um_s(self, axis: str) -> float:
+        """Return the property's upper limit; one without limits is refused by the core itself."""
+        label, _ = self._place(axis)
+        setup = self._setup
+        if not setup.speed_property:
+            return setup.speed_um_s
+        with calling(f"read the limits of {setup.speed_property}"):
+            core = self._loaded.core
+            if not core.hasPropertyLimits(label, setup.speed_property):
+                return math.inf
+            return core.getPropertyUpperLimit(label, setup.speed_property) * setup.speed_unit_um_s
 
     def _apply_speed(self, axis: str, speed_um_s: float) -> None:
         setup = self._setup

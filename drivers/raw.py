@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import math
 import struct
 import threading
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,16 @@ from drivers.plain_dng import read_in_place
 
 Array = np.ndarray
 
-TIFF_MAGICS = (b"II*\x00", b"MM\x00*")
+TIFF_MAGICS = {
+    b"II*\x00": b"II*\x00",
+    b"MM\x00*": b"MM\x00*",
+    b"IIRO": b"II*\x00",
+    b"IIRS": b"II*\x00",
+    b"MMOR": b"MM\x00*",
+    b"IIU\x00": b"II*\x00",
+}
+"""First bytes of files that are laid out as TIFF, with TIFF's own: Olympus and Panasonic differ."""
+PANASONIC = b"IIU\x00"
 EXPOSURE_TIME_TAG = 33434
 EXIF_TAG = 34665
 IMAGE_DESCRIPTION_TAG = 270
@@ -46,6 +56,29 @@ TOLD_IN_EXIF = {
 
 HASH_BESIDE_BYTES = 1 << 20
 """From here on a file is hashed in a thread of its own, while LibRaw decodes it."""
+
+FEWEST_BITS_PER_PIXEL = 0.25
+"""Of a whole file: lossless coding takes at least one, the lossy ones of cameras 1.5 and more."""
+PENTAX_PEF = 65535
+BITS_PER_SAMPLE_AT_LEAST = {
+    tifffile.COMPRESSION.JPEG: 1.0,
+    PENTAX_PEF: 1.0,
+    tifffile.COMPRESSION.NIKON_NEF: 1.0,
+    tifffile.COMPRESSION.SONY_ARW: 1.0,
+}
+"""By compression of a TIFF-based RAW image: a Huffman code has at least one bit."""
+MOSAIC_PHOTOMETRICS = (tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW)
+RW2_PIXELS_PER_BLOCK = {
+    (4, 12): 14,
+    (5, 12): 10,
+    (5, 14): 9,
+    (6, 12): 14,
+    (6, 14): 11,
+    (7, 12): 10,
+    (7, 14): 9,
+}
+"""By raw format (0x2D) and bits (0x0A) of a Panasonic: pixels in a block of 16 bytes (LibRaw,
+panasonic_load_raw, panasonicC6_load_raw, panasonicC7_load_raw)."""
 
 _DAMAGED = (
     tifffile.TiffFileError,
@@ -93,10 +126,11 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
 
     The mosaic of a plain uncompressed DNG is a view of `data`; LibRaw decodes all others.
 
-    Raises `RawFrameError` for bytes that are no RAW file, a TIFF-based file (DNG, NEF, CR2, ...)
-    that is torn, or a mosaic whose `(y, x)` is not `expected_shape`. A torn uncompressed DNG
-    decodes without complaint, so the file's own table of contents is checked first. A flipped bit
-    cannot be told from light: keep `sha256`.
+    Raises `RawFrameError` for bytes that are no RAW file, that are torn, or too few for their
+    picture, or a mosaic whose `(y, x)` is not `expected_shape`. LibRaw reports most damage, but
+    fills what is missing of a plain DNG, of an empty tile or of a Panasonic's RW2 with zeros: the
+    table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked first. A
+    flipped bit that still decodes cannot be told from light: keep `sha256`.
     """
     if not data:
         raise RawFrameError("it is empty")
@@ -139,9 +173,12 @@ def decode_by_libraw(data: bytes) -> tuple[Array, Array, int, str]:
         with rawpy.imread(io.BytesIO(data)) as raw:
             mosaic = raw.raw_image_visible.copy()
             black_level_dn, cfa = _read_levels_and_phase(raw)
-            return mosaic, black_level_dn, int(raw.white_level), cfa
+            white_level_dn = int(raw.white_level)
     except (rawpy.LibRawError, NotImplementedError, *_DAMAGED) as error:
         raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
+    if 8 * len(data) < FEWEST_BITS_PER_PIXEL * mosaic.size:
+        raise RawFrameError(f"its {len(data)} bytes cannot hold {_size(mosaic.shape)} pixels (y x)")
+    return mosaic, black_level_dn, white_level_dn, cfa
 
 
 @contextmanager
@@ -183,11 +220,17 @@ def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
 def _read_tiff(data: bytes) -> _Told:
     """Return what the tags say, having checked that every strip lies inside the file."""
     try:
-        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        magic = data[:4]
+        plain = TIFF_MAGICS[magic] == magic
+        stream = io.BytesIO(data if plain else TIFF_MAGICS[magic] + data[4:])
+        with tifffile.TiffFile(stream) as tiff:
             pages = list(tiff.pages)
             for page in pages:
                 pages.extend(page.pages or ())
-            missing = max(_bytes_missing(page, len(data)) for page in pages)
+            if magic == PANASONIC:
+                missing = _rw2_bytes_missing(tiff.pages.first.tags, len(data))
+            else:
+                missing = max(_bytes_missing(page, len(data)) for page in pages)
             tags = tiff.pages.first.tags
             exif = tags.valueof(EXIF_TAG)
             exif = exif if isinstance(exif, dict) else {}
@@ -195,7 +238,7 @@ def _read_tiff(data: bytes) -> _Told:
             description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
             metadata = {name: tags.valueof(tag) for name, tag in TOLD.items()}
             metadata |= {name: exif.get(key) for name, key in TOLD_IN_EXIF.items() if key in exif}
-            pixels = read_in_place(data, tiff) if missing <= 0 else None
+            pixels = read_in_place(data, tiff) if plain and missing <= 0 else None
     except _DAMAGED as error:
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
@@ -219,17 +262,33 @@ def _shown(value: object) -> str:
 def _bytes_missing(page: Any, file_size: int) -> int:
     """Return how many bytes of the page's pixels cannot be in a file of that size.
 
-    Either its strips end beyond the file, or they are too short for an uncompressed image.
+    Either its strips end beyond the file, or they are too short for the image.
     """
     beyond = [
         offset + count - file_size
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
     ]
-    short = 0
+    bits = 0.0
     if page.compression == tifffile.COMPRESSION.NONE:
-        pixels = page.imagewidth * page.imagelength * page.samplesperpixel
-        short = (pixels * page.bitspersample + 7) // 8 - sum(page.databytecounts)
+        bits = page.bitspersample
+    elif page.photometric in MOSAIC_PHOTOMETRICS:
+        bits = BITS_PER_SAMPLE_AT_LEAST.get(page.compression, 0.0)
+    samples = page.imagewidth * page.imagelength * page.samplesperpixel
+    short = math.ceil(samples * bits / 8) - sum(page.databytecounts)
     return max([short, *beyond])
+
+
+def _rw2_bytes_missing(tags: Any, file_size: int) -> int:
+    """Return how many bytes of a Panasonic's pixels cannot be in a file of that size.
+
+    Their place is tag 0x118; the strip's own offset and length stand for nothing there. An
+    unknown coding has at least one bit for each pixel.
+    """
+    width, height = tags.valueof(0x02), tags.valueof(0x03)
+    offset = tags.valueof(0x118) or max(tags.valueof(0x111))
+    per_block = RW2_PIXELS_PER_BLOCK.get((tags.valueof(0x2D), tags.valueof(0x0A)))
+    needed = height * (width // per_block) * 16 if per_block else height * width // 8
+    return offset + needed - file_size
 
 
 def _exposure_s(tags: Any, exif: Mapping[str, Any]) -> float | None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import NamedTuple, Protocol, Self, TypeVar
 
 from drivers.clock import Clock
@@ -81,6 +82,10 @@ class Stage(Protocol):
         """Return the speed of a move."""
         ...
 
+    def top_speed_um_s(self, axis: str) -> float:
+        """Return the fastest speed that `set_speed_um_s` accepts."""
+        ...
+
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Choose the speed of the moves that follow, also after a reconnect."""
         ...
@@ -116,6 +121,7 @@ class StageSettings:
     `settle_s`: pause between standing still and being used.
     `soft_limits_um`: limits by axis, narrower than the device's own.
     `speeds_um_s`: speed by axis, instead of the device's own; restored after every reconnect.
+    `top_speeds_um_s`: highest speed by axis, from the data sheet, below what the device allows.
     """
 
     approach_um: float = 10.0
@@ -124,6 +130,7 @@ class StageSettings:
     poll_s: float = 0.02
     soft_limits_um: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     speeds_um_s: Mapping[str, float] = field(default_factory=dict)
+    top_speeds_um_s: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for settings no stage can work with."""
@@ -203,7 +210,8 @@ class HostStage(ABC):
         self._settings = settings
         self._speeds_um_s = dict(settings.speeds_um_s)
         self._not_trusted: dict[str, str] = {}
-        for axis in (*settings.soft_limits_um, *settings.speeds_um_s):
+        chosen = (settings.soft_limits_um, settings.speeds_um_s, settings.top_speeds_um_s)
+        for axis in chain.from_iterable(chosen):
             self._require_axis(axis)
 
     @abstractmethod
@@ -239,6 +247,10 @@ class HostStage(ABC):
         """Make the axis move at this speed from now on."""
 
     @abstractmethod
+    def _top_speed_um_s(self, axis: str) -> float:
+        """Return the fastest speed that the device can give the axis."""
+
+    @abstractmethod
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
 
@@ -249,10 +261,6 @@ class HostStage(ABC):
     def _homing_speed_um_s(self, axis: str) -> float:
         """Return the speed at which the axis looks for its reference."""
         return self.speed_um_s(axis)
-
-    def _top_speed_um_s(self, axis: str) -> float:
-        """Return the fastest speed that the axis can be given."""
-        return math.inf
 
     def _readings_are_checked(self, axis: str) -> bool:
         """Return whether a checksum protects what `_read` reads."""
@@ -325,13 +333,18 @@ class HostStage(ABC):
         soft_low_um, soft_high_um = self._settings.soft_limits_um.get(axis, (low_um, high_um))
         return max(low_um, soft_low_um) + self._settings.approach_um, min(high_um, soft_high_um)
 
+    def top_speed_um_s(self, axis: str) -> float:
+        """Return the fastest speed that `set_speed_um_s` accepts: the device's, or the stated."""
+        self._require_axis(axis)
+        stated_um_s = self._settings.top_speeds_um_s.get(axis, math.inf)
+        return min(self._top_speed_um_s(axis), stated_um_s)
+
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Choose the speed of the moves that follow, also after a reconnect.
 
         Raises `SpeedLimitError` before anything is sent, or `CommandRefusedError`.
         """
-        self._require_axis(axis)
-        top_um_s = self._top_speed_um_s(axis)
+        top_um_s = self.top_speed_um_s(axis)
         if not (math.isfinite(speed_um_s) and 0 < speed_um_s <= top_um_s):
             raise SpeedLimitError(axis, speed_um_s, top_um_s)
         self._apply_speed(axis, speed_um_s)
@@ -412,6 +425,9 @@ class HostStage(ABC):
 
     def _start_up(self) -> None:
         self._configure()
+        for axis in self._settings.top_speeds_um_s:
+            if self.speed_um_s(axis) > self.top_speed_um_s(axis):
+                self._apply_speed(axis, self.top_speed_um_s(axis))
         for axis, speed_um_s in self._speeds_um_s.items():
             self.set_speed_um_s(axis, speed_um_s)
 

@@ -12,6 +12,7 @@ from drivers.errors import (
     DriverError,
     GarbledReplyError,
     PortBusyError,
+    PortError,
     PortGoneError,
     PortNotFoundError,
     PortPermissionError,
@@ -28,6 +29,9 @@ _PORT_FAILURES = (serial.SerialException, OSError, _TermiosError)
 """What pyserial lets through when the port breaks; the terminal's own error is no OSError."""
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ECONNREFUSED, errno.EHOSTUNREACH)
+IN_USE = b"Port already in use"
+"""What ser2net, and the simulators' TCP server, say to a second client before they hang up."""
+NETWORK_HOLDER = "another program over the network"
 QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
@@ -103,6 +107,7 @@ class SerialTransport:
         self._flow_control = flow_control
         self._lock = threading.RLock()
         self._unread = bytearray()
+        self._heard = False
         device = find_port(port)
         self._serial = self._open(device)
         self._serial_number = "" if "://" in device else usb_serial_number(device)
@@ -126,7 +131,7 @@ class SerialTransport:
             except serial.SerialTimeoutException as error:
                 raise TransportTimeoutError(self.port, self.write_timeout_s) from error
             except _PORT_FAILURES as error:
-                raise PortGoneError(self.port) from error
+                raise self._gone() from error
 
     def read_until(self, terminator: bytes) -> bytes:
         """Return bytes up to and including `terminator`; raises as `write` does.
@@ -230,7 +235,16 @@ class SerialTransport:
         try:
             self._unread += self._serial.read(max(1, self._serial.in_waiting))
         except _PORT_FAILURES as error:
-            raise PortGoneError(self.port) from error
+            raise self._gone() from error
+        if not self._heard and "://" in self.port and IN_USE in self._unread:
+            raise PortBusyError(self.port, IN_USE.decode(), NETWORK_HOLDER)
+        self._heard |= not IN_USE.startswith(self._unread[: len(IN_USE)])
+
+    def _gone(self) -> PortError:
+        """Return why the port failed; a network port that never spoke is somebody else's."""
+        if "://" in self.port and not self._heard:
+            return PortBusyError(self.port, "it hung up at once", NETWORK_HOLDER)
+        return PortGoneError(self.port)
 
     def _take(self, count: int) -> bytes:
         message = bytes(self._unread[:count])

@@ -3,10 +3,13 @@
 import logging
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import cycle
+from typing import Any
 
 from drivers import zaber_codec as codec
+from drivers import zaber_models as models
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     AxisFaultError,
@@ -16,6 +19,7 @@ from drivers.errors import (
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
+    ScaleError,
     StalledError,
     TransportTimeoutError,
 )
@@ -28,6 +32,8 @@ QUERY_ATTEMPTS = 3
 FOREIGN_MESSAGES_TOLERATED = 64
 EXCHANGE_LIMIT_S = 2.0
 """Longest wait for one answer among messages that are none."""
+TRIGGER = 1
+"""Which of the device's triggers raises the output on arrival."""
 REFERENCE_FLAGS = {"WR", "WH"}
 DRIVER_OFF_FLAGS = {"FH", "FO", "FD"}
 FAULTS_BY_FLAG: Mapping[str, type[AxisFaultError]] = {
@@ -53,6 +59,13 @@ REFUSAL_ADVICE = {
     "REMOTE": "another program controls the device over its network port, close that",
 }
 
+SCALES_AGREE = 1e-3
+"""Relative: data sheets round a microstep to at least that, and no two screws are so alike."""
+SCALE_ADVICE = (
+    "write microstep_um from its data sheet into the stage's YAML file, or measure it with "
+    "`emmc-rig devices scale`"
+)
+
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d+)?")
 
 
@@ -70,37 +83,81 @@ class ZaberDevice:
 class ZaberStage(HostStage):
     """Axes of one chain, `axes` mapping names to (device address, axis number).
 
-    `microstep_um` is the length of a microstep, one for all axes or by name. Construction asks
-    every axis for its limits and speed, so that a missing one shows at once; it moves nothing.
-    Raises `TransportTimeoutError` for a device that does not answer.
+    `microstep_um` is the length of a microstep, one for all axes or by name; what it does not
+    state is looked up by the ids of device and peripheral. `resolution` is the device's setting
+    of that name for which it was stated. `in_microsteps` takes a microstep as the unit in place
+    of a micrometre: only to measure its length. Construction asks every axis for its scale,
+    limits and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
+    contradicts what was stated, `TransportTimeoutError` for a device that does not answer.
     Source: Zaber ASCII Protocol Manual (commands `home`, `move abs`, `stop`, `warnings`,
     `driver enable`; settings `pos`, `limit.min`, `limit.max`, `maxspeed`, `comm.checksum`,
-    `limit.approach.maxspeed`).
+    `limit.approach.maxspeed`, `resolution`, `deviceid`, `peripheralid`, `device.hw.modified`,
+    `peripheral.hw.modified`).
     """
 
     def __init__(
         self,
         transport: Transport,
         axes: Mapping[str, tuple[int, int]],
-        microstep_um: float | Mapping[str, float],
+        microstep_um: float | Mapping[str, float] | None = None,
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
+        resolution: int | Mapping[str, int] | None = None,
+        in_microsteps: bool = False,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         self._chain = _Chain(transport, clock)
         self._addresses = dict(axes)
-        if isinstance(microstep_um, Mapping):
-            self._microstep_um = dict(microstep_um)
-        else:
-            self._microstep_um = dict.fromkeys(axes, microstep_um)
-        for axis in axes:
-            check_tolerance(axis, settings.tolerance_um, self._microstep_um[axis])
+        self._stated_um = _by_axis(microstep_um, axes)
+        self._stated_resolution = _by_axis(resolution, axes)
+        self._in_microsteps = in_microsteps
+        self._signal: tuple[str, float, int] | None = None
+        for axis in (*self._stated_um, *self._stated_resolution):
+            self._require_axis(axis)
         self._start_up()
+
+    def resolution(self, axis: str) -> int | None:
+        """Return how many microsteps make a full step; None for a motor that has no steps."""
+        self._require_axis(axis)
+        return self._resolutions[axis]
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move, as the device last said it."""
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
+
+    def move_and_signal_um(self, axis: str, target_um: float, output: int = 1) -> float:
+        """As `move_to_um`; a digital output of the axis's device rises the moment it arrives.
+
+        The device raises it by itself, without the host; it falls at the next such move. A
+        camera that it triggers must wait out the vibration by a delay of its own. Raises as
+        `move_to_um`, and `CommandRefusedError` for a device without outputs or triggers.
+        Source: Zaber ASCII Protocol Manual, "trigger", "io set do"; firmware 7.
+        """
+        self._require_axis(axis)
+        device, _ = self._addresses[axis]
+        self._chain.query(device, 0, f"io set do {output} 0", axis)
+        self._signal = (axis, target_um, output)
+        try:
+            return self.move_to_um({axis: target_um})[axis]
+        finally:
+            self._signal = None
+            with suppress(DriverError):  # of a move that failed, the first fault is the one to tell
+                self._chain.query(device, 0, f"trigger {TRIGGER} disable", axis)
+
+    def _arm_signal(self, axis: str, target_um: float, start_um: float) -> None:
+        """Let the output rise where the move that comes now ends, if it is the last leg."""
+        if self._signal is None or self._signal[:2] != (axis, target_um):
+            return
+        device, number = self._addresses[axis]
+        sign = ">=" if target_um >= start_um else "<="
+        target = round(target_um / self._microstep_um[axis])
+        for command in (
+            f"when {number} pos {sign} {target}",
+            f"action a io set do {self._signal[2]} 1",
+            "enable 1",
+        ):
+            self._chain.query(device, 0, f"trigger {TRIGGER} {command}", axis)
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
@@ -108,11 +165,16 @@ class ZaberStage(HostStage):
             device for device, _ in self._addresses.values() if self._enable_checksum(device)
         )
         axes = self._axes
+        self._resolutions = {axis: self._optional(axis, "resolution") for axis in axes}
+        self._microstep_um = {axis: self._scale_um(axis) for axis in axes}
+        for axis in axes:
+            check_tolerance(axis, self._settings.tolerance_um, self._microstep_um[axis])
         self._limits_um = {
             axis: (self._length_um(axis, "limit.min"), self._length_um(axis, "limit.max"))
             for axis in axes
         }
         self._move_speeds_um_s = {axis: self._speed_setting_um_s(axis, "maxspeed") for axis in axes}
+        self._first_speeds_um_s = dict(self._move_speeds_um_s)
         self._home_speeds_um_s = {axis: self._approach_speed_um_s(axis) for axis in axes}
 
     def _read(self, axis: str) -> Reading:
@@ -135,6 +197,7 @@ class ZaberStage(HostStage):
 
     def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
         for axis, target_um in targets_um.items():
+            self._arm_signal(axis, target_um, start_um[axis])
             target = round(target_um / self._microstep_um[axis])
             self._send_once((axis,), lambda axis=axis, target=target: self._move(axis, target))
 
@@ -159,11 +222,70 @@ class ZaberStage(HostStage):
         self._query(axis, f"set maxspeed {wanted}")
         self._move_speeds_um_s[axis] = self._speed_setting_um_s(axis, "maxspeed")
 
+    def _top_speed_um_s(self, axis: str) -> float:
+        """Return what the firmware can step; a motor without steps: the speed it came with."""
+        resolution = self._resolutions[axis]
+        if resolution is None:
+            return self._first_speeds_um_s[axis]
+        return models.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
+
     def _homing_speed_um_s(self, axis: str) -> float:
         return self._home_speeds_um_s[axis]
 
     def _readings_are_checked(self, axis: str) -> bool:
         return self._addresses[axis][0] in self._chain.checksummed
+
+    def _scale_um(self, axis: str) -> float:
+        """Return the length of a microstep, from the device or stated; both must agree."""
+        if self._in_microsteps:
+            return 1.0
+        resolution = self._resolutions[axis]
+        stated_um = self._stated_um.get(axis)
+        wanted = self._stated_resolution.get(axis)
+        if wanted is not None and wanted != resolution:
+            raise ScaleError(
+                axis,
+                f"its microstep was stated for resolution {wanted}, but it has {resolution}",
+                f"send it `set resolution {wanted}`, or state microstep_um and resolution anew",
+            )
+        device_id = self._optional(axis, "deviceid", whole_device=True)
+        peripheral_id = self._optional(axis, "peripheralid")
+        model = models.find_model(device_id or 0, peripheral_id)
+        identity = f"device id {device_id}, peripheral id {peripheral_id or 'none'}"
+        if self._is_modified(axis, peripheral_id):
+            model, identity = None, f"{identity}, modified hardware"
+        if model is not None and model.microstep_um is None:
+            raise ScaleError(axis, f"it is {model.name} ({identity})", "wire a linear axis")
+        identity = f"{identity}, resolution {resolution}"
+        if model is None or model.microstep_um is None or not resolution:
+            if stated_um is None:
+                what = f"the length of its microstep is unknown ({identity})"
+                raise ScaleError(axis, what, SCALE_ADVICE)
+            return stated_um
+        known_um = model.microstep_um * models.DEFAULT_RESOLUTION / resolution
+        if stated_um is not None and abs(stated_um / known_um - 1) > SCALES_AGREE:
+            raise ScaleError(
+                axis,
+                f"a microstep of {stated_um:g} um was stated, but this {model.name} ({identity}) "
+                f"has {known_um:g} um",
+                "correct microstep_um, or leave it out",
+            )
+        return known_um
+
+    def _is_modified(self, axis: str, peripheral_id: int | None) -> bool:
+        """Return whether the maker fitted other mechanics than the ids tell."""
+        if peripheral_id:
+            return self._optional(axis, "peripheral.hw.modified") == 1
+        return self._optional(axis, "device.hw.modified", whole_device=True) == 1
+
+    def _optional(self, axis: str, setting: str, whole_device: bool = False) -> int | None:
+        """Return a setting that not every device has; None where it says so."""
+        device, number = self._addresses[axis]
+        try:
+            reply = self._chain.query(device, 0 if whole_device else number, f"get {setting}", axis)
+        except CommandRefusedError:
+            return None
+        return int(self._number(axis, reply))
 
     def _warnings(self, axis: str) -> list[str]:
         """Return the flags raised, the most severe first; the device's reply counts them too."""
@@ -216,6 +338,13 @@ class ZaberStage(HostStage):
     def _query(self, axis: str, data: str) -> codec.Reply:
         device, number = self._addresses[axis]
         return self._chain.query(device, number, data, axis)
+
+
+def _by_axis(value: Any, axes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a value for every axis, for those that a mapping names, or for none."""
+    if value is None:
+        return {}
+    return dict(value) if isinstance(value, Mapping) else dict.fromkeys(axes, value)
 
 
 class _Chain:

@@ -2,10 +2,13 @@
 
 Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
 at the lower end and one up by the offset, where the counter is zero; parameters are not kept over
-a power cycle. A controller takes the bits "A" for downwards, as KDC101 do.
+a power cycle; soft limits are stored and stop nothing. A controller takes the bits "A" for
+downwards, as KDC101 do. A message that is not modelled is passed over, as real controllers do, and
+logged.
 Source of the messages: Thorlabs, "APT Controllers Host-Controller Communications Protocol".
 """
 
+import logging
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -33,8 +36,17 @@ UPDATES_WITHOUT_ACKNOWLEDGEMENT = 50
 MODEL = b"KDC101\0\0"
 SERIAL_NUMBER = 27_000_001
 FIRMWARE = (3, 0, 2, 0)
+JOG = struct.Struct("<HHiiiiH")
+CONTINUOUS, SINGLE_STEP = 1, 2
+"""Modes of a jog."""
+UPWARDS = 2
+"""Direction of a jog and of a move at a velocity, which KDC101 count the other way round."""
+LIMIT_SWITCHES = struct.Struct("<HHHIIH")
+MAKES_ON_CONTACT = 2
 OUT_OF_RANGE = 8
 """Code of a complaint about a target; the document leaves the numbers to the server's help."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -52,6 +64,8 @@ class _Bay:
     homing: str = ""
     motion_error: bool = False
     drift_um: float = 0.0
+    jog: tuple[int, ...] = ()
+    limit_switches: tuple[int, ...] = (MAKES_ON_CONTACT, MAKES_ON_CONTACT, 0, 0, 1)
 
 
 class AptController(SimulatedController):
@@ -127,6 +141,7 @@ class AptController(SimulatedController):
         message = codec.decode(raw)
         handle = self._handlers.get(message.id)
         if handle is None:
+            _log.warning("not modelled, passed over: message %#06x", message.id)
             return
         for address in self._meant(message.destination):
             handle(self, address, self._bays[address], message)
@@ -277,10 +292,42 @@ class AptController(SimulatedController):
         parameters = codec.VelocityParameters(1, 0, bay.acceleration, bay.maximum)
         self._say(address, Id.MOT_GET_VELPARAMS, data=codec.encode_velocity(parameters))
 
+    def _jog_parameters(self, bay: _Bay) -> tuple[int, ...]:
+        """Return mode, step, least speed, acceleration, speed and way to stop."""
+        return bay.jog or (
+            *(SINGLE_STEP, round(100 * COUNTS_PER_UM), 0, bay.acceleration, bay.maximum),
+            codec.STOP_PROFILED,
+        )
+
+    def _set_jog(self, address: int, bay: _Bay, message: Message) -> None:
+        if message.data is not None and len(message.data) == JOG.size:
+            bay.jog = JOG.unpack(message.data)[1:]
+
     def _get_jog(self, address: int, bay: _Bay, message: Message) -> None:
-        step = round(100 * COUNTS_PER_UM)
-        data = struct.pack("<HHiiiiH", 1, 2, step, 0, bay.acceleration, bay.maximum, 2)
+        data = JOG.pack(1, *self._jog_parameters(bay))
         self._say(address, Id.MOT_GET_JOGPARAMS, data=data)
+
+    def _jog(self, address: int, bay: _Bay, message: Message) -> None:
+        mode, step, _, acceleration, speed, _ = self._jog_parameters(bay)
+        if mode == CONTINUOUS:
+            step = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
+        here = round(bay.motor.counted_um * COUNTS_PER_UM)
+        usual = bay.maximum, bay.acceleration
+        bay.maximum, bay.acceleration = max(1, speed), max(1, acceleration)
+        target = here + step if message.param2 == UPWARDS else here - step
+        self._go(address, bay, target, message.id)
+        bay.maximum, bay.acceleration = usual
+
+    def _set_limit_switches(self, address: int, bay: _Bay, message: Message) -> None:
+        if message.data is not None and len(message.data) == LIMIT_SWITCHES.size:
+            bay.limit_switches = LIMIT_SWITCHES.unpack(message.data)[1:]
+
+    def _get_limit_switches(self, address: int, bay: _Bay, message: Message) -> None:
+        data = LIMIT_SWITCHES.pack(1, *bay.limit_switches)
+        self._say(address, Id.MOT_GET_LIMSWITCHPARAMS, data=data)
+
+    def _pass_over(self, address: int, bay: _Bay, message: Message) -> None:
+        """Take a message that changes nothing here: a lamp, flash memory, the end of the link."""
 
     def _set_backlash(self, address: int, bay: _Bay, message: Message) -> None:
         (_, bay.backlash) = struct.unpack("<Hi", message.data or b"\0" * 6)
@@ -320,7 +367,7 @@ class AptController(SimulatedController):
 
     def _move_for_ever(self, address: int, bay: _Bay, message: Message) -> None:
         far = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
-        self._go(address, bay, far if message.param2 == 2 else -far, message.id)
+        self._go(address, bay, far if message.param2 == UPWARDS else -far, message.id)
 
     def _stop(self, address: int, bay: _Bay, message: Message) -> None:
         if bay.motor.ends_s is None:
@@ -361,7 +408,14 @@ class AptController(SimulatedController):
         Id.MOT_REQ_POSCOUNTER: _position,
         Id.MOT_SET_VELPARAMS: _set_velocity,
         Id.MOT_REQ_VELPARAMS: _get_velocity,
+        Id.MOT_SET_JOGPARAMS: _set_jog,
         Id.MOT_REQ_JOGPARAMS: _get_jog,
+        Id.MOT_MOVE_JOG: _jog,
+        Id.MOT_SET_LIMSWITCHPARAMS: _set_limit_switches,
+        Id.MOT_REQ_LIMSWITCHPARAMS: _get_limit_switches,
+        Id.HW_DISCONNECT: _pass_over,
+        Id.HW_NO_FLASH_PROGRAMMING: _pass_over,
+        Id.MOD_IDENTIFY: _pass_over,
         Id.MOT_SET_GENMOVEPARAMS: _set_backlash,
         Id.MOT_REQ_GENMOVEPARAMS: _get_backlash,
         Id.MOT_SET_HOMEPARAMS: _set_home,

@@ -1,14 +1,15 @@
 """Firmware of a Grbl 1.1 controller: G-code lines and real-time bytes in, `ok` and reports out.
 
-Simplified: every move of the queue starts and ends at rest; a move that was held is not taken up
-again; homing takes all its axes to their
-switches together, pulls off, touches the switch again slowly and pulls off; arcs, spindle and
-coolant are accepted where they move nothing, and refused where they would. The axes have no
-encoders: a stall loses steps unnoticed.
+Simplified: every move of the queue starts and ends at rest; homing takes all its axes to their
+switches together, pulls off, touches the switch again slowly and pulls off. What is not modelled
+(arcs, probing, spindle, ...) is refused as an unsupported command, and logged. The axes have no
+encoders: a stall loses steps unnoticed. Bytes that come while the receive buffer is full are lost,
+as on the real controller.
 Source of the messages: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Realtime
 commands"; the order of a report's fields and its counters from report.c.
 """
 
+import logging
 import math
 import re
 from collections import deque
@@ -34,7 +35,10 @@ PULL_OFF_MM = 1.0
 LOCATE_MM_MIN = 25.0
 SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 5, 9, 30)}
 """Words that are accepted and change nothing here."""
+OFFSETS = (10, 92, 92.1)
+"""G words that shift the work coordinates."""
 
+_log = logging.getLogger(__name__)
 _WORD = re.compile(r"([A-Z])(-?\d+\.?\d*|-?\.\d+)")
 _SETTING_LINE = re.compile(r"\$(\d{1,3})=(-?\d+\.?\d*)")
 
@@ -70,6 +74,7 @@ class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
+    `lost_bytes` counts what came while the receive buffer was full.
     """
 
     def __init__(
@@ -84,6 +89,7 @@ class GrblController(SimulatedController):
         self.options = options
         self.settings = _default_settings(axes) | dict(settings or {})
         self.work_offset_mm = dict.fromkeys(axes, 0.0)
+        self.lost_bytes = 0
         self._motors = {letter: Motor(spec, clock) for letter, spec in axes.items()}
         self._boot()
 
@@ -114,7 +120,8 @@ class GrblController(SimulatedController):
         for motor in self._motors.values():
             motor.halt()
         self._line = bytearray()
-        self._lines: deque[str] = deque()
+        self._lines: deque[tuple[str, int]] = deque()
+        self._shift_mm = dict.fromkeys(self.axes, 0.0)
         self._blocks: deque[_Block] = deque()
         self._block: _Block | None = None
         self._ends: dict[str, End] = {}
@@ -141,21 +148,38 @@ class GrblController(SimulatedController):
             elif byte == codec.FEED_HOLD:
                 self._feed_hold()
             elif byte == codec.CYCLE_START:
-                self._held = False
-                if self._state == "Hold":
-                    self._state = "Idle"
-                    self._advance()
+                self._cycle_start()
             elif byte == codec.JOG_CANCEL:
                 if self._state == "Jog":
                     self._blocks.clear()
                     self._brake()
             elif value >= 0x80:
                 continue
+            elif self._stuck() and self._buffered() >= RX_BUFFER:
+                self.lost_bytes += 1
             elif byte in b"\r\n":
                 self._end_line()
+                self._execute_lines()
             else:
                 self._line.append(value)
         self._execute_lines()
+
+    def _stuck(self) -> bool:
+        """Return whether bytes stay in the receive buffer, since no line can be taken up."""
+        return bool(self._lines or self._homing_letters)
+
+    def _buffered(self) -> int:
+        return len(self._line) + sum(size for _, size in self._lines)
+
+    def _cycle_start(self) -> None:
+        """Take a held program up again; Grbl hears it only once the axes stand."""
+        if self._state != "Hold":
+            return
+        self._held = False
+        self._state = "Idle"
+        if self._blocks:
+            self._start_block(None)
+        self._advance()
 
     def _end_line(self) -> None:
         line, self._line = bytes(self._line), bytearray()
@@ -164,7 +188,7 @@ class GrblController(SimulatedController):
         text = re.sub(r"\(.*?\)|;.*", "", line.decode("ascii", "replace"))
         if len(line) >= codec.LINE_LENGTH:
             text = "overflow"
-        self._lines.append("".join(text.split()).upper())
+        self._lines.append(("".join(text.split()).upper(), len(line) + 1))
 
     def _advance(self) -> None:
         """Bring motors, queue and homing to the present, move by move."""
@@ -197,6 +221,7 @@ class GrblController(SimulatedController):
         block, self._block = self._block, None
         assert block is not None
         if self._held:
+            self._blocks.appendleft(block)
             self._state = "Hold"
             return
         for letter, target_mm in block.targets_mm.items():
@@ -270,6 +295,8 @@ class GrblController(SimulatedController):
             self._say("ALARM:6" if homing else "ALARM:3")
         elif self._state in ("Hold", "Door", "Check"):
             self._state = "Idle"
+        elif self._state == "Sleep":
+            self._state = "Alarm"
         self._waits_for_reset = False
         self._restart()
 
@@ -292,7 +319,7 @@ class GrblController(SimulatedController):
             and not self._homing_letters
             and len(self._blocks) < PLANNER_BLOCKS
         ):
-            line = self._lines.popleft()
+            line, _ = self._lines.popleft()
             if self.faults.strikes("door", line):
                 self._state = "Door"
             try:
@@ -308,7 +335,7 @@ class GrblController(SimulatedController):
             return
         if line.startswith("$"):
             self._execute_system(line)
-        elif self._state in ("Alarm", "Jog", "Door"):
+        elif self._state in ("Alarm", "Jog", "Door", "Sleep"):
             raise _RefusedError(9)
         else:
             self._execute_gcode(line)
@@ -333,6 +360,8 @@ class GrblController(SimulatedController):
             if self._state == "Alarm":
                 self._say("[MSG:Caution: Unlocked]")
                 self._state = "Idle"
+        elif line == "$C":
+            self._toggle_check()
         elif line == "$$":
             if self._state in ("Run", "Hold"):
                 raise _RefusedError(8)
@@ -347,17 +376,33 @@ class GrblController(SimulatedController):
             offsets = ",".join(f"{self.work_offset_mm[letter]:.3f}" for letter in self.axes)
             nothing = ",".join("0.000" for _ in self.axes)
             self._say(f"[G54:{offsets}]")
-            for name in ("G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"):
+            for name in ("G55", "G56", "G57", "G58", "G59", "G28", "G30"):
                 self._say(f"[{name}:{nothing}]")
+            shifts = ",".join(f"{self._shift_mm[letter]:.3f}" for letter in self.axes)
+            self._say(f"[G92:{shifts}]")
             self._say("[TLO:0.000]")
             self._say(f"[PRB:{nothing}:0]")
         elif line == "$N":
             self._say("$N0=")
             self._say("$N1=")
+        elif line == "$SLP":
+            self._say("[MSG:Sleeping]")
+            self._state = "Sleep"
         elif line.startswith("$H"):
             self._execute_home(line[2:])
         else:
             self._execute_setting(line)
+
+    def _toggle_check(self) -> None:
+        """Switch the mode that parses programs and moves nothing; leaving it resets."""
+        if self._state == "Check":
+            self._say("[MSG:Disabled]")
+            self._soft_reset()
+        elif self._state == "Idle":
+            self._state = "Check"
+            self._say("[MSG:Enabled]")
+        else:
+            raise _RefusedError(8)
 
     def _execute_setting(self, line: str) -> None:
         match = _SETTING_LINE.fullmatch(line)
@@ -452,6 +497,9 @@ class GrblController(SimulatedController):
     def _execute_gcode(self, line: str) -> None:
         words = _words(line)
         modes, machine, motion = self._modes, False, None
+        if any(letter == "G" and value in OFFSETS for letter, value in words):
+            self._set_offsets(words)
+            return
         for letter, value in words:
             word = f"{letter}{value:g}"
             if word in ("G0", "G1"):
@@ -464,15 +512,15 @@ class GrblController(SimulatedController):
                 machine = True
             elif letter in SILENT_WORDS:
                 if value not in SILENT_WORDS[letter]:
-                    raise _RefusedError(20)
+                    raise _not_modelled(line)
             elif letter not in "FSTNP" and letter not in self.axes:
-                raise _RefusedError(20)
+                raise _not_modelled(line)
         unit = codec.MM_PER_INCH if modes.inches else 1.0
         for letter, value in words:
             if letter == "F":
                 modes.feed_mm_min = value * unit
         targets_mm = self._targets_mm(words, unit, modes.absolute, machine)
-        if not targets_mm:
+        if not targets_mm or self._state == "Check":
             return
         rapid = (motion or modes.motion) == "G0"
         if not rapid and modes.feed_mm_min <= 0:
@@ -482,6 +530,33 @@ class GrblController(SimulatedController):
             return
         fastest = max(self._setting(codec.MAX_RATE, letter) for letter in self.axes) * 10
         self._queue(_Block(targets_mm, fastest if rapid else modes.feed_mm_min, jog=False))
+
+    def _set_offsets(self, words: list[tuple[str, float]]) -> None:
+        """Shift the work coordinates: G92 until a reset, G10 L2 and L20 as G54 (P0 or P1)."""
+        given = dict(words)
+        given["G"] = next(value for letter, value in words if letter == "G" and value in OFFSETS)
+        unit = codec.MM_PER_INCH if self._modes.inches else 1.0
+        axes_mm = {letter: value * unit for letter, value in words if letter in self.axes}
+        if given["G"] == 92.1:
+            self._shift_mm = dict.fromkeys(self.axes, 0.0)
+            return
+        if not axes_mm:
+            raise _RefusedError(26)
+        planned_mm = self._planned_mm()
+        if given["G"] == 92:
+            for letter, value_mm in axes_mm.items():
+                self._shift_mm[letter] = planned_mm[letter] - self.work_offset_mm[letter] - value_mm
+        elif given.get("L") not in (2, 20) or given.get("P", 0) not in (0, 1):
+            raise _not_modelled("".join(f"{letter}{value:g}" for letter, value in words))
+        else:
+            for letter, value_mm in axes_mm.items():
+                here_mm = planned_mm[letter] - self._shift_mm[letter] - value_mm
+                self.work_offset_mm[letter] = value_mm if given["L"] == 2 else here_mm
+        self._reports_to_offset = 0
+
+    def _offset_mm(self, letter: str) -> float:
+        """Return where the work coordinates begin: WCO of a report."""
+        return self.work_offset_mm[letter] + self._shift_mm[letter]
 
     def _targets_mm(
         self, words: list[tuple[str, float]], unit: float, absolute: bool, machine: bool
@@ -494,7 +569,7 @@ class GrblController(SimulatedController):
                 if not absolute:
                     targets_mm[letter] = planned_mm[letter] + value * unit
                 else:
-                    offset_mm = 0.0 if machine else self.work_offset_mm[letter]
+                    offset_mm = 0.0 if machine else self._offset_mm(letter)
                     targets_mm[letter] = value * unit + offset_mm
         return targets_mm
 
@@ -549,7 +624,7 @@ class GrblController(SimulatedController):
         if int(self.settings[codec.REPORT_MASK]) & codec.REPORTS_MACHINE_POSITION:
             fields = [state, f"MPos:{self._coordinates(machine_mm, unit)}"]
         else:
-            work_mm = {one: mm - self.work_offset_mm[one] for one, mm in machine_mm.items()}
+            work_mm = {one: mm - self._offset_mm(one) for one, mm in machine_mm.items()}
             fields = [state, f"WPos:{self._coordinates(work_mm, unit)}"]
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
         fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.0f},0")
@@ -558,7 +633,8 @@ class GrblController(SimulatedController):
             self._reports_to_offset -= 1
         else:
             self._reports_to_offset = OFFSET_EVERY[moving] - 1
-            fields.append(f"WCO:{self._coordinates(self.work_offset_mm, unit)}")
+            offsets_mm = {letter: self._offset_mm(letter) for letter in self.axes}
+            fields.append(f"WCO:{self._coordinates(offsets_mm, unit)}")
         if self._reports_to_overrides:
             self._reports_to_overrides -= 1
         else:
@@ -572,6 +648,12 @@ class GrblController(SimulatedController):
 
     def _say(self, text: str) -> None:
         self._send(text.encode("ascii") + b"\r\n")
+
+
+def _not_modelled(line: str) -> _RefusedError:
+    """Return the refusal of what a real controller may know, having logged it."""
+    _log.warning("not modelled, refused: %s", line)
+    return _RefusedError(20)
 
 
 def _default_settings(axes: Mapping[str, AxisSpec]) -> dict[int, float]:

@@ -5,6 +5,7 @@ For what is measured or tested around devices: their own time is none, or exactl
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Self
 
 from drivers.camera import CameraIdentity, Limits
 from drivers.clock import Clock
@@ -63,6 +64,10 @@ class StillStage:
         """A speed to reckon with."""
         return 1000.0
 
+    def top_speed_um_s(self, axis: str) -> float:
+        """The same: it has one speed."""
+        return self.speed_um_s(axis)
+
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Take no notice."""
 
@@ -79,6 +84,12 @@ class StillStage:
 
     def close(self) -> None:
         """Keep nothing open."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 class PreparedCamera:

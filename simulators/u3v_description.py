@@ -16,6 +16,7 @@ WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x00, 0x04, 0x08, 0x0C
 WIDTH_MAX, HEIGHT_MAX, PIXEL_FORMAT, PAYLOAD = 0x10, 0x14, 0x18, 0x1C
 MODE, START, STOP, TRIGGER, SOFTWARE_TRIGGER = 0x20, 0x24, 0x28, 0x2C, 0x30
 EXPOSURE, GAIN, BLACK_LEVEL, LOCKED, FRAME_RATE, AUTO = 0x34, 0x38, 0x3C, 0x40, 0x44, 0x48
+TRIGGER_DELAY = 0x4C
 SENSOR = 0x50
 SIZE = 0x70
 
@@ -61,6 +62,7 @@ def describe(
         _choice("TriggerSource", {"Software": 0, "Line0": 1}, "TriggerSourceReg"),
         _masked("TriggerSourceReg", TRIGGER, 4, 7),
         _command("TriggerSoftware", SOFTWARE_TRIGGER),
+        _float("TriggerDelay", TRIGGER_DELAY, (0, 1_000_000), "us"),
         _choice("ExposureAuto", {"Off": 0, "Continuous": 1}, "ExposureAutoReg"),
         _masked("ExposureAutoReg", AUTO, AUTO_EXPOSURE_BIT, AUTO_EXPOSURE_BIT),
         _choice("GainAuto", {"Off": 0, "Continuous": 1}, "GainAutoReg"),
@@ -86,11 +88,7 @@ def describe(
         '<SwissKnife Name="BlackLevelKnife"><pVariable Name="RAW">BlackLevelReg</pVariable>'
         "<Formula>RAW / 16</Formula></SwissKnife>",
         _register("BlackLevelReg", BLACK_LEVEL, "RO"),
-        '<Float Name="AcquisitionFrameRate"><pValue>FrameRateReg</pValue><Min>0.001</Min>'
-        "<Max>1000</Max><Unit>Hz</Unit></Float>"
-        f'<FloatReg Name="FrameRateReg"><Address>{BASE + FRAME_RATE:#x}</Address>'
-        "<Length>4</Length><AccessMode>RW</AccessMode><pPort>Device</pPort>"
-        "<Endianess>LittleEndian</Endianess></FloatReg>",
+        _float("AcquisitionFrameRate", FRAME_RATE, (0.001, 1000), "Hz"),
         '<Integer Name="TLParamsLocked"><Visibility>Invisible</Visibility>'
         "<pValue>TLParamsLockedReg</pValue><Min>0</Min><Max>1</Max></Integer>",
         _register("TLParamsLockedReg", LOCKED),
@@ -104,8 +102,9 @@ def describe(
         "Width Height OffsetX OffsetY WidthMax HeightMax SensorWidth SensorHeight PixelFormat "
         "PayloadSize AcquisitionMode "
         "AcquisitionStart AcquisitionStop TriggerSelector TriggerMode TriggerSource "
-        "TriggerSoftware ExposureAuto ExposureTime GainAuto Gain BlackLevel AcquisitionFrameRate "
-        "TLParamsLocked SensorName DeviceVendorName DeviceModelName DeviceSerialNumber"
+        "TriggerSoftware TriggerDelay ExposureAuto ExposureTime GainAuto Gain BlackLevel "
+        "AcquisitionFrameRate TLParamsLocked SensorName DeviceVendorName DeviceModelName "
+        "DeviceSerialNumber"
     )
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in features.split())
     xml = (
@@ -121,6 +120,16 @@ def describe(
         + "\n</RegisterDescription>\n"
     )
     return xml.encode()
+
+
+def _float(name: str, offset: int, limits: tuple[float, float], unit: str) -> str:
+    return (
+        f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>{limits[0]}</Min>'
+        f"<Max>{limits[1]}</Max><Unit>{unit}</Unit></Float>"
+        f'<FloatReg Name="{name}Reg"><Address>{BASE + offset:#x}</Address>'
+        "<Length>4</Length><AccessMode>RW</AccessMode><pPort>Device</pPort>"
+        "<Endianess>LittleEndian</Endianess></FloatReg>"
+    )
 
 
 def _register(name: str, offset: int, access: str = "RW", extra: str = "") -> str:

@@ -16,7 +16,7 @@ from drivers.errors import (
     PortNotFoundError,
     TransportTimeoutError,
 )
-from drivers.transport import QUIET_LIMIT
+from drivers.transport import IN_USE, QUIET_LIMIT
 
 READ_SIZE = 4096
 TICK_S = 0.002
@@ -283,7 +283,10 @@ class PtyServer(_Server):
 
 
 class TcpServer(_Server):
-    """Serves firmware on TCP, to one client at a time; `port` is a URL that pyserial opens."""
+    """Serves firmware on TCP, to one client at a time; `port` is a URL that pyserial opens.
+
+    A second client is told that the port is in use, as ser2net does, and let go.
+    """
 
     def __init__(self, firmware: Firmware, host: str = "127.0.0.1", number: int = 0) -> None:
         super().__init__(firmware)
@@ -300,9 +303,15 @@ class TcpServer(_Server):
         self._listener.close()
 
     def _sources(self) -> list[Any]:
-        return [self._listener] if self._client is None else [self._client]
+        return [self._listener] if self._client is None else [self._client, self._listener]
 
     def _read(self, source: Any) -> bytes:
+        if source is self._listener and self._client is not None:
+            refused, _ = self._listener.accept()
+            with refused, suppress(ConnectionError):
+                refused.sendall(IN_USE + b"\r\n")
+                refused.shutdown(socket.SHUT_WR)
+            return b""
         if source is self._listener:
             self._client, _ = self._listener.accept()
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

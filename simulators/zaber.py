@@ -2,16 +2,19 @@
 
 Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
 at 0 and sets the counter there; settings are not kept over a power cycle; commands longer than
-the packet size are accepted. Source of the messages: Zaber ASCII Protocol Manual.
+the packet size are accepted. A command or setting of real firmware that is not modelled is
+refused as an unknown one, and logged. Source of the messages: Zaber ASCII Protocol Manual.
 """
 
+import logging
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 
 from drivers.clock import Clock
 from drivers.zaber_codec import FLAG_MEANINGS, SPEED_SCALE, lrc
+from drivers.zaber_models import DEFAULT_RESOLUTION
 from simulators.firmware import SimulatedController
 from simulators.motion import AxisSpec, End, Motion, Motor
 
@@ -19,11 +22,23 @@ __all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
 
 ACCELERATION_SCALE = SPEED_SCALE / 1e4
 PACKET_SIZE = 80
-DEVICE_ID = 50_081
+NO_MODEL = 65_535
+"""A device id that no table has: whoever drives it must be told its scale."""
 FIRMWARE = "7.38"
 FIRST_SERIAL_NUMBER = 73_001
 DRIVER_OFF = "FH"
 
+TOP_SPEED_PER_RESOLUTION = 16_384
+"""`maxspeed` and `move vel` end at this many times the resolution."""
+FINEST_RESOLUTION = 256
+OUTPUTS, TRIGGERS = 4, 6
+"""Of every controller; real ones differ."""
+MOVE_NUMBERS = {"abs": (1, 2), "rel": (1, 2), "vel": (1, 1), "min": (0, 1), "max": (0, 1)}
+"""How many numbers each kind of `move` takes; the last one is a speed."""
+OLD_NAMES = {"deviceid": "device.id", "peripheralid": "peripheral.id"}
+"""What firmware 6 called them; firmware 7 answers to both."""
+
+_log = logging.getLogger(__name__)
 _COMMAND = re.compile(rb"/([^:]*)(?::([0-9A-Fa-f]{2}))?")
 
 BENCH_AXES = {(device, axis): AxisSpec() for device in (1, 2) for axis in (1, 2)}
@@ -36,8 +51,9 @@ class _RefusedError(Exception):
 class _Axis:
     """One motor with its settings and its flags."""
 
-    def __init__(self, spec: AxisSpec, clock: Clock) -> None:
+    def __init__(self, spec: AxisSpec, clock: Clock, peripheral_id: int | None) -> None:
         self.spec = spec
+        self.peripheral_id = peripheral_id
         self.flags = {"WR", "WH"}
         self.driver_enabled = True
         self.drift_um = 0.0
@@ -49,6 +65,7 @@ class _Axis:
             "accel": round(spec.acceleration_um_s2 / spec.microstep_um * ACCELERATION_SCALE),
             "limit.min": 0,
             "limit.max": math.floor(spec.travel_um / spec.microstep_um),
+            "resolution": DEFAULT_RESOLUTION,
         }
         self._clock = clock
         self.motor = Motor(spec, clock)
@@ -75,22 +92,45 @@ class _Axis:
     @property
     def counter(self) -> int:
         """Position in microsteps from where the counter believes 0 to be."""
-        return round(self.motor.counted_um / self.spec.microstep_um)
+        return round(self.motor.counted_um / self.microstep_um)
 
-    def move_abs(self, target: int, stalls: bool, start_s: float) -> None:
+    @property
+    def microstep_um(self) -> float:
+        """Length of a microstep; that of the specification is at the default resolution."""
+        return self.spec.microstep_um * DEFAULT_RESOLUTION / self.settings["resolution"]
+
+    @property
+    def top_speed(self) -> int:
+        """Highest value of a speed."""
+        return TOP_SPEED_PER_RESOLUTION * self.settings["resolution"]
+
+    def set_resolution(self, resolution: int) -> None:
+        """Count finer or coarser; every setting in microsteps follows."""
+        if not 1 <= resolution <= FINEST_RESOLUTION:
+            raise _RefusedError("BADDATA")
+        if self.busy:
+            raise _RefusedError("STATUSBUSY")
+        ratio = resolution / self.settings["resolution"]
+        self.settings = {name: round(value * ratio) for name, value in self.settings.items()}
+        self.settings["resolution"] = resolution
+
+    def move_abs(self, target: int, stalls: bool, start_s: float, speed: int | None = None) -> None:
+        """Go to a position, at `maxspeed` or at the speed given."""
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
+            raise _RefusedError("BADDATA")
+        if speed is not None and not 0 < abs(speed) <= self.top_speed:
             raise _RefusedError("BADDATA")
         self._begin(False)
         speed_um_s, acceleration_um_s2 = self._pace()
-        self.motor.go(
-            target * self.spec.microstep_um, speed_um_s, acceleration_um_s2, stalls, start_s
-        )
+        if speed is not None:
+            speed_um_s = abs(speed) * self.microstep_um / SPEED_SCALE
+        self.motor.go(target * self.microstep_um, speed_um_s, acceleration_um_s2, stalls, start_s)
 
     def home(self, stalls: bool) -> None:
         self._begin(True)
         speed_um_s, acceleration_um_s2 = self._pace()
         approach = self.settings["limit.approach.maxspeed"] / SPEED_SCALE
-        speed_um_s = min(speed_um_s, approach * self.spec.microstep_um)
+        speed_um_s = min(speed_um_s, approach * self.microstep_um)
         if stalls:
             self.motor.go(self.motor.counted_um / 2, speed_um_s, acceleration_um_s2, stalls)
         else:
@@ -100,6 +140,12 @@ class _Axis:
         if self.motor.moving:
             self.motor.brake(self._pace()[1])
             self.flags.add("NI")
+
+    def halt(self) -> None:
+        """What `estop` does: stop without braking; the position may have slipped."""
+        if self.motor.moving:
+            self.motor.halt()
+            self.flags |= {"NI", "WR"}
 
     def cut_power(self) -> None:
         """What the emergency stop does: the motor stands and its driver is off."""
@@ -118,13 +164,14 @@ class _Axis:
     def restarted(self) -> "_Axis":
         """Return the axis as it comes up after power was lost where it is now."""
         self.advance()
-        return _Axis(replace(self.spec, start_um=self.motor.true_um), self._clock)
+        spec = replace(self.spec, start_um=self.motor.true_um)
+        return _Axis(spec, self._clock, self.peripheral_id)
 
     def _pace(self) -> tuple[float, float]:
         """Return speed and acceleration in um/s and um/s^2."""
         return (
-            self.settings["maxspeed"] * self.spec.microstep_um / SPEED_SCALE,
-            self.settings["accel"] * self.spec.microstep_um / ACCELERATION_SCALE,
+            self.settings["maxspeed"] * self.microstep_um / SPEED_SCALE,
+            self.settings["accel"] * self.microstep_um / ACCELERATION_SCALE,
         )
 
     def _begin(self, homing: bool) -> None:
@@ -137,17 +184,32 @@ class _Axis:
         self._homing = homing
 
 
+@dataclass
+class _Trigger:
+    """`when AXIS pos >= VALUE`, the output that it sets then, and how often it still may."""
+
+    axis: int = 0
+    rises: bool = True
+    value: int = 0
+    output: int = 0
+    level: int = 0
+    left: int = 0
+
+
 class _Device:
     """One controller: its axes, numbered from 1, and its own settings."""
 
-    def __init__(self, address: int, axes: list[_Axis]) -> None:
+    def __init__(self, address: int, axes: list[_Axis], model: int, modified: bool) -> None:
         self.axes = axes
+        self.outputs = [0] * OUTPUTS
+        self.triggers = {number: _Trigger() for number in range(1, TRIGGERS + 1)}
         self.settings = {"comm.checksum": 1, "comm.alert": 0}
         self.constants = {
             "comm.packet.size.max": str(PACKET_SIZE),
             "system.axiscount": str(len(axes)),
             "system.serial": str(FIRST_SERIAL_NUMBER + address),
-            "device.id": str(DEVICE_ID),
+            "device.id": str(model),
+            "device.hw.modified": str(int(modified)),
             "version": FIRMWARE,
         }
 
@@ -155,18 +217,37 @@ class _Device:
 class ZaberChain(SimulatedController):
     """Devices on one chain, keyed by (device address, axis number).
 
+    `models`: device ids by address; `peripherals`: peripheral ids of the axes of controllers.
+    `modified`: addresses of devices that have other mechanics than their id tells. The microstep
+    of an axis is its specification's at the default resolution, whatever its ids.
     Faults as `SimulatedController`'s, and `emergency_stop`: the power of every motor is cut at
-    the next command.
+    the next command. `on_output` is told of every digital output that changes: device, output,
+    level and when. Of triggers only `when AXIS pos >= VALUE` (or <=) and `io set do` are modelled.
     """
 
-    def __init__(self, clock: Clock, axes: Mapping[tuple[int, int], AxisSpec] = BENCH_AXES) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        axes: Mapping[tuple[int, int], AxisSpec] = BENCH_AXES,
+        models: Mapping[int, int] | None = None,
+        peripherals: Mapping[tuple[int, int], int] | None = None,
+        modified: Collection[int] = (),
+    ) -> None:
         super().__init__(clock, ("emergency_stop",))
-        addresses = sorted({device for device, _ in axes})
+        self.on_output: Callable[[int, int, int, float], None] = lambda *change: None
+        models, peripherals = models or {}, peripherals or {}
         self._devices = {
             address: _Device(
-                address, [_Axis(axes[key], clock) for key in sorted(axes) if key[0] == address]
+                address,
+                [
+                    _Axis(axes[key], clock, peripherals.get(key))
+                    for key in sorted(axes)
+                    if key[0] == address
+                ],
+                models.get(address, NO_MODEL),
+                address in modified,
             )
-            for address in addresses
+            for address in sorted({device for device, _ in axes})
         }
         self._unread = bytearray()
 
@@ -200,9 +281,30 @@ class ZaberChain(SimulatedController):
     def _advance(self) -> None:
         for address, device in self._devices.items():
             for number, axis in enumerate(device.axes, start=1):
-                if axis.advance() and device.settings["comm.alert"]:
+                ends_s = axis.motor.ends_s
+                ended = axis.advance()
+                self._fire(address, device, number, axis, ends_s if ended else None)
+                if ended and device.settings["comm.alert"]:
                     text = f"{address:02d} {number} IDLE {_flag([axis])}"
                     self._send(_encode("!", text, device))
+
+    def _fire(
+        self, address: int, device: _Device, number: int, axis: _Axis, ended_s: float | None
+    ) -> None:
+        """Let the triggers on an axis fire that its position calls for."""
+        for trigger in device.triggers.values():
+            beyond = axis.counter - trigger.value
+            if trigger.left and trigger.axis == number and (beyond >= 0) == trigger.rises:
+                trigger.left -= 1
+                at_s = self._clock.now_s() if ended_s is None else ended_s
+                self._set_output(address, device, trigger.output, trigger.level, at_s)
+
+    def _set_output(
+        self, address: int, device: _Device, output: int, level: int, at_s: float
+    ) -> None:
+        if device.outputs[output - 1] != level:
+            device.outputs[output - 1] = level
+            self.on_output(address, output, level, at_s)
 
     def _next_event_s(self) -> float | None:
         ends_s = [axis.motor.ends_s for device in self._devices.values() for axis in device.axes]
@@ -241,7 +343,7 @@ class ZaberChain(SimulatedController):
                 axes = [device.axes[axis_number - 1]]
             name = words[0] if words else ""
             if name not in self._commands:
-                raise _RefusedError("BADCOMMAND")
+                raise self._not_modelled(words)
             data = self._commands[name](self, device, axes, axis_number, words[1:])
             outcome = "OK"
         except _RefusedError as refusal:
@@ -250,6 +352,11 @@ class ZaberChain(SimulatedController):
         label = "" if message_id is None else f"{message_id:02d} "
         text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data}"
         return _encode("@", text, device)
+
+    def _not_modelled(self, words: list[str]) -> _RefusedError:
+        """Return the refusal of a command, having logged that it may exist on a real device."""
+        _log.warning("not modelled, refused: %s", " ".join(words))
+        return _RefusedError("BADCOMMAND")
 
     def _poll(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         return "0"
@@ -260,12 +367,28 @@ class ZaberChain(SimulatedController):
         return "0"
 
     def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        if len(words) != 2 or words[0] not in ("abs", "rel"):
+        """`move abs|rel DISTANCE [SPEED]`, `move vel SPEED`, `move min|max [SPEED]`."""
+        kind, *numbers = words or [""]
+        if kind not in MOVE_NUMBERS:
+            raise self._not_modelled(["move", *words])
+        fewest, most = MOVE_NUMBERS[kind]
+        if not fewest <= len(numbers) <= most:
             raise _RefusedError("BADCOMMAND")
-        amount = _integer(words[1])
+        values = [_integer(number) for number in numbers]
         for axis in axes:
-            origin = axis.counter if words[0] == "rel" else 0
-            axis.move_abs(origin + amount, self._stalls(axis), self._start_s())
+            low, high = axis.settings["limit.min"], axis.settings["limit.max"]
+            target, *speeds = {
+                "abs": values,
+                "rel": [axis.counter + value for value in values[:1]] + values[1:],
+                "vel": [high if values and values[0] > 0 else low, *values],
+                "min": [low, *values],
+                "max": [high, *values],
+            }[kind]
+            if kind == "vel" and not values[0]:
+                axis.stop()
+            else:
+                speed = speeds[0] if speeds else None
+                axis.move_abs(target, self._stalls(axis), self._start_s(), speed)
         return "0"
 
     def _stalls(self, axis: _Axis) -> bool:
@@ -278,6 +401,52 @@ class ZaberChain(SimulatedController):
     def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         for axis in axes:
             axis.stop()
+        return "0"
+
+    def _estop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+        for axis in axes:
+            axis.halt()
+        return "0"
+
+    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+        if words != ["reset"]:
+            raise self._not_modelled(["system", *words])
+        if number:
+            raise _RefusedError("DEVICEONLY")
+        for axis in device.axes:
+            axis.advance()
+            axis.motor.halt()
+        device.axes = [axis.restarted() for axis in device.axes]
+        return "0"
+
+    def _io(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+        """`io get do [OUTPUT]` and `io set do OUTPUT LEVEL`."""
+        match words:
+            case ["get", "do"]:
+                return " ".join(str(level) for level in device.outputs)
+            case ["get", "do", output]:
+                return str(device.outputs[_within(output, OUTPUTS) - 1])
+            case ["set", "do", output, level]:
+                address = next(key for key, one in self._devices.items() if one is device)
+                place = _within(output, OUTPUTS)
+                self._set_output(address, device, place, _level(level), self._clock.now_s())
+                return "0"
+        raise self._not_modelled(["io", *words])
+
+    def _trigger(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+        trigger = device.triggers[_within(words[0] if words else "", TRIGGERS)]
+        match words[1:]:
+            case ["when", axis, "pos", ">=" | "<=" as sign, value]:
+                trigger.axis = _within(axis, len(device.axes))
+                trigger.rises, trigger.value = sign == ">=", _integer(value)
+            case ["action", "a", "io", "set", "do", output, level]:
+                trigger.output, trigger.level = _within(output, OUTPUTS), _level(level)
+            case ["enable", *count] if len(count) < 2:
+                trigger.left = _integer(count[0]) if count else 1 << 31
+            case ["disable"]:
+                trigger.left = 0
+            case _:
+                raise self._not_modelled(["trigger", *words])
         return "0"
 
     def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -293,20 +462,25 @@ class ZaberChain(SimulatedController):
             for axis in axes:
                 axis.clear_warnings()
         elif words:
-            raise _RefusedError("BADCOMMAND")
+            raise self._not_modelled(["warnings", *words])
         return " ".join([f"{len(flags):02d}", *flags])
 
     def _get(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         if len(words) != 1:
             raise _RefusedError("BADCOMMAND")
-        (setting,) = words
+        setting = OLD_NAMES.get(words[0], words[0])
         if setting == "pos":
             return " ".join(str(axis.counter) for axis in axes)
+        if setting in ("peripheral.id", "peripheral.hw.modified"):
+            ids = [axis.peripheral_id for axis in axes if axis.peripheral_id is not None]
+            if not ids:
+                raise _RefusedError("BADCOMMAND")
+            return " ".join(str(one) if setting == "peripheral.id" else "0" for one in ids)
         if setting in axes[0].settings:
             return " ".join(str(axis.settings[setting]) for axis in axes)
         whole = device.settings | device.constants
         if setting not in whole:
-            raise _RefusedError("BADCOMMAND")
+            raise self._not_modelled(["get", setting])
         if number:
             raise _RefusedError("DEVICEONLY")
         return str(whole[setting])
@@ -315,13 +489,18 @@ class ZaberChain(SimulatedController):
         if len(words) != 2:
             raise _RefusedError("BADCOMMAND")
         setting, value = words[0], _integer(words[1])
-        if setting in axes[0].settings:
+        if setting == "resolution":
+            for axis in axes:
+                axis.set_resolution(value)
+        elif setting in axes[0].settings:
             if not setting.startswith("limit.m") and value < 1:
                 raise _RefusedError("BADDATA")
             for axis in axes:
+                if setting.endswith("maxspeed") and value > axis.top_speed:
+                    raise _RefusedError("BADDATA")
                 axis.settings[setting] = value
         elif setting not in device.settings:
-            raise _RefusedError("BADCOMMAND")
+            raise self._not_modelled(["set", *words])
         elif number:
             raise _RefusedError("DEVICEONLY")
         elif value not in (0, 1):
@@ -335,7 +514,11 @@ class ZaberChain(SimulatedController):
         "home": _home,
         "move": _move,
         "stop": _stop,
+        "estop": _estop,
+        "system": _system,
         "driver": _driver,
+        "io": _io,
+        "trigger": _trigger,
         "warnings": _warnings,
         "get": _get,
         "set": _set,
@@ -358,6 +541,20 @@ def _integer(word: str) -> int:
         return int(word)
     except ValueError as error:
         raise _RefusedError("BADDATA") from error
+
+
+def _within(word: str, most: int) -> int:
+    number = _integer(word)
+    if not 1 <= number <= most:
+        raise _RefusedError("BADDATA")
+    return number
+
+
+def _level(word: str) -> int:
+    level = _integer(word)
+    if level not in (0, 1):
+        raise _RefusedError("BADDATA")
+    return level
 
 
 def _flags(axes: list[_Axis]) -> list[str]:

@@ -47,6 +47,15 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture
+def peer_files():
+    """The folder of files of real devices, named by EMMC_PEER_FILES."""
+    folder = os.environ.get("EMMC_PEER_FILES")
+    if not (folder and Path(folder).is_dir()):
+        pytest.skip("EMMC_PEER_FILES does not name a folder of files of real devices")
+    return Path(folder)
+
+
+@pytest.fixture
 def run(monkeypatch, capsys, tmp_path):
     """Run the program in a folder of its own: exit code, standard output and standard error."""
     monkeypatch.chdir(tmp_path)

@@ -3,7 +3,7 @@
 from typing import Any, ClassVar
 
 from drivers import grbl_codec as codec
-from drivers.apt import AptAxis, AptStage
+from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.apt_codec import Id
 from drivers.grbl import GrblStage
 from drivers.zaber import ZaberStage
@@ -12,6 +12,7 @@ from simulators.apt import AptController
 from simulators.grbl import GrblController
 from simulators.zaber import AxisSpec, ZaberChain
 
+Z825_MOTOR = ACTUATORS["z825"]
 QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
 """mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
 
@@ -69,7 +70,7 @@ class AptRig(StageRig):
         return AptController(self.clock)
 
     def make_from(self, settings):
-        return AptStage({"mask_x": AptAxis(self.transport)}, self.clock, settings)
+        return AptStage({"mask_x": AptAxis(self.transport, Z825_MOTOR)}, self.clock, settings)
 
     def true_um(self, axis):
         return self.device.position_um()

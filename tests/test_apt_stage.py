@@ -18,6 +18,7 @@ from drivers.stage import StageSettings
 from simulators.apt import HOME_OFFSET_UM, Z825, AptController
 from simulators.clock import ManualClock
 
+Z825_MOTOR = ACTUATORS["z825"]
 PLAIN = StageSettings(approach_um=0.0)
 
 
@@ -28,7 +29,7 @@ class Bench:
         self.transport = self.device.transport()
 
     def stage(self, settings=PLAIN, **axes):
-        return AptStage(axes or {"x": AptAxis(self.transport)}, self.clock, settings)
+        return AptStage(axes or {"x": AptAxis(self.transport, Z825_MOTOR)}, self.clock, settings)
 
     def homed(self, settings=PLAIN):
         stage = self.stage(settings)
@@ -83,7 +84,8 @@ def test_a_controller_that_swaps_destination_and_source_is_understood(swapped):
 def test_bays_of_a_rack_are_axes_of_one_port():
     bench = Bench({0x21: Z825, 0x22: Z825})
     stage = bench.stage(
-        x=AptAxis(bench.transport, destination=0x21), y=AptAxis(bench.transport, destination=0x22)
+        x=AptAxis(bench.transport, Z825_MOTOR, destination=0x21),
+        y=AptAxis(bench.transport, Z825_MOTOR, destination=0x22),
     )
     stage.home()
     stage.move_to_um({"x": 1000.0, "y": 2000.0})
@@ -95,7 +97,10 @@ def test_controllers_on_ports_of_their_own_are_one_stage():
     first, second = Bench(), Bench()
     second.clock = first.clock
     second.device = AptController(first.clock)
-    axes = {"x": AptAxis(first.transport), "y": AptAxis(second.device.transport())}
+    axes = {
+        "x": AptAxis(first.transport, Z825_MOTOR),
+        "y": AptAxis(second.device.transport(), Z825_MOTOR),
+    }
     stage = AptStage(axes, first.clock, PLAIN)
     stage.home()
     stage.move_to_um({"x": 700.0, "y": 900.0})
@@ -195,7 +200,7 @@ def test_it_says_what_it_is(bench):
 def test_a_controller_that_is_not_there_shows_at_construction(bench):
     rack = Bench({0x21: Z825, 0x22: Z825})
     with pytest.raises(TransportTimeoutError) as caught:
-        rack.stage(z=AptAxis(rack.transport, destination=0x25))
+        rack.stage(z=AptAxis(rack.transport, Z825_MOTOR, destination=0x25))
     assert (caught.value.axis, caught.value.command) == ("z", "MOT_REQ_VELPARAMS")
 
 

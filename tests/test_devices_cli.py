@@ -16,19 +16,20 @@ import pytest
 import yaml
 from serial.tools import list_ports
 
-from drivers.apt import AptAxis, AptStage
+from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
 from emmc_rig.errors import AppError
-from emmc_rig.rig.hardware import open_stage, probe_port
+from emmc_rig.rig.hardware import SIMULATED_SCALES, open_stage, probe_port
 from emmc_rig.rig.stage_config import parse_stage
 from simulators.apt import Z825, AptController
 from simulators.grbl import BENCH_AXES, GrblController
 from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
+Z825_MOTOR = ACTUATORS["z825"]
 PATIENCE_S = 20.0
 PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()", "devices")
 QUICK = AxisSpec(max_speed_um_s=100_000.0, acceleration_um_s2=1e7, start_um=500.0)
@@ -81,7 +82,7 @@ def test_a_simulated_stage_is_shown_homed_and_jogged(run, rig):
 
 def test_a_real_port_works_alike(run):
     with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK, (1, 2): QUICK})) as server:
-        stage = f"zaber:{server.port}"
+        stage = f"zaber:{server.port},microstep_um=0.047625"
         assert "unknown" in run("info", "--stage", stage)[1]
         code, _, err = run("jog", "--stage", stage, "1.2", 100)
         assert (code, "home it first" in one_line(err)) == (1, True)
@@ -118,7 +119,7 @@ def test_apt_axes_may_be_on_ports_of_their_own(tmp_path):
         wiring = {
             "protocol": "apt",
             "axes": {
-                "mask_x": {"port": one.port},
+                "mask_x": {"port": one.port, "actuator": "z825"},
                 "mask_y": {"port": two.port, "actuator": "z812"},
             },
         }
@@ -132,7 +133,10 @@ def test_apt_axes_may_be_on_ports_of_their_own(tmp_path):
 
 
 def test_the_rigs_own_chain_gets_the_rigs_own_names():
-    with PtyServer(ZaberChain(SYSTEM_CLOCK)) as server, open_stage(f"zaber:{server.port}") as stage:
+    with (
+        PtyServer(ZaberChain(SYSTEM_CLOCK)) as server,
+        open_stage(f"zaber:{server.port}{SIMULATED_SCALES['zaber']}") as stage,
+    ):
         assert stage.axes == ("mask_x", "mask_y", "aperture_x", "aperture_y")
 
 
@@ -253,7 +257,7 @@ def homed_zaber(clock=SYSTEM_CLOCK):
 def homed_apt(clock=SYSTEM_CLOCK):
     device = AptController(clock, {0x50: replace(Z825, start_um=290.0)})
     settings = StageSettings(approach_um=0.0)
-    with AptStage({"x": AptAxis(device.transport())}, clock, settings) as stage:
+    with AptStage({"x": AptAxis(device.transport(), Z825_MOTOR)}, clock, settings) as stage:
         stage.home()
     return device, device.position_um, ["x", "20000"]
 
@@ -279,7 +283,8 @@ def test_every_way_to_interrupt_a_move_stops_the_stage_and_leaves_it_stopped(
 ):
     device, distance_um, jog = make()
     with PtyServer(device) as server:
-        command = [*PROGRAM, "jog", "--stage", f"{protocol}:{server.port}", *jog]
+        stage = f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}"
+        command = [*PROGRAM, "jog", "--stage", stage, *jog]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         with subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -304,7 +309,8 @@ def test_a_stage_that_vanishes_in_a_move_is_an_error_that_says_it_could_not_be_s
     device, _, jog = homed_zaber()
     device.faults.inject("unplug", when=lambda occasion: b" move " in occasion.command)
     with PtyServer(device) as server:
-        code, _, err = run("jog", "--stage", f"zaber:{server.port}", *jog)
+        stage = f"zaber:{server.port}{SIMULATED_SCALES['zaber']}"
+        code, _, err = run("jog", "--stage", stage, *jog)
     assert code == 1
     assert "went away" in one_line(err)
     assert "could not be stopped" in one_line(err)
@@ -364,3 +370,27 @@ def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
     assert code == 0
     assert "frame-0001.dng: 240x320 rggb" in told.replace("\n", "")
     assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320
+
+
+def test_a_request_to_end_serving_is_not_called_ctrl_c():
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
+    command = [*PROGRAM, "serve", "zaber"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("zaber:")
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "no longer serving (SIGTERM)" in err
+    assert "Ctrl-C" not in err
+
+
+def test_a_jog_raises_an_output_on_arrival_where_the_stage_can(run):
+    code, out, _ = run("jog", "--rig", "simulated", "--home", "--signal", 1, "mask_x", 100)
+    assert (code, out.startswith("mask_x at 100.")) == (0, True)
+    code, _, err = run("jog", "--rig", "simulated", "--home", "--signal", 9, "mask_x", 100)
+    assert (code, "BADDATA" in one_line(err)) == (1, True)
+    code, _, err = run("jog", "--rig", "simulated:grbl", "--home", "--signal", 1, "x", "--", -100)
+    assert (code, "only Zaber" in one_line(err)) == (1, True)

@@ -195,7 +195,37 @@ print(json.dumps(told))
 """
 
 
-def test_libgphoto2_captures_and_downloads_from_our_camera(tmp_path):
+def initiator(server, home, *shutters):
+    """What libgphoto2 tells of one session with the server, with a picture for each shutter."""
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            INITIATOR,
+            f"ptpip:127.0.0.1:{server.port}:{server.port}",
+            *shutters,
+        ],
+        env=os.environ | {"HOME": str(home)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "sessions",
+    [
+        [(), ("0.0080s",), ("0.0333s",)],
+        [("0.0080s", "0.0333s"), (), ("0.0080s",)],
+    ],
+    ids=["summary first", "summary between"],
+)
+def test_libgphoto2_captures_and_downloads_from_our_camera_session_after_session(
+    tmp_path, sessions
+):
     exposed_s = []
 
     def see(exposure_s):
@@ -203,26 +233,21 @@ def test_libgphoto2_captures_and_downloads_from_our_camera(tmp_path):
         return MOSAIC
 
     camera = PtpCameraSimulator(see, SystemClock())
+    pictures = []
     with PtpIpServer(camera) as server:
-        address = f"ptpip:127.0.0.1:{server.port}:{server.port}"
-        done = subprocess.run(
-            [sys.executable, "-c", INITIATOR, address, "0.0080s", "0.0333s"],
-            env=os.environ | {"HOME": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert "EMMC simulated camera" in told["summary"]
+        for shutters in sessions:
+            told = initiator(server, tmp_path, *shutters)
+            assert "EMMC simulated camera" in told["summary"]
+            assert len(told["pictures"]) == len(shutters)
+            pictures += told["pictures"]
     stored = [
         [info.name, len(data), hashlib.sha256(data).hexdigest()]
         for info, data in camera.objects.values()
         if info.format == Format.DNG
     ]
-    assert told["pictures"] == stored
-    assert exposed_s == pytest.approx([0.008, 0.0333])
+    assert pictures == stored
+    wanted_s = [float(shutter.rstrip("s")) for shutters in sessions for shutter in shutters]
+    assert exposed_s == pytest.approx(wanted_s)
     for _, data in camera.objects.values():
         if data:
             np.testing.assert_array_equal(decode_raw(data).mosaic, MOSAIC)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers import apt_codec, grbl_codec, zaber_codec
-from drivers.apt import AptAxis, AptStage
+from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.errors import DriverError, GarbledReplyError
 from drivers.grbl import GrblStage
 from drivers.stage import StageSettings
@@ -24,6 +24,7 @@ from simulators.grbl import GrblController
 from simulators.wire import MemoryTransport
 from simulators.zaber import AxisSpec, ZaberChain
 
+Z825_MOTOR = ACTUATORS["z825"]
 CARELESS = StageSettings(poll_s=0.2, settle_s=0.0)
 MOST_WRITES = 3000
 """A driver that writes more often for one call counts as hung."""
@@ -289,7 +290,7 @@ def grbl(clock):
 
 def apt(clock):
     liar = Liar(AptController(clock, {apt_codec.USB_UNIT: quick(Z825)}), clock)
-    return liar, AptStage({"x": AptAxis(MemoryTransport(liar, clock))}, clock, CARELESS)
+    return liar, AptStage({"x": AptAxis(MemoryTransport(liar, clock), Z825_MOTOR)}, clock, CARELESS)
 
 
 def zaber_positions_um(heard):
@@ -375,7 +376,7 @@ def test_no_answers_make_connecting_hang_or_fail_otherwise_than_by_an_error_of_t
             elif protocol == "grbl":
                 stage = GrblStage(wire, {"x": "X"}, clock)
             else:
-                stage = AptStage({"x": AptAxis(wire)}, clock)
+                stage = AptStage({"x": AptAxis(wire, Z825_MOTOR)}, clock)
         except DriverError as error:
             check_one_line(error)
             return

@@ -21,7 +21,7 @@ from simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 QUICK = AxisSpec(max_speed_um_s=200_000.0, acceleration_um_s2=2e7)
 
 
@@ -82,7 +82,7 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
             axis.generic_command("sing")
         assert devices[1].generic_command("get system.serial").data == "73003"
 
-        axis.settings.set("maxspeed", 5_000_000.0)
+        axis.settings.set("maxspeed", 1_000_000.0)
         devices[0].all_axes.home()
         chain.faults.inject("stall")
         with pytest.raises(refusals.MovementFailedException, match="FS"):
@@ -99,6 +99,50 @@ def test_zaber_motion_follows_moves_by_alerts():
         for target in (40_000, 10, 90_000):
             axis.move_absolute(target)
             assert chain.position_um(2, 1) == pytest.approx(target * QUICK.microstep_um, abs=3.1)
+
+
+@pytest.mark.parametrize("wire", [PtyServer, TcpServer])
+def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
+    ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
+    chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
+    with wire(chain) as server:
+        before = 0.0
+        for target in (100_000, 40_000):
+            opening = (
+                ascii_protocol.Connection.open_serial_port(server.port)
+                if wire is PtyServer
+                else ascii_protocol.Connection.open_tcp(*server.address)
+            )
+            with opening as connection:
+                (device,) = connection.detect_devices(identify_devices=False)
+                axis = device.get_axis(1)
+                if not before:
+                    axis.home()
+                assert axis.warnings.get_flags() == set()
+                assert axis.get_position() == before
+                axis.move_absolute(target)
+                assert axis.settings.get("resolution") == 64
+            before = float(target)
+
+
+def test_zaber_motion_lets_an_output_rise_when_the_axis_arrives():
+    ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
+    chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
+    levels = []
+    chain.on_output = lambda device, output, level, at_s: levels.append((output, level))
+    with TcpServer(chain) as server, ascii_protocol.Connection.open_tcp(*server.address) as opened:
+        (device,) = opened.detect_devices(identify_devices=False)
+        device.get_axis(1).home()
+        trigger = device.triggers.get_trigger(1)
+        for target in (40_000, 90_000):
+            trigger.fire_when(f"1 pos >= {target}")
+            trigger.on_fire(ascii_protocol.TriggerAction.A, 0, "io set do 1 1")
+            trigger.enable(1)
+            assert not device.io.get_digital_output(1)
+            device.get_axis(1).move_absolute(target)
+            assert device.io.get_digital_output(1)
+            device.io.set_digital_output(1, ascii_protocol.DigitalOutputAction.OFF)
+    assert levels == [(1, 1), (1, 0), (1, 1), (1, 0)]
 
 
 @pytest.fixture
@@ -140,6 +184,28 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
         finally:
             peer.close()
             peer._thread.join()
+
+
+def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_controller):
+    devices = pytest.importorskip("thorlabs_apt_device", reason="needs the extra `peers`")
+    with PtyServer(apt_controller) as server:
+        for session, target in enumerate((200_000, 50_000)):
+            peer = devices.KDC101(serial_port=server.port, home=False)
+            try:
+                wait_until(lambda peer=peer: peer.status["msg"] and peer.jogparams["msg"])
+                if not session:
+                    peer.home()
+                wait_until(lambda peer=peer: peer.status["homed"])
+                peer.set_jog_params(10_000, 1_000, 767_367)
+                peer.move_absolute(target)
+                wait_until(lambda peer=peer, at=target: peer.status["position"] == at)
+                wait_until(lambda peer=peer: peer.status["settled"])
+                peer.move_jog(direction="forward")
+                wait_until(lambda peer=peer, at=target: peer.status["position"] == at + 10_000)
+            finally:
+                peer.close()
+                peer._thread.join()
+    assert apt_controller.position_um() == pytest.approx(60_000 / COUNTS_PER_UM, abs=0.1)
 
 
 def test_the_apt_codec_writes_the_bytes_that_an_independent_one_writes():
@@ -244,3 +310,29 @@ def test_grbl_streamer_homes_streams_and_is_alarmed():
             assert peer.cmpos == (-5.5, -3.0, -1.0)
         finally:
             peer.disconnect()
+
+
+def test_grbl_streamer_streams_again_in_a_second_session():
+    streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
+    quick = replace(
+        BENCH_AXES["X"], max_speed_um_s=200_000.0, acceleration_um_s2=1e7, start_um=24_000.0
+    )
+    device = GrblController(SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={22: 0, 20: 0})
+    with PtyServer(device) as server:
+        for place in ("1.000", "0.500"):
+            told = []
+            peer = streamer.GrblStreamer(lambda *event, told=told: told.append(event))
+            peer.poll_interval = 0.01
+            peer.cnect(server.port)
+            try:
+                wait_until(lambda told=told: ("on_boot",) in told)
+                peer.poll_start()
+                wait_until(lambda peer=peer: peer.cmode == "Idle")
+                peer.incremental_streaming = True
+                peer.write(f"G21 G90\nG53 G1 F3000 X-{place}")
+                peer.job_run()
+                wait_until(lambda told=told: ("on_job_completed",) in told)
+                wait_until(lambda peer=peer, at=-float(place): peer.cmpos[0] == at)
+                assert not any(event[0] in ("on_error", "on_alarm") for event in told)
+            finally:
+                peer.disconnect()

@@ -14,6 +14,7 @@ import serial
 from serial.tools import list_ports
 
 from drivers import ports
+from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import (
     GarbledReplyError,
     PortBusyError,
@@ -268,3 +269,23 @@ def test_a_fault_strikes_at_the_moment_it_was_armed_for():
         faults.inject("sing")
     with pytest.raises(ValueError, match="no clock"):
         Faults(["stall"]).inject("stall", after_s=1.0)
+
+
+def test_a_second_client_of_a_tcp_stage_is_told_that_it_is_busy_and_the_first_goes_on():
+    chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): AxisSpec()})
+    with TcpServer(chain) as server:
+        first = SerialTransport(server.port, timeout_s=2.0)
+        first.write(b"/1 0 01\n")
+        first.read_until(b"\n")
+        second = SerialTransport(server.port, timeout_s=2.0)
+        with pytest.raises(PortBusyError, match="another program over the network"):
+            second.read_until(b"\n")
+        second.close()
+        first.write(b"/1 0 02\n")
+        assert b"@01 0 02 OK" in first.read_until(b"\n")
+        first.close()
+
+
+def test_a_flood_is_shortened_in_the_message():
+    assert len(str(GarbledReplyError(bytes(100_000), "no reply"))) < 400
+    assert "(100000 bytes)" in str(TransportTimeoutError("p", 1.0, bytes(100_000)))

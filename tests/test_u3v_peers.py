@@ -65,13 +65,14 @@ def test_aravis_takes_exact_frames_from_the_simulated_camera_through_libusb(peer
     assert seen["sensor"] == [1022, 1024]
     assert seen["payload"] == 1022 * 1024 * 12 // 8
     assert "BayerGB12Packed" in seen["formats"]
-    assert len(seen["frames"]) == 4
-    for frame in seen["frames"]:
-        assert frame["whole"]
-        assert frame["equal"]
-        assert frame["format"] == "BayerGB12p"
-    blocks = [frame["block"] for frame in seen["frames"]]
-    assert blocks == sorted(set(blocks))
+    assert [len(frames) for frames in seen["sessions"]] == [4, 4]
+    for frames in seen["sessions"]:
+        for frame in frames:
+            assert frame["whole"]
+            assert frame["equal"]
+            assert frame["format"] == "BayerGB12p"
+        # The second may begin with a frame of the first that was still under way.
+        assert len({frame["block"] for frame in frames}) == len(frames)
 
 
 def test_our_driver_takes_exact_frames_through_libusb(peer):
@@ -79,7 +80,7 @@ def test_our_driver_takes_exact_frames_through_libusb(peer):
     assert seen["faults"] == []
     assert seen["listed"] == [["EMMC", "U3V simulator", "U1"]]
     assert seen["exposure_s"] == pytest.approx(0.005)
-    assert seen["frames"] == [True] * 5
+    assert seen["frames"] == [True] * 10
     assert not seen["streaming"]
 
 

@@ -7,6 +7,7 @@ Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -22,6 +23,7 @@ from rich.table import Table
 from emmc_rig.capture.signals import ENDING, handled
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
+from emmc_rig.commands.stage_scale import register as register_scale
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 register(app)
 app.command()(conform)
+register_scale(app)
 
 
 @app.command("list")
@@ -155,17 +158,30 @@ def jog(
     to: Annotated[bool, typer.Option("--to", help="move to this place, not by it")] = False,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
+    signal_on: Annotated[
+        int | None,
+        typer.Option("--signal", min=1, help="digital output that rises on arrival (Zaber)"),
+    ] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
     """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
+    from drivers.zaber import ZaberStage
+
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
         if home_first:
             opened.home([axis])
-        move = opened.move_to_um if to else opened.move_by_um
-        typer.echo(f"{axis} at {move({axis: distance_um})[axis]:.3f} um")
+        if signal_on is not None:
+            if not isinstance(opened, ZaberStage):
+                raise AppError("--signal: only Zaber devices raise an output on arrival")
+            target_um = distance_um + (0.0 if to else opened.position_um(axis))
+            at_um = opened.move_and_signal_um(axis, target_um, signal_on)
+        else:
+            move = opened.move_to_um if to else opened.move_by_um
+            at_um = move({axis: distance_um})[axis]
+        typer.echo(f"{axis} at {at_um:.3f} um")
 
 
 @app.command()
@@ -181,7 +197,7 @@ def serve(
     """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
     from drivers.clock import SYSTEM_CLOCK
     from emmc_rig.files.folders import refuse_inside_session
-    from emmc_rig.rig.hardware import simulated_firmware
+    from emmc_rig.rig.hardware import SIMULATED_SCALES, simulated_firmware
     from simulators.wire import PtyServer, TcpServer
 
     if link is not None:
@@ -194,9 +210,14 @@ def serve(
         if not (host and number.isdecimal() and int(number) < 2**16):
             raise AppError(f"--tcp {tcp}: write HOST:PORT, for instance 127.0.0.1:5000")
         server = TcpServer(firmware, host, int(number))
+
+    def ended(number: int, frame: FrameType | None) -> None:
+        _told.print(f"emmc-rig: no longer serving ({signal.Signals(number).name})")
+        raise typer.Exit(128 + number)
+
     try:
-        with _signals_interrupt(), server:
-            typer.echo(f"{protocol}:{server.port}")
+        with handled(ended, ENDING), server:
+            typer.echo(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
             while True:
                 time.sleep(1.0)
     except OSError as fault:
@@ -221,6 +242,7 @@ def bench(
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
+    from emmc_rig.study.benchmarks.trigger import trigger_timing
     from emmc_rig.study.benchmarks.u3v import u3v_timings
 
     with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
@@ -247,10 +269,17 @@ def bench(
                 f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
                 f"{one.gigabytes_per_s:.2f} GB/s"
             )
+        trigger = trigger_timing()
+        typer.echo(
+            f"a frame at each step, {trigger.vibration_ms:g} ms of vibration, "
+            f"{trigger.exposure_ms:g} ms of exposure (simulated): {trigger.asked_ms:.1f} ms asked "
+            f"for, {trigger.triggered_ms:.1f} ms triggered by the stage's arrival"
+        )
         if folder is not None:
             metrics = {
                 "stage_commands": [one.as_dict() for one in timings],
                 "picture": picture.as_dict(),
+                "trigger": trigger.as_dict(),
                 "usb3_vision": [one.as_dict() for one in streams],
                 "command": command_line(),
                 "versions": versions(),
@@ -269,7 +298,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     if rig is not None:
         simulated_protocol(rig)
     logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)
-    with _signals_interrupt(), open_stage(rig or stage or "") as opened:
+    with signals_interrupt(), open_stage(rig or stage or "") as opened:
         try:
             yield opened
         except KeyboardInterrupt as stop:
@@ -282,7 +311,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
 
 
 @contextmanager
-def _signals_interrupt() -> Iterator[None]:
+def signals_interrupt() -> Iterator[None]:
     """Let a request to end, or a closed terminal, act as Ctrl-C does."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -295,7 +324,7 @@ def _signals_interrupt() -> Iterator[None]:
 def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
-    table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)
+    table = Table("axis", "homed", "position um", "limits um", "speed um/s", "up to", box=SIMPLE)
     for axis in stage.axes:
         low_um, high_um = stage.limits_um(axis)
         try:
@@ -303,6 +332,11 @@ def _show(stage: Stage) -> None:
         except NotHomedError:
             homed, position = "no", "unknown"
         table.add_row(
-            axis, homed, position, f"{low_um:g} to {high_um:g}", f"{stage.speed_um_s(axis):g}"
+            axis,
+            homed,
+            position,
+            f"{low_um:g} to {high_um:g}",
+            f"{stage.speed_um_s(axis):g}",
+            f"{stage.top_speed_um_s(axis):g}",
         )
     Console().print(table)

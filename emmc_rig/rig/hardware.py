@@ -11,13 +11,13 @@ import hashlib
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.apt import ACTUATORS, AptAxis, AptStage
+from drivers.apt import ACTUATORS, Actuator, AptAxis, AptStage
 from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -47,7 +47,7 @@ from emmc_rig.rig.camera_config import (
 )
 from emmc_rig.rig.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.rig.stage_config import (
-    USUAL_MICROSTEP_UM,
+    AptAxisConfig,
     AptConfig,
     GrblConfig,
     MicroManagerConfig,
@@ -78,6 +78,12 @@ MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
 SIMULATED = "simulated"
 PROBE_TIMEOUT_S = 0.2
+SIMULATED_SCALES = {
+    "zaber": f",microstep_um={AxisSpec().microstep_um}",
+    "grbl": "",
+    "apt": ",actuator=z825",
+}
+"""What must be stated of simulated devices: models that no table has, an unnamed actuator."""
 
 
 class Attendant(Protocol):
@@ -227,18 +233,20 @@ def simulated_rig(
     return rig, bench
 
 
-def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
+def open_stage(
+    spec: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
+) -> Stage:
     """Return the stage that `spec` names, connected; it must be closed.
 
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
     `emmc_rig.rig.stage_config`;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
-    once. settings: single settings that replace those of the file. Raises AppError or a
-    `DriverError`.
+    once. settings: single settings that replace those of the file. to_measure: see `_stage`.
+    Raises AppError or a `DriverError`.
     """
     name, _, protocol = spec.partition(":")
     if name == SIMULATED:
-        return open_simulated(protocol or "zaber", settings)[0]
+        return open_simulated(protocol or "zaber", settings, to_measure)[0]
     config = parse_stage(spec, settings)
     if isinstance(config, PluginConfig):
         care = config.stage_settings()
@@ -257,7 +265,7 @@ def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
                 opened.callback(transports[port].close)
             return transports[port]
 
-        stage = _stage(config, transport, SYSTEM_CLOCK)
+        stage = _stage(config, transport, SYSTEM_CLOCK, to_measure)
         opened.pop_all()
     return stage
 
@@ -277,15 +285,15 @@ def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
 
 
 def open_simulated(
-    protocol: str, settings: Mapping[str, Any] | None = None
+    protocol: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
 ) -> tuple[HostStage, SimulatedController]:
     """Return a stage over simulated firmware in memory, and that firmware."""
     clock = ManualClock()
     firmware = simulated_firmware(protocol, clock)
     wire = firmware.transport()
-    config = parse_stage(f"{protocol}:{SIMULATED}", settings)
+    config = parse_stage(f"{protocol}:{SIMULATED}{SIMULATED_SCALES[protocol]}", settings)
     assert isinstance(config, SerialConfig)
-    return _stage(config, lambda port: wire, clock), firmware
+    return _stage(config, lambda port: wire, clock, to_measure), firmware
 
 
 def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
@@ -341,25 +349,45 @@ _PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
 """In this order: half a line of text would leave an APT controller in the middle of a message."""
 
 
-def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
-    """Return the stage of a configuration over transports opened by port."""
+def _actuator(axis: AptAxisConfig, to_measure: bool) -> Actuator:
+    """Return an axis's actuator, with its counts as stated; to measure it, a count is the unit."""
+    known = ACTUATORS[axis.actuator]
+    counts_per_um = axis.counts_per_um or known.counts_per_um
+    if not to_measure:
+        return replace(known, counts_per_um=counts_per_um)
+    return Actuator(1.0, known.travel_um * counts_per_um, known.top_speed_um_s * counts_per_um)
+
+
+def _stage(
+    config: SerialConfig,
+    transport: Callable[[str], Transport],
+    clock: Clock,
+    to_measure: bool = False,
+) -> HostStage:
+    """Return the stage of a configuration over transports opened by port.
+
+    to_measure: the unit is a device's own count (Grbl: its own millimetre), of unknown length.
+    """
     try:
         settings = config.stage_settings()
         if isinstance(config, ZaberConfig):
             wire = transport(config.port)
             axes = config.axes or _found_axes(wire, clock)
-            if config.microstep_um == USUAL_MICROSTEP_UM and config.port != SIMULATED:
-                _log.warning(
-                    "assuming %g um for a microstep: set microstep_um in a YAML file if the "
-                    "stage's data sheet says otherwise",
-                    USUAL_MICROSTEP_UM,
-                )
-            return ZaberStage(wire, axes, config.microstep_um, clock, settings)
+            return ZaberStage(
+                wire, axes, config.microstep_um, clock, settings, config.resolution, to_measure
+            )
         if isinstance(config, GrblConfig):
-            return GrblStage(transport(config.port), config.axes, clock, settings)
+            return GrblStage(
+                transport(config.port),
+                config.axes,
+                clock,
+                settings,
+                steps_per_mm=config.steps_per_mm,
+                any_scale=to_measure,
+            )
         channels = {
             name: AptAxis(
-                transport(one.port), ACTUATORS[one.actuator], one.destination, one.channel
+                transport(one.port), _actuator(one, to_measure), one.destination, one.channel
             )
             for name, one in config.axes.items()
         }

@@ -1,4 +1,7 @@
-"""Which stage is meant: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes."""
+"""Which stage is meant: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes.
+
+Single settings may follow the port: `zaber:/dev/ttyUSB0,microstep_um=0.49609375`.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
-from drivers.apt import ACTUATORS, DEFAULT_ACTUATOR
+from drivers.apt import ACTUATORS
 from drivers.stage import StageSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import read_yaml
@@ -16,7 +20,6 @@ from emmc_rig.model.settings import Settings, explain
 from emmc_rig.rig.plugins import STAGES, plug_ins
 
 Positive = Annotated[float, Field(gt=0)]
-USUAL_MICROSTEP_UM = 0.047625
 
 
 class _Common(Settings):
@@ -27,6 +30,7 @@ class _Common(Settings):
     settle_s: Annotated[float, Field(ge=0)] = 0.05
     soft_limits_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
     speeds_um_s: dict[str, Positive] = Field(default_factory=dict)
+    top_speeds_um_s: dict[str, Positive] = Field(default_factory=dict)
 
     def stage_settings(self) -> StageSettings:
         """Return the part that concerns how carefully the stage moves."""
@@ -36,20 +40,25 @@ class _Common(Settings):
             settle_s=self.settle_s,
             soft_limits_um=self.soft_limits_um,
             speeds_um_s=self.speeds_um_s,
+            top_speeds_um_s=self.top_speeds_um_s,
         )
 
 
 class ZaberConfig(_Common):
-    """A chain of Zaber devices; without `axes` every axis found is used."""
+    """A chain of Zaber devices; without `axes` every axis found is used.
+
+    microstep_um: of axes whose model is not known. resolution: the device's, where it holds.
+    """
 
     protocol: Literal["zaber"] = "zaber"
     port: str
     axes: dict[str, tuple[int, int]] | None = None
-    microstep_um: Positive | dict[str, Positive] = USUAL_MICROSTEP_UM
+    microstep_um: Positive | dict[str, Positive] | None = None
+    resolution: int | dict[str, int] | None = None
 
 
 class GrblConfig(_Common):
-    """A Grbl controller, axes by letter."""
+    """A Grbl controller, axes by letter; steps_per_mm: what its `$100` and following must be."""
 
     protocol: Literal["grbl"] = "grbl"
     port: str
@@ -57,13 +66,15 @@ class GrblConfig(_Common):
         default_factory=lambda: {"x": "X", "y": "Y"}
     )
     tolerance_um: Positive = 5.0
+    steps_per_mm: dict[str, Positive] = Field(default_factory=dict)
 
 
 class AptAxisConfig(Settings):
-    """One channel of a Thorlabs controller."""
+    """One channel of a Thorlabs controller; counts_per_um replaces the actuator's own."""
 
     port: str
-    actuator: str = DEFAULT_ACTUATOR
+    actuator: str
+    counts_per_um: Positive | None = None
     destination: int = 0x50
     channel: int = 1
 
@@ -73,6 +84,9 @@ class AptConfig(_Common):
 
     protocol: Literal["apt"] = "apt"
     axes: dict[str, AptAxisConfig]
+
+
+APT_AXIS_OPTIONS = ("actuator", "counts_per_um", "destination", "channel")
 
 
 class MicroManagerConfig(_Common):
@@ -123,10 +137,15 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     """
     protocol, colon, port = spec.partition(":")
     known = stage_protocols()
+    chosen: dict[str, Any] = {}
+    if protocol in PROTOCOLS:
+        port, *options = port.split(",")
+        chosen = dict(_option(spec, one) for one in options)
     if colon and protocol in known and (port or known[protocol] is PluginConfig):
-        data: dict[str, Any] = {"protocol": protocol, "port": port}
+        data: dict[str, Any] = {"protocol": protocol, "port": port} | chosen
         if protocol == "apt":
-            data = {"protocol": protocol, "axes": {"x": {"port": port}}}
+            axis = {key: chosen.pop(key) for key in APT_AXIS_OPTIONS if key in chosen}
+            data = {"protocol": protocol, "axes": {"x": {"port": port} | axis}} | chosen
     elif spec.endswith((".yaml", ".yml")):
         read = read_yaml(Path(spec), AppError)
         if not isinstance(read, dict):
@@ -140,12 +159,34 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     return _validated(data | dict(overrides or {}), spec)
 
 
+def _require_actuators(axes: Any, source: str) -> None:
+    """Raise AppError for an axis without an actuator: no controller tells what is plugged in."""
+    known = ", ".join(ACTUATORS)
+    for axis, one in axes.items() if isinstance(axes, dict) else ():
+        if isinstance(one, dict) and "actuator" not in one:
+            raise AppError(
+                f"{source}: {axis} must not move, its actuator is not stated: write "
+                f"actuator: with one of {known} into the stage's YAML file, or "
+                "apt:PORT,actuator=NAME"
+            )
+
+
+def _option(spec: str, text: str) -> tuple[str, Any]:
+    """Return name and value of one `NAME=VALUE` behind a port."""
+    name, equals, value = text.partition("=")
+    if not (equals and name and value):
+        raise AppError(f"--stage {spec}: write NAME=VALUE behind the port, not {text!r}")
+    return name.strip(), yaml.safe_load(value)
+
+
 def _validated(data: dict[str, Any], source: str) -> StageConfig:
     protocol = str(data.get("protocol", ""))
     known = stage_protocols()
     if protocol not in known:
         raise AppError(f"{source}: protocol must be one of {', '.join(known)}")
     cls = known[protocol]
+    if cls is AptConfig:
+        _require_actuators(data.get("axes"), source)
     try:
         config: StageConfig = TypeAdapter(cls).validate_python(data)
     except ValidationError as fault:

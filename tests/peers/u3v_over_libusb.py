@@ -29,7 +29,7 @@ from drivers.u3v import list_u3v, open_u3v  # noqa: E402
 from simulators.u3v import U3vCameraSimulator  # noqa: E402
 from simulators.usb import SimulatedUsb  # noqa: E402
 
-SHAPE, FRAMES = (1024, 1022), 4
+SHAPE, FRAMES, SESSIONS = (1024, 1022), 4, 2
 MOSAIC = np.random.default_rng(7).integers(64, 4096, SHAPE, dtype=np.uint16)
 PATIENCE_US = 5_000_000
 
@@ -70,13 +70,20 @@ def with_aravis():
     seen["payload"] = camera.get_payload()
     for _ in range(3):
         stream.push_buffer(Aravis.Buffer.new_allocate(seen["payload"]))
+    seen["sessions"] = [acquired(camera, stream) for _ in range(SESSIONS)]
+    seen["faults"] = usbfs.faults
+    return seen
+
+
+def acquired(camera, stream):
+    """Start an acquisition, take frames, stop; return what is told of each frame."""
     camera.start_acquisition()
-    seen["frames"] = []
+    frames = []
     for _ in range(FRAMES):
         buffer = stream.timeout_pop_buffer(PATIENCE_US)
         form = BY_CODE[buffer.get_image_pixel_format()]
         pixels = unpack(bytes(buffer.get_data()), form, SHAPE)
-        seen["frames"].append(
+        frames.append(
             {
                 "whole": buffer.get_status() == Aravis.BufferStatus.SUCCESS,
                 "format": form.name,
@@ -87,8 +94,12 @@ def with_aravis():
         )
         stream.push_buffer(buffer)
     camera.stop_acquisition()
-    seen["faults"] = usbfs.faults
-    return seen
+    late = []
+    while (buffer := stream.try_pop_buffer()) is not None:
+        late.append(buffer)
+    for buffer in late:
+        stream.push_buffer(buffer)
+    return frames
 
 
 def with_driver():
@@ -97,10 +108,12 @@ def with_driver():
     testbed, usbfs = mock(SimulatedUsb(SYSTEM_CLOCK, simulator))
     KEPT.append(testbed)
     listings = list_u3v()
-    camera = open_u3v("U1")
-    camera.set_exposure_s(0.005)
-    frames = [camera.snap(), *itertools.islice(camera.stream(), FRAMES)]
-    camera.close()
+    frames = []
+    for _ in range(SESSIONS):
+        camera = open_u3v("U1")
+        camera.set_exposure_s(0.005)
+        frames += [camera.snap(), *itertools.islice(camera.stream(), FRAMES)]
+        camera.close()
     return {
         "listed": [(one.maker, one.model, one.serial) for one in listings],
         "exposure_s": camera.exposure_s,

@@ -1,0 +1,170 @@
+"""`emmc-rig devices scale`: measure the length of an axis's step, by a ruler or by the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import yaml
+
+from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from drivers.stage import Stage
+    from emmc_rig.rig.stage_config import StageConfig
+
+SMALLEST_COUNT = 100
+APPROACH_SHARE = 0.05
+"""Every place is come to from below by so much of the whole distance: backlash stays out."""
+
+ReadPlace = Callable[[int], float]
+"""Given the number of a place (from 0), returns where the axis reads to be there, in um."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program's `devices`."""
+    app.command("scale")(scale)
+
+
+def scale(
+    axis: Annotated[str, typer.Argument(help="name of the axis")],
+    counts: Annotated[int, typer.Argument(help="distance to move, in the device's own counts")],
+    stage: Annotated[
+        str, typer.Option("--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file")
+    ],
+    places: Annotated[int, typer.Option("--places", min=3, help="places to read")] = 5,
+    camera: Annotated[
+        str | None, typer.Option("--camera", help="read the mask's shadow in this camera's frames")
+    ] = None,
+    um_per_pixel: Annotated[
+        float | None,
+        typer.Option("--um-per-pixel", min=0, help="at the mask: pixel pitch over magnification"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="write the stage's YAML file, with the scale")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before the axis moves")] = False,
+) -> None:
+    """Measure the length of an axis's step: home, move a known count, read where it stands.
+
+    Without --camera every place is asked for: read it off a ruler or a dial indicator, in um.
+    Counts are microsteps (Zaber), encoder counts (APT), thousandths of Grbl's own millimetre.
+    """
+    from calibration.errors import CalibrationError
+    from calibration.stage_scale import fit_step_length
+    from drivers.errors import DriverError
+    from emmc_rig.commands.devices import signals_interrupt
+    from emmc_rig.files.folders import refuse_inside_session
+    from emmc_rig.rig.hardware import open_camera, open_stage
+    from emmc_rig.rig.stage_config import parse_stage
+
+    if counts < SMALLEST_COUNT:
+        raise AppError(f"{counts} counts are too few to measure: move at least {SMALLEST_COUNT}")
+    if (camera is None) != (um_per_pixel is None):
+        raise typer.BadParameter("--camera and --um-per-pixel belong together")
+    if out is not None:
+        refuse_inside_session(out.parent)
+        if out.exists():
+            raise AppError(f"{out} exists: name another file")
+    config = parse_stage(stage)
+    settings = {"approach_um": APPROACH_SHARE * counts}
+    try:
+        with signals_interrupt(), open_stage(stage, settings, to_measure=True) as opened:
+            if axis not in opened.axes:
+                raise AppError(f"no axis {axis!r} on {stage}: use one of {', '.join(opened.axes)}")
+            question = (
+                f"{axis} will be homed, then moved by {counts} counts of unknown length. "
+                "Is its way free?"
+            )
+            if not (yes or typer.confirm(question)):
+                raise AppError("nothing was moved: clear the way, then answer y")
+            if camera is None:
+                steps, readings = measure(opened, axis, counts, places, _asked)
+            else:
+                with closing(open_camera(camera)) as device:
+                    reader = shadow_reader(device, um_per_pixel or 0.0)
+                    steps, readings = measure(opened, axis, counts, places, reader)
+            found = fit_step_length(steps, readings)
+            told = scale_settings(config, opened, axis, found.um_per_step)
+    except (DriverError, CalibrationError) as fault:
+        raise AppError("; ".join([str(fault), *getattr(fault, "__notes__", [])])) from fault
+    share = found.deviation_um / found.um_per_step
+    typer.echo(
+        f"{axis}: {found.um_per_step:.6g} um a count, deviation {100 * share:.2g} %, worst reading "
+        f"{found.worst_um:.3g} um off the line" + (", counting downwards" * found.reversed)
+    )
+    typer.echo("take the data sheet's own figure if it is within that; for the stage's file:")
+    typer.echo(yaml.safe_dump(told, sort_keys=False), nl=False)
+    if out is not None:
+        whole = _merged(config.model_dump(mode="json", exclude_defaults=True), told)
+        with out.open("x", encoding="utf-8") as file:
+            yaml.safe_dump({"protocol": config.protocol} | whole, file, sort_keys=False)
+
+
+def measure(
+    stage: Stage, axis: str, counts: int, places: int, read: ReadPlace
+) -> tuple[list[float], list[float]]:
+    """Return where the axis counted to be and where it was read, at places over the distance.
+
+    Homes the axis; the places lie about the middle of its travel, and every one is approached
+    from below. The stage's unit is the count.
+    """
+    stage.home([axis])
+    low, high = stage.limits_um(axis)
+    if counts > high - low:
+        raise AppError(f"{axis} has {high - low:.0f} counts of travel: move less than {counts}")
+    steps, readings = [], []
+    first = round((low + high - counts) / 2)
+    for number in range(places):
+        target = first + round(counts * number / (places - 1))
+        steps.append(stage.move_to_um({axis: target})[axis])
+        readings.append(read(number))
+    return steps, readings
+
+
+def scale_settings(config: StageConfig, stage: Any, axis: str, um_per_step: float) -> dict:
+    """Return the settings of a stage's file that state what was measured."""
+    figure = float(f"{um_per_step:.6g}")
+    if config.protocol == "zaber":
+        resolution = stage.resolution(axis)
+        stated = {"microstep_um": {axis: figure}}
+        return stated | ({} if resolution is None else {"resolution": {axis: resolution}})
+    if config.protocol == "apt":
+        return {"axes": {axis: {"counts_per_um": float(f"{1 / um_per_step:.6g}")}}}
+    return {"steps_per_mm": {axis: float(f"{stage.steps_per_mm(axis) / um_per_step:.6g}")}}
+
+
+def _asked(number: int) -> float:
+    return typer.prompt(f"place {number + 1}: where does it stand, in um", type=float)
+
+
+def shadow_reader(camera: Any, um_per_pixel: float) -> ReadPlace:
+    """Return a reader that adds up the moves of the mask's shadow since the first place."""
+    from calibration.stage_scale import shadow_shift_px
+
+    frames: list[Any] = []
+    moved_px = [0.0, 0.0]
+
+    def read(number: int) -> float:
+        frames.append(camera.snap().mosaic)
+        if len(frames) > 1:
+            for axis, shift_px in enumerate(shadow_shift_px(frames.pop(0), frames[0])):
+                moved_px[axis] += shift_px
+        return um_per_pixel * math.hypot(*moved_px)
+
+    return read
+
+
+def _merged(base: dict, more: dict) -> dict:
+    """Return settings with those of `more` in their place, mapping by mapping."""
+    merged = dict(base)
+    for key, value in more.items():
+        old = merged.get(key)
+        if isinstance(old, dict) and isinstance(value, dict):
+            value = _merged(old, value)
+        merged[key] = value
+    return merged
