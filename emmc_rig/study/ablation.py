@@ -6,6 +6,7 @@ with, on the same frames.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +17,8 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruct import PSI, open_dictionary, read_capture
-from reconstruction.adaptive.method import AdaptiveSettings
+from emmc_rig.study.oracle import matched_disparity
+from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.methods import MethodSettings, reconstruct
 
 WHOLE = "adaptive"
@@ -33,6 +35,7 @@ LEFT_OUT = {
     "disparity (all at 0)": {"furthest_px": 0.01},
 }
 """Pieces of the method, and the settings without them."""
+ORACLE = "true disparity in place of the searched one"
 RIVALS = ("adaptive-fast", "tv", "tv-dict")
 
 
@@ -54,7 +57,7 @@ class Ablation:
 def ablations(
     scene: str, camera_name: str, camera: Camera, size: tuple[int, int], seed: int, folder: Path
 ) -> Iterator[Ablation]:
-    """Yield the whole method, then the method without each piece, then its rivals.
+    """Yield the whole method, then the method without each piece, its rivals, and the oracle.
 
     The frames are made once, by `simulate` into an existing folder. The whole runs twice, so that
     compiling is not counted.
@@ -86,5 +89,15 @@ def ablations(
     for method in RIVALS:
         decibels, seconds = run(method, MethodSettings())
         yield Ablation(method, decibels, seconds, best - decibels, took - seconds)
+    started = time.perf_counter()
+    known = reconstruct_adaptive(
+        psi,
+        capture.readings,
+        capture.noise_sigma,
+        usable=capture.usable,
+        disparity=matched_disparity(truth),
+    )
+    decibels, seconds = psnr_db(known.light_field, truth), time.perf_counter() - started
+    yield Ablation(ORACLE, decibels, seconds, best - decibels, took - seconds)
     copied = psnr_db(replicate_centre(truth), truth)
     yield Ablation("copied true centre view", copied, 0.0, best - copied, took)

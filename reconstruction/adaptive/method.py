@@ -46,6 +46,7 @@ from reconstruction.adaptive.parsimony import (
 )
 from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import darkness, smooth_guess
+from reconstruction.errors import ReconstructionError
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction
@@ -129,12 +130,14 @@ def reconstruct_adaptive(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    disparity: Array | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each. usable: pixels to fit (default all). Raises ReconstructionError for inputs that
-    do not fit each other.
+    one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
+    it is known, in place of the one searched. Raises ReconstructionError for inputs that do not
+    fit each other.
     """
     settings = settings or AdaptiveSettings()
     started = clock()
@@ -158,7 +161,7 @@ def reconstruct_adaptive(
     data = _unexplained_by(picture / np.float32(scale), flat, bright, settings)
     volume = _searched(data, settings, lambda: tell(1))
     k = psi.binning
-    centre = search.per_pixel(volume, psi.size, k)
+    centre = search.per_pixel(volume, psi.size, k) if disparity is None else _known(disparity, psi)
     searched_s = clock() - started
     tell(2)
     held = held_out(usable)
@@ -269,6 +272,15 @@ class Given:
         psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
         noise = (self.noise / scale**2).astype(np.float32)
         return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+
+def _known(disparity: Array, psi: ImagingMatrix) -> Array:
+    """Return a disparity that is given, checked; raises ReconstructionError."""
+    if disparity.shape != psi.size or not np.isfinite(disparity).all():
+        raise ReconstructionError(
+            f"a disparity of shape {disparity.shape} is given, Psi needs {psi.size}, all finite"
+        )
+    return np.asarray(disparity, dtype=np.float32)
 
 
 def _unexplained_by(
