@@ -31,7 +31,9 @@ LEFT_OUT = {
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},
     "momentum": {"texture": {"momentum": 0.0}},
     "second layer": {"layers": False},
-    "total variation where no surface fits": {"free": False},
+    "total variation in the mean": {"free": False},
+    "a second fit, of less misfit": {"misfits": (0.004,)},
+    "a second fit, of more misfit": {"misfits": (0.0015,)},
     "disparity (all at 0)": {"furthest_px": 0.01},
 }
 """Pieces of the method, and the settings without them."""

@@ -10,8 +10,8 @@ Edges that views do not reach are told from the scene first (`edges`).
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `texture`, `shrinkage`, `refine`).
-5. Where total variation explains readings that were kept from both fits better than surfaces do,
-   it is returned (`free`).
+5. Textures that follow the readings more or less closely, and total variation, are averaged by
+   how well they predict readings kept from all of them (`mixture`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 """
@@ -33,8 +33,8 @@ from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
 from reconstruction.adaptive.edges import dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.free import freedom
 from reconstruction.adaptive.joint import TextureSettings, solve
+from reconstruction.adaptive.mixture import mean_deviation, mean_light_field, weighted
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.parsimony import (
     colour_is_needed,
@@ -44,7 +44,7 @@ from reconstruction.adaptive.parsimony import (
     one_plane,
     plane_bound_db,
 )
-from reconstruction.adaptive.uncertainty import deviation, held_out
+from reconstruction.adaptive.uncertainty import deviation, held_out, plain_deviation
 from reconstruction.choices import darkness, smooth_guess
 from reconstruction.errors import ReconstructionError
 from reconstruction.flat import FlatPsi, flat_psi
@@ -97,7 +97,10 @@ class AdaptiveSettings(Settings):
         default=True, description="give what the centre view does not see a texture of its own"
     )
     misfit: float = Field(
-        default=0.0015, gt=0, description="deviation of readings that no model explains"
+        default=0.004, gt=0, description="deviation of readings that no disparity explains"
+    )
+    misfits: tuple[Length, ...] = Field(
+        default=(0.004, 0.0015), min_length=1, description="and no texture, of each one fitted"
     )
     nearer: Literal["larger", "smaller"] = Field(
         default="larger", description="disparity of what is in front; pictures may be flipped"
@@ -110,7 +113,7 @@ class AdaptiveSettings(Settings):
         default=40, ge=1, description="of total variation, from which textures begin"
     )
     free: bool = Field(
-        default=True, description="return total variation where it explains the frames better"
+        default=True, description="average with total variation where it explains the frames"
     )
 
 
@@ -143,7 +146,7 @@ def reconstruct_adaptive(
     started = clock()
     typical, noise = checked_noise(psi, noise_sigma, usable)
     frames, usable = checked_inputs(psi, frames, typical, usable)
-    total = settings.texture.steps + 3
+    total = len(settings.misfits) * settings.texture.steps + 3
 
     def tell(step: int) -> None:
         if on_step is not None:
@@ -168,7 +171,7 @@ def reconstruct_adaptive(
     # Total variation is what surfaces must beat on the readings kept from both, and their begin.
     start = TVSettings(max_steps=settings.start_steps, objective_every=settings.start_steps + 1)
     plain = reconstruct_tv(given.psi, given.frames, given.typical, start, usable & ~held)
-    precision = np.where(usable & ~held, 1 / data.variance, 0).astype(np.float32)
+    precision = _precision(bright, held, settings.misfits[-1])
     nearer = 1 if settings.nearer == "larger" else -1
     begun = centre_view(plain.light_field) / np.float32(scale)
     needed = Needed(given.psi, centre, begun, settings.texture)
@@ -176,20 +179,27 @@ def reconstruct_adaptive(
     if settings.parsimony:
         needed, spared = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
         left_out += spared
-    found = solve(
-        needed.psi,
-        needed.centre,
-        nearer,
-        bright.frames,
-        precision,
-        needed.picture,
-        needed.texture,
-        settings.layers,
-        on_step=lambda step: tell(2 + step),
-    )
-    seen = found.surfaces.light_field(found.texture) * np.float32(scale)
-    light_field = np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape)
-    missed = bright.frames - found.surfaces.forward(found.texture)
+    light_fields, misses = [], []
+    for fit, misfit in enumerate(settings.misfits):
+        # One layout of rays at a time: it is as large as the light field.
+        found = None
+        done = 2 + fit * settings.texture.steps
+        found = solve(
+            needed.psi,
+            needed.centre,
+            nearer,
+            bright.frames,
+            _precision(bright, held, misfit),
+            needed.picture,
+            needed.texture,
+            settings.layers,
+            on_step=lambda step, done=done: tell(done + step),
+        )
+        seen = found.surfaces.light_field(found.texture) * np.float32(scale)
+        light_fields.append(np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape))
+        misses.append(bright.frames - found.surfaces.forward(found.texture))
+    assert found is not None
+    missed = misses[-1]
     kinds = texture_map(volume, psi.size, k)
     doubt = search.variance_per_pixel(volume, psi.size, k)
     maps = {
@@ -204,22 +214,33 @@ def reconstruct_adaptive(
     decided = _decided(volume)
     judged = _judgement(settings, volume, decided, masks)
     sure = deviation(found, doubt, bright.frames, bright.noise, held)
-    variance = None if sure is None else np.square(sure.sigma * np.float32(scale))
-    if settings.free and variance is not None:
+    sigmas: list[Array | float] = (
+        [] if sure is None else [sure.sigma * np.float32(scale)] * len(misses)
+    )
+    if settings.free:
         rest = given.frames - given.psi.forward(plain.light_field)
-        free = freedom(given.psi, missed * np.float32(scale), rest, given.noise, held)
-        light_field = light_field + free.share[..., None] * (plain.light_field - light_field)
-        variance += free.share * (np.float32(free.variance) - variance)
-        maps["model"][free.share > 0.5] = MODELS.index("free")
-        if free.share.mean() > MOSTLY:
-            judged.append(
-                f"readings kept from the fit speak against surfaces in {free.share.mean():.0%} of "
-                "the picture, where total variation is returned: take more shots"
-            )
+        light_fields.append(plain.light_field)
+        misses.append(rest / np.float32(scale))
+    light_field = light_fields[0]
+    if held.any():
+        share = weighted(misses, bright.noise, held)
+        light_field = mean_light_field(light_fields, share.shares, k)
+        if settings.free:
+            free = share.shares[-1]
+            sigmas.append(plain_deviation(given.psi, rest, given.noise, held, free))
+            maps["model"][free.repeat(k, axis=0).repeat(k, axis=1) > MOSTLY] = MODELS.index("free")
+            if np.mean(free > MOSTLY) > MOSTLY:
+                judged.append(
+                    "readings kept from the fit speak against surfaces in "
+                    f"{np.mean(free > MOSTLY):.0%} of the picture, where total variation is "
+                    "returned: take more shots"
+                )
+        if sure is not None:
+            sigma = mean_deviation(sigmas, share, misses, k)
     if edges is not None:
         light_field = faded(edges, given.psi, light_field, given.frames, all_usable)
-    if variance is not None:
-        maps["sigma"] = np.sqrt(variance)
+    if sure is not None:
+        maps["sigma"] = sigma
     tell(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     return Reconstruction(
@@ -272,6 +293,12 @@ class Given:
         psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
         noise = (self.noise / scale**2).astype(np.float32)
         return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+
+def _precision(given: Given, held: NDArray[np.bool_], misfit: float) -> Array:
+    """Return the inverse variance of the readings fitted, 0 of the others."""
+    variance = given.noise + np.float32(misfit**2)
+    return np.where(given.usable & ~held, 1 / variance, 0).astype(np.float32)
 
 
 def _known(disparity: Array, psi: ImagingMatrix) -> Array:
