@@ -359,6 +359,9 @@ def chart(
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="instead: PSNR of the default method, against figures")
+    ] = False,
     until: Annotated[
         list[float] | None,
         typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
@@ -382,6 +385,9 @@ def chart(
             _chart_peers(named, size or TIMED_SIZE, repeats or TIMED_CALLS, place)
         else:
             _chart_kernels(named, size or TIMED_SIZE, repeats or TIMED_CALLS, place)
+        return
+    if guard:
+        _chart_guard(scene or [], camera, _size(size), out or Path("emmc-guard"))
         return
     if ablation or next_shot:
         through, cut = (camera or ["rgbw-bayer-1shot"])[0], _size(size) or (128, 160)
@@ -675,6 +681,37 @@ def _chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, o
         metrics = {"scene": scene, "camera": camera, "size": list(size), "rows": rows}
         write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
     Console().print(table)
+
+
+def _chart_guard(
+    scenes: list[str], camera: list[str] | None, size: tuple[int, int] | None, out: Path
+) -> None:
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.model.files import write_text
+    from emmc_rig.study import guard
+
+    stored = guard.stored_figures()
+    chosen = guard.cases(scenes, size, (camera or [guard.CAMERA])[0])
+    table, rows = Table("case", "dB", "stored dB", ""), []
+    with result_folder(out) as folder:
+        for row in guard.guarded(chosen, stored):
+            rows.append(row)
+            was = "-" if row.stored_db is None else f"{row.stored_db:.2f}"
+            word = "fell" if row.fell else "none stored" if row.stored_db is None else ""
+            table.add_row(row.case.key, f"{row.psnr_db:.2f}", was, word)
+        figures = {row.case.key: row.psnr_db for row in rows}
+        write_text(folder / guard.STORED, guard.merged_text(rows, stored))
+        metrics = {"psnr_db": figures, "fell": [row.case.key for row in rows if row.fell]}
+        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+    Console().print(table)
+    fallen = [row.case.key for row in rows if row.fell]
+    if fallen:
+        typer.echo(
+            f"{len(fallen)} figure(s) fell by more than {guard.MOST_FALL_DB} dB: "
+            f"{'; '.join(fallen)}: mend the method, or store {out / guard.STORED} if it is meant",
+            err=True,
+        )
+        raise typer.Exit(1)
 
 
 def _chart_next_shot(

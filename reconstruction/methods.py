@@ -154,6 +154,11 @@ METHODS = {
 }
 
 
+DEFAULT_METHOD = "adaptive"
+"""Of every command: from one shot and without training ahead of the others on every scene measured
+with it (`emmc-rig chart --guard`)."""
+
+
 def find_method(name: str) -> Method:
     """Return a method by name; raises ReconstructionError naming the nearest."""
     if name in METHODS:

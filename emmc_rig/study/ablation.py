@@ -26,6 +26,7 @@ LEFT_OUT = {
     "heavy tails of the evidence": {"freedom": 1000.0},
     "belief propagation": {"jump": 0.999},
     "a second length of textures": {"lengths_px": (3.0,)},
+    "plane sweeps with the texture": {"texture": {"sweeps": ()}},
     "sharpening of the disparity": {"texture": {"refine_steps": 0}},
     "stacking of like blocks": {"texture": {"reach": 0}},
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},

@@ -9,7 +9,9 @@ Edges that views do not reach are told from the scene first (`edges`).
    linear in the surfaces' texture (`rays`).
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
-   `texture`, `shrinkage`, `refine`).
+   `texture`, `shrinkage`, `refine`). All fits but the last sweep planes with their texture for a
+   new disparity (`sweep`): where that leads astray the last one, which keeps what the patches
+   agreed on, predicts held-out readings better.
 5. Textures that follow the readings more or less closely, and total variation, are averaged by
    how well they predict readings kept from all of them (`mixture`).
 
@@ -44,6 +46,7 @@ from reconstruction.adaptive.parsimony import (
     one_plane,
     plane_bound_db,
 )
+from reconstruction.adaptive.sweep import swept
 from reconstruction.adaptive.uncertainty import deviation, held_out, plain_deviation
 from reconstruction.choices import darkness, smooth_guess
 from reconstruction.errors import ReconstructionError
@@ -119,7 +122,9 @@ class AdaptiveSettings(Settings):
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
-    quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
+    quick = settings.texture.model_copy(
+        update={"steps": 6, "refine_steps": 2, "block_step": 6, "sweeps": ()}
+    )
     coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
     return settings.model_copy(update=coarser | fewer)
@@ -179,6 +184,22 @@ def reconstruct_adaptive(
     if settings.parsimony:
         needed, spared = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
         left_out += spared
+
+    def again(texture: Array, missed: Array, margin: int) -> Array:
+        beliefs = swept(
+            volume,
+            needed.psi,
+            bright.frames,
+            bright.noise,
+            usable & ~held,
+            texture,
+            missed,
+            margin,
+            settings.slope_px,
+            settings.jump,
+        )
+        return search.per_pixel(beliefs, psi.size, k)
+
     light_fields, misses = [], []
     for fit, misfit in enumerate(settings.misfits):
         # One layout of rays at a time: it is as large as the light field.
@@ -194,6 +215,7 @@ def reconstruct_adaptive(
             needed.texture,
             settings.layers,
             on_step=lambda step, done=done: tell(done + step),
+            again=again if fit < len(settings.misfits) - 1 else None,
         )
         seen = found.surfaces.light_field(found.texture) * np.float32(scale)
         light_fields.append(np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape))
@@ -369,7 +391,7 @@ def _needed(
         kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
         left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
         centre = plane.over(psi.size, psi.binning)
-        texture = texture.model_copy(update={"refine_steps": 0})
+        texture = texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
     if may_be_grey(picture):
         quick = texture.model_copy(update={"steps": TRIAL_STEPS, "refine_steps": 0})
         both = (psi, picture), (grey_psi(psi), picture.mean(axis=-1, keepdims=True))
