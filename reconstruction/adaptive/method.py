@@ -14,6 +14,7 @@ Edges that views do not reach are told from the scene first (`edges`).
    agreed on, predicts held-out readings better.
 5. Textures that follow the readings more or less closely, and total variation, are averaged by
    how well they predict readings kept from all of them (`mixture`).
+6. What is still missed is a light field of its own, if those readings speak for it (`rest`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 """
@@ -46,6 +47,7 @@ from reconstruction.adaptive.parsimony import (
     one_plane,
     plane_bound_db,
 )
+from reconstruction.adaptive.rest import UNEXPLAINED, misfit_of, rest
 from reconstruction.adaptive.sweep import swept
 from reconstruction.adaptive.uncertainty import deviation, held_out, plain_deviation
 from reconstruction.choices import darkness, smooth_guess
@@ -68,6 +70,9 @@ MOSTLY = 0.5
 """Share of the picture beyond which what surfaces do not explain is told."""
 TRIAL_STEPS = 4
 """Of the fits, with colour and without, that tell whether the scene has any."""
+FAR_OFF = 8.0
+"""Times their noise that readings are missed by beyond which the result is doubted. Without noise
+one shot of the fish is missed by 4 times it, eight of deep-occlusions without a rest by 7."""
 SHADOW = 0.7
 """Strength of the masks' shadow in the readings, as a share of what Psi says, below which Psi is
 called another's: at least 0.93 on clean captures, 0 to 0.25 with masks 4 samples off."""
@@ -117,6 +122,9 @@ class AdaptiveSettings(Settings):
     )
     free: bool = Field(
         default=True, description="average with total variation where it explains the frames"
+    )
+    rest: bool = Field(
+        default=True, description="add what is missed, where readings kept from all speak for it"
     )
 
 
@@ -240,16 +248,16 @@ def reconstruct_adaptive(
         [] if sure is None else [sure.sigma * np.float32(scale)] * len(misses)
     )
     if settings.free:
-        rest = given.frames - given.psi.forward(plain.light_field)
+        plain_missed = given.frames - given.psi.forward(plain.light_field)
         light_fields.append(plain.light_field)
-        misses.append(rest / np.float32(scale))
+        misses.append(plain_missed / np.float32(scale))
     light_field = light_fields[0]
     if held.any():
         share = weighted(misses, bright.noise, held)
         light_field = mean_light_field(light_fields, share.shares, k)
         if settings.free:
             free = share.shares[-1]
-            sigmas.append(plain_deviation(given.psi, rest, given.noise, held, free))
+            sigmas.append(plain_deviation(given.psi, plain_missed, given.noise, held, free))
             maps["model"][free.repeat(k, axis=0).repeat(k, axis=1) > MOSTLY] = MODELS.index("free")
             if np.mean(free > MOSTLY) > MOSTLY:
                 judged.append(
@@ -259,6 +267,23 @@ def reconstruct_adaptive(
                 )
         if sure is not None:
             sigma = mean_deviation(sigmas, share, misses, k)
+    fitted = usable & ~held
+    left = (given.frames - given.psi.forward(light_field)).astype(np.float32)
+    unexplained = misfit_of(left, given.noise, fitted)
+    if settings.rest and unexplained.times > UNEXPLAINED:
+        more = rest(
+            given.psi, given.frames, left, given.typical, fitted, held, settings.start_steps
+        )
+        if more is not None:
+            light_field = np.clip(light_field + more, 0, 1)
+            left = (given.frames - given.psi.forward(light_field)).astype(np.float32)
+            unexplained = misfit_of(left, given.noise, fitted)
+    if unexplained.times > FAR_OFF:
+        judged.append(
+            f"readings are missed by {unexplained.times:.1f} times their noise, most about row "
+            f"{unexplained.row}, column {unexplained.column}: take more shots, or see whether "
+            "noise and Psi are right"
+        )
     if edges is not None:
         light_field = faded(edges, given.psi, light_field, given.frames, all_usable)
     if sure is not None:
@@ -281,6 +306,9 @@ def reconstruct_adaptive(
             "search_seconds": searched_s,
             "held_readings": int(held.sum()),
             "at_end": volume.at_end,
+            "misfit": unexplained.times,
+            "misfit_row": float(unexplained.row),
+            "misfit_column": float(unexplained.column),
             **({} if decided is None else {"decided": decided}),
             **({} if explained is None else {"explained": explained}),
             **{
