@@ -286,6 +286,9 @@ def test_frames_of_another_psi_are_not_passed_over_in_silence(bayer, planted):
 def test_bad_inputs_are_refused_in_one_line(bayer):
     with pytest.raises(ReconstructionError, match="frames of shape"):
         reconstruct_adaptive(bayer, np.zeros((1, 4, 4), np.float32), 0.01)
+    dark, small = np.zeros(bayer.frames_shape, np.float32), np.zeros((4, 4), np.float32)
+    with pytest.raises(ReconstructionError, match="a disparity of shape"):
+        reconstruct_adaptive(bayer, dark, 0.01, disparity=small)
     tiny = bayer.window(slice(0, 4), slice(0, 4))
     with pytest.raises(ReconstructionError, match="do not fit a sensor"):
         reconstruct_adaptive(tiny, np.zeros((1, 4, 4), np.float32), 0.01)
@@ -366,9 +369,10 @@ def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     texture = textured(surfaces.textures_shape[2:])
     missed = frames - plane_frames(bayer, texture, 0.0, surfaces.margin)
     labels = np.arange(-1, 1.1, 0.25)
-    # The patches believe in 0, though not firmly.
+    # All patches but one in the even part believe in 0, though not firmly.
     beliefs = np.full((3, 3, len(labels)), 0.05, np.float32)
     beliefs[..., 4] = 1 - 0.05 * (len(labels) - 1)
+    beliefs[2, 0] = beliefs[2, 0, ::-1].take(np.arange(len(labels)) + 6, mode="wrap")
     at = np.array([0.0, 24.0, 47.0]), np.array([0.0, 28.0, 55.0])
     volume = Volume(labels, at, beliefs, beliefs, np.zeros((3, 3), int), beliefs[..., 0] > 0)
     noise = np.full(frames.shape, 1e-5, np.float32)

@@ -159,6 +159,7 @@ def reconstruct_adaptive(
     started = clock()
     typical, noise = checked_noise(psi, noise_sigma, usable)
     frames, usable = checked_inputs(psi, frames, typical, usable)
+    disparity = None if disparity is None else _known(disparity, psi)
     total = len(settings.misfits) * settings.texture.steps + 3
 
     def tell(step: int) -> None:
@@ -177,7 +178,7 @@ def reconstruct_adaptive(
     data = _unexplained_by(picture / np.float32(scale), flat, bright, settings)
     volume = _searched(data, settings, lambda: tell(1))
     k = psi.binning
-    centre = search.per_pixel(volume, psi.size, k) if disparity is None else _known(disparity, psi)
+    centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     searched_s = clock() - started
     tell(2)
     held = held_out(usable)
