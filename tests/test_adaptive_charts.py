@@ -6,21 +6,22 @@ import pytest
 from emmc_rig.capture.plan import planned_camera
 from emmc_rig.capture.until import refuse_without_choice
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.progress import Silent
 from emmc_rig.session.session import Session
 from emmc_rig.study import ablation, next_shot
 from emmc_rig.study.oracle import STEP_PX, matched_disparity
-from emmc_rig.study.points import open_folder
+from emmc_rig.study.sweep import open_folder
 from simulators.scenes import render
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
 
-def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(tmp_path, monkeypatch):
+def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch):
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
     camera = find_camera(CAMERA)
-    rows = list(ablation.ablations("deep-occlusions", CAMERA, camera, SIZE, 0, tmp_path))
+    rows = list(ablation.ablations("deep-occlusions", camera, SIZE, 0))
     assert [row.name for row in rows] == [
         "adaptive",
         "without sharpening",
@@ -77,14 +78,15 @@ def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     few = tmp_path / "few-views.yaml"
     few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
     camera = find_camera(str(few))
-    folder = open_folder(tmp_path / "out", next_shot.ROWS, "shots")
+    folder = open_folder(tmp_path / "out", next_shot.ROWS, "chart --next-shot")
     told = []
+    watcher = Silent()
+    monkeypatch.setattr(watcher, "step", told.append)
 
     def measured():
-        rows = next_shot.next_shots(
-            ["near-planar"], str(few), camera, (32, 40), 0, folder, told.append, 64, 2
+        return next_shot.next_shots(
+            ["near-planar"], str(few), camera, (32, 40), 0, folder, watcher, 64, 2
         )
-        return list(rows)
 
     (scene,) = measured()
     assert [one.count for one in scene.chosen] == [1, 2]

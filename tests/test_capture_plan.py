@@ -12,8 +12,10 @@ from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
+    Boards,
+    OpenBoard,
     Plan,
-    first_difference,
+    differences,
     load_plan,
     plan_schema,
     planned_camera,
@@ -220,7 +222,8 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     path.write_text(new_plan(name, camera), encoding="utf-8")
     plan = load_plan(path)
     assert planned_camera(plan).shots == camera.shots
-    assert Plan(camera=name, shots=plan.shots, title=name) == plan
+    boards = Boards(open=(OpenBoard(held_out=True),))
+    assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards) == plan
     np.testing.assert_allclose(
         [bracket[0] for bracket in exposures_s(plan, camera)], camera.exposures_s(), rtol=1e-5
     )
@@ -228,6 +231,6 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
 
 def test_what_differs_between_two_plans_is_named():
     one, other = plan_of(), plan_of(settle_s=0.5)
-    assert first_difference(one, one) == ""
-    assert first_difference(other, one) == "settle_s is 0.5, not 0.0"
-    assert "shots has 3 entries, not 1" in first_difference(one, plan_of(shots=[{}]))
+    assert differences(one, one) == []
+    assert differences(other, one) == ["settle_s is 0.5, not 0.0"]
+    assert differences(one, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"

@@ -43,7 +43,7 @@ def one_line(text):
 
 
 def leftovers(folder):
-    return [path.name for path in folder.iterdir() if ".part" in path.name or ".old" in path.name]
+    return [path.name for path in folder.rglob(".*")]
 
 
 def test_the_demo_writes_a_whole_result(run, tmp_path):
@@ -97,6 +97,13 @@ def test_kernels_are_charted_against_the_triad(run, tmp_path):
     names = [row["name"] for row in metrics["kernels"]]
     assert names == ["triad", "forward", "adjoint", "data step", "TV step"]
     assert metrics["reconstruction_peak_gib"] > 0
+    assert [start["name"] for start in metrics["starts"]] == [
+        "python",
+        "import numpy",
+        "import emmc_rig",
+        "emmc-rig --help",
+    ]
+    assert all(start["seconds"] > 0 for start in metrics["starts"])
     assert "TV step" in out
 
 
@@ -232,7 +239,7 @@ def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
 
 
 def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
-    from emmc_rig.commands import demo
+    from emmc_rig import demo
 
     for stage in (
         "fine_scene",
@@ -254,7 +261,7 @@ def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
-    from emmc_rig.commands import demo
+    from emmc_rig import demo
 
     def full(*arguments, **settings):
         raise OSError(28, "No space left on device")

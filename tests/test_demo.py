@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from emmc_rig.commands.demo import DemoSettings, run_demo
+from emmc_rig.demo import DemoSettings, run_demo
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.commands import train
-from emmc_rig.commands.train import checkpoint_path, draw_atoms, find_sources
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
+from emmc_rig.reconstruct import training as train
+from emmc_rig.reconstruct.training import checkpoint_path, draw_atoms, find_sources
 from reconstruction.dictionary import Dictionary
 from simulators.scenes import SCENES
 
@@ -144,7 +144,7 @@ def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, to
         (["--leave-out", "dgo"], "did you mean 'dog'"),
         (["--out", "d.png"], "ends in .h5"),
         (["--out", "file/d.h5"], "cannot be written"),
-        (["--out", "other.h5"], "no dictionary"),
+        (["--out", "other.h5"], "exists already"),
         (["--resume"], "no checkpoint"),
     ],
 )

@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.errors import AppError
+from emmc_rig.advice.reference import reference
+from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.results import parse_psnr
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.methods import METHODS, MethodSettings
 
 ADVICE, SHIPPED = "recommended.json", "recommended.json"
@@ -123,13 +125,31 @@ def parse_budget(text: str) -> float:
     """Return the seconds of "30s", "2min", "1h" or "30"; raise AppError for anything else."""
     found = re.fullmatch(_NUMBER + "(s|min|m|h|)", text.strip().lower())
     if found is None or float(found[1]) == 0:
-        raise AppError(f"--budget {text}: write a time above 0, for instance 30s, 2min or 1h")
+        raise WrongUsageError(
+            f"--budget {text}: write a time above 0, for instance 30s, 2min or 1h"
+        )
     return float(found[1]) * _SECONDS[found[2]]
 
 
 def parse_wanted(text: str) -> float:
     """Return the dB of "28dB" or "28"; raise AppError for anything else."""
     return parse_psnr(text, "--want")
+
+
+def advice_for(
+    psi: ImagingMatrix, budget: str | None, want: str | None, chart: Path | None
+) -> Advice:
+    """Return the method to take for frames of this Psi, by a chart and this machine's yardstick.
+
+    budget, want: as typed, such as "30s" and "28dB". chart: the folder of one; None takes the
+    shipped one. Raises AppError for what cannot be read.
+    """
+    budget_s = None if budget is None else parse_budget(budget)
+    wanted_db = None if want is None else parse_wanted(want)
+    rows = read_rows(chart)
+    values = int(np.prod(psi.light_field_shape))
+    problem = Problem(values, psi.shots, psi.colour is not None)
+    return advised(rows, problem, reference().seconds, budget_s, wanted_db)
 
 
 def advised(

@@ -352,6 +352,7 @@ class Sequencer:
         exposure_s = frame.exposure_s if frame.exposure_s is not None else self._camera.exposure_s
         entry = {
             "run": self._run,
+            "plan": self._session.amendments,
             **frame_facts(frame),
             "exposure_s": exposure_s,
             "gain": frame.gain if frame.gain is not None else self._camera.gain,

@@ -16,6 +16,9 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.text import Text
+
+from emmc_rig.errors import StoppedError
 
 if TYPE_CHECKING:
     from reconstruction.result import Progress as SolverProgress
@@ -58,9 +61,18 @@ class Bars:
             self._progress.update(self._task, total=done, completed=done, detail="")
 
 
+def say(label: str, message: object, style: str = "yellow") -> None:
+    """Print one line to standard error; brackets in the message are brackets, not markup."""
+    line = Text.assemble((f"{label}:", style), " ", str(message))
+    console.print(line, highlight=False, soft_wrap=True)
+
+
 @contextmanager
 def shown_bars() -> Iterator[Bars]:
-    """Yield bars, drawn until the block ends; the last one is filled if it ends well."""
+    """Yield bars, drawn until the block ends; the last one is filled if it ends well.
+
+    A KeyboardInterrupt that says what is kept becomes a StoppedError.
+    """
     with Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -72,5 +84,10 @@ def shown_bars() -> Iterator[Bars]:
         disable=not console.is_terminal,
     ) as progress:
         bars = Bars(progress)
-        yield bars
+        try:
+            yield bars
+        except KeyboardInterrupt as stop:
+            if str(stop):
+                raise StoppedError(str(stop)) from stop
+            raise
         bars.finish()

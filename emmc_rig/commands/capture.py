@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 OptionalPath = Path | None
 
 
-class CaptureStoppedError(AppError):
-    """Somebody stopped the capture; the message says how to go on."""
-
-
 def capture(
     plan: Annotated[
         OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
@@ -93,23 +89,16 @@ def _run(
     dry_run: bool,
     out: Path | None,
 ) -> None:
-    from emmc_rig.capture.command import run_capture, wish_from_plan, wish_from_session
+    from emmc_rig.capture.command import capture_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
     from emmc_rig.files.results import shown_bytes, shown_seconds
-    from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
     from emmc_rig.rig.rig_config import rig_description
     from emmc_rig.session.decisions import decided_words, ended
-    from emmc_rig.session.session import REPORT, is_session
+    from emmc_rig.session.session import REPORT
 
     chosen = None if rig is None else rig_description(rig, imaged)
-    if is_session(plan):
-        wish = wish_from_session(plan, chosen, until_db)
-    elif chosen is None:
-        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
-    else:
-        wish = wish_from_plan(plan, out, chosen, until_db)
     console, control = Console(stderr=True), Control()
     display = CaptureDisplay(console, control)
 
@@ -131,26 +120,11 @@ def _run(
             )
         return not dry_run
 
-    go_on = f"go on with: emmc-rig capture {wish.out}"
-    try:
-        with display.shown():
-            captured = run_capture(wish, display, ask, agreed, control)
-    except KeyboardInterrupt as stop:
-        begun = is_session(wish.out)
-        kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
-        raise CaptureStoppedError(f"stopped at once; {kept}") from stop
+    with display.shown():
+        captured = capture_session(plan, chosen, out, until_db, display, ask, agreed, control)
     if captured is None:
         return
     session, outcome = captured
-    try:
-        write_sheet(session, session.folder / REPORT, quick_pictures(session))
-    except AppError as fault:
-        display.tell(f"no report: {fault}")
-    if not outcome.complete:
-        raise CaptureStoppedError(
-            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
-            f"{go_on}"
-        )
     retried = f", {outcome.retries} retries" if outcome.retries else ""
     typer.echo(
         f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "

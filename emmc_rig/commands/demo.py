@@ -1,254 +1,76 @@
-"""The whole loop on the simulated rig: whiteboards -> Psi -> shots -> light field -> report."""
+"""The command `emmc-rig demo`: the whole loop on the simulated rig, and its report."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
+import typer
 
-from calibration.frames import MeanFrame
-from calibration.whiteboard import (
-    Calibration,
-    ideal_boards,
-    lamps_needed,
-    measure_psi,
+from emmc_rig.commands.options import (
+    DEFAULT_CAMERA,
+    DEFAULT_SCENE,
+    CameraOption,
+    DictionaryOption,
+    MethodOption,
+    OutOption,
+    SceneOption,
+    SeedOption,
+    ShotsOption,
+    SizeOption,
 )
-from emmc_rig.capture.direct import capture_shots, capture_whiteboards, whiteboard_exposures
-from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
-from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
-from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.lightfield import (
-    export_pictures,
-    focus_disparities,
-    psnr_db,
-    replicate_centre,
-    save_hdf5,
-    ssim,
-)
-from emmc_rig.model.masks import cfa_tile
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.report import ReportContent, write_report
-from emmc_rig.progress import Silent, Watcher
-from emmc_rig.reconstruct import open_dictionary
-from emmc_rig.rig.hardware import simulated_rig
-from reconstruction.methods import MethodSettings, find_method
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import reconstruct_judged
-
-Array = NDArray[np.floating]
+from emmc_rig.commands.verdict import end_with_verdict
+from emmc_rig.errors import AppError
 
 
-@dataclass(frozen=True)
-class DemoSettings:
-    """What to run: scene and camera with their names, size (rows, columns) or None, seed.
+def demo(
+    scene: SceneOption = DEFAULT_SCENE,
+    camera: CameraOption = DEFAULT_CAMERA,
+    shots: ShotsOption = None,
+    seed: SeedOption = 0,
+    size: SizeOption = None,
+    mu: Annotated[
+        float | None, typer.Option("--mu", help="weight of the regulariser (default: from noise)")
+    ] = None,
+    chroma_weight: Annotated[
+        float, typer.Option("--chroma-weight", help="of chrominance differences; 1: DV_1")
+    ] = 2.0,
+    method: MethodOption = "tv",
+    dictionary: DictionaryOption = None,
+    out: OutOption = Path("emmc-demo"),
+) -> None:
+    """Run the whole loop on the simulated rig, and write a report."""
+    import emmc_rig as emmc
+    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.demo import DemoSettings, run_demo
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import parse_size
+    from emmc_rig.model.settings import validated
+    from reconstruction.methods import MethodSettings
 
-    method: see `reconstruction.methods`; dictionary: see `emmc_rig.reconstruct.open_dictionary`.
-    """
-
-    scene: str
-    camera_name: str
-    camera: Camera
-    size: tuple[int, int] | None = None
-    seed: int = 0
-    whiteboard_repeats: int = 2
-    method: str = "tv"
-    dictionary: str | None = None
-    solver: MethodSettings = field(default_factory=MethodSettings)
-
-
-@dataclass
-class _Stages:
-    """The seconds that each stage took, in order."""
-
-    watcher: Watcher
-    clock: Callable[[], float] = time.perf_counter
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, name: str, steps: int | None = None) -> Iterator[None]:
-        self.watcher.begin(name, steps)
-        started = self.clock()
-        yield
-        self.seconds[name] = self.clock() - started
-
-
-def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = None) -> dict:
-    """Run the demo into an existing folder and return its metrics.
-
-    Writes light_field.h5, psi.h5, frames.h5, metrics.json, report.html and pictures/. Raises the
-    errors of the layers below, each one line.
-    """
-    watcher = watcher or Silent()
-    find_method(settings.method)
-    stages = _Stages(watcher)
-    camera = settings.camera
-    with stages("scene"):
-        fine = fine_scene(
-            settings.scene,
-            APERTURE_FACTOR,
-            PIXEL_FACTOR,
-            size=settings.size,
-            views=camera.views,
-            seed=settings.seed,
-        )
-        truth = fine.scene.light_field
-        size = (truth.shape[2], truth.shape[3])
-    with stages("design"):
-        design = build_imaging_matrix(camera, size)
-        dictionary = None
-        if find_method(settings.method).needs_dictionary:
-            dictionary = open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
-        rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
-    lamps = lamps_needed(design)
-    seen: dict[tuple[int, int, int, str], Array] = {}
-    exposures = whiteboard_exposures(camera, lamps, settings.whiteboard_repeats)
-    with stages("whiteboards", exposures):
-        boards = capture_whiteboards(
-            rig,
-            camera,
-            lamps,
-            settings.whiteboard_repeats,
-            on_frame=watcher.step,
-            on_setting=lambda key: seen.__setitem__(key, bench.readings()),
-        )
-    with stages("psi"):
-        calibration = measure_psi(boards, design)
-        exact = measure_psi(ideal_boards(seen, lamps, design), design).psi
-        psi_error = calibration.psi.relative_difference(exact)
-        design_error = design.relative_difference(exact)
-    with stages("capture", design.shots):
-        frames_dn, exposures_s = capture_shots(rig, camera, watcher.step)
-    with stages("reconstruct"):
-        readings = calibration.readings(frames_dn, exposures_s)
-        usable = frames_dn < camera.sensor.noise.white_level_dn
-        variance = calibration.reading_variance(frames_dn, exposures_s)
-        sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
-
-        def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
-            return reconstruct_judged(
-                settings.method,
-                psi,
-                readings,
-                sigma,
-                dictionary,
-                settings.solver,
-                usable,
-                lambda p: watcher.step(_told(p)),
-            )
-
-        result, verdict = light_field(calibration.psi)
-    with stages("exact Psi, for comparison"):
-        compared, _ = light_field(exact)
-    with stages("evaluate"):
-        estimate = result.light_field
-        psnr, exact_psnr = psnr_db(estimate, truth), psnr_db(compared.light_field, truth)
-        metrics = {
-            "scene": settings.scene,
-            "scene_provenance": fine.scene.provenance,
-            "camera": settings.camera_name,
-            "shots": design.shots,
-            "size": list(size),
-            "psnr_db": psnr,
-            "ssim": ssim(estimate, truth),
-            "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
-            "psi_relative_error": psi_error,
-            "design_relative_error": design_error,
-            "psi_mean_deviation": float(calibration.deviation.mean()),
-            "exact_psi_psnr_db": exact_psnr,
-            "calibration_cost_db": exact_psnr - psnr,
-            "noise_sigma": sigma,
-            "saturated_share": float(1 - usable.mean()),
-            "whiteboard_frames": exposures,
-            "method": result.method,
-            "status": result.status,
-            "advice": result.advice,
-            "verdict": verdict.as_dict(),
-            "steps": result.steps,
-            "parameters": result.parameters,
-            "seed": settings.seed,
-            "warnings": camera.warnings(),
-            "command": command_line(),
-            "versions": versions(),
-        }
-    with stages("write"):
-        save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": psnr})
-        focus = focus_disparities(truth)
-        export_pictures(folder / "pictures", estimate, focus)
-        save_frames(
-            folder / "frames.h5",
-            frames_dn,
-            readings,
-            exposures_s,
-            deviation=np.sqrt(variance),
-            usable=usable,
-        )
-        calibration.psi.save(folder / "psi.h5")
-        metrics["seconds"] = dict(stages.seconds)
-        write_report(
-            folder / "report.html",
-            _report(
-                settings, metrics, truth, result, readings, calibration, boards.pinholes, focus
-            ),
-        )
-    metrics["seconds"] = dict(stages.seconds)
-    write_metrics(folder, metrics)
-    return metrics
-
-
-def _told(progress: Progress) -> str:
-    if progress.relative_change is None:
-        return f"{progress.step} of {progress.total} patches"
-    return f"change {progress.relative_change:.1e}"
-
-
-def _report(
-    settings: DemoSettings,
-    metrics: dict,
-    truth: Array,
-    result: Reconstruction,
-    readings: Array,
-    calibration: Calibration,
-    pinholes: Mapping[tuple[int, int, int, str], MeanFrame],
-    focus: tuple[float, float, float],
-) -> ReportContent:
-    camera = settings.camera
-    weights, deviation = (
-        array[0].sum(axis=3) for array in (calibration.psi.weights, calibration.deviation)
+    described = emmc.camera(camera, shots)
+    chosen = {"tv": {"mu": mu, "chroma_weight": chroma_weight}}
+    solver = validated(MethodSettings, chosen, "solver settings", AppError)
+    settings = DemoSettings(
+        scene,
+        camera,
+        described,
+        parse_size(size),
+        seed,
+        method=method,
+        dictionary=dictionary,
+        solver=solver,
     )
-    keys = list(pinholes)
-    chosen = [keys[0], keys[len(keys) // 2], keys[-1]]
-    boards = [
-        (
-            f"shot {shot + 1}, view ({v}, {u}), {lamp} lamp",
-            pinholes[shot, v, u, lamp].mean_dn - calibration.dark_dn,
-        )
-        for shot, v, u, lamp in chosen
-    ]
-    peak = max(float(np.percentile(board, 99.9)) for _, board in boards)
-    return ReportContent(
-        title=f"{settings.scene} through {settings.camera_name}",
-        scene=settings.scene,
-        camera=settings.camera_name,
-        camera_line=camera.title,
-        camera_reference=camera.reference,
-        estimate=result.light_field,
-        truth=truth,
-        frames=readings,
-        cfa=camera.sensor.cfa_name,
-        cfa_tile=cfa_tile(camera.sensor.cfa),
-        whiteboards=[(label, board / peak) for label, board in boards],
-        psi=weights,
-        psi_std=deviation,
-        metrics=metrics,
-        stage_s=metrics["seconds"],
-        objective=[value for _, value in result.objective],
-        disparity_range_px=(focus[0], focus[2]),
-        warnings=metrics["warnings"],
-        command=metrics["command"],
+    for warning in described.warnings():
+        say("warning", warning)
+    with result_folder(out, "demo") as folder, shown_bars() as bars:
+        metrics = run_demo(settings, folder, bars)
+    gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
+    typer.echo(
+        f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
+        f"copied centre view; SSIM {metrics['ssim']:.3f}; Psi to "
+        f"{metrics['psi_relative_error']:.2%}; {metrics['status']}"
+        + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
+    typer.echo(f"open {out / 'report.html'}")
+    end_with_verdict(metrics["verdict"], strict=False)

@@ -7,9 +7,8 @@ import json
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import cv2
 import typer
 from rich.box import SIMPLE
 from rich.console import Console, Group
@@ -18,24 +17,22 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 from rich.table import Table
 from rich.text import Text
 
-from drivers.camera import Camera
-from drivers.raw import RawFrame
 from emmc_rig.capture.keyboard import pressed_keys
 from emmc_rig.errors import AppError
-from emmc_rig.pages.frame_view import (
-    FrameFigures,
-    frame_figures,
-    histogram,
-    histogram_text,
-    preview,
-)
-from emmc_rig.session.frame_file import frame_facts, suffix_of
-from emmc_rig.session.storage import SYSTEM_DISK, write_whole
+from emmc_rig.files.folders import new_file, refuse_inside_session
+
+if TYPE_CHECKING:
+    from drivers.camera import Camera
+    from drivers.raw import RawFrame
+    from emmc_rig.pages.frame_view import FrameFigures
 
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
 CameraSpec = Annotated[
-    str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+    str,
+    typer.Option(
+        "--camera", help="ptp:, u3v:, gphoto2:, mm:CONFIG.cfg, folder:DIR, simulated or a YAML file"
+    ),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
@@ -82,6 +79,8 @@ def snap(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
+    from emmc_rig.pages.frame_view import frame_figures
+
     with closing(open_camera(_chosen(camera, rig))) as device:
         folder = frames_folder(out)
         choose(device, exposure, gain)
@@ -106,6 +105,8 @@ def live(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
+    from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text
+
     folder = frames_folder(out) if save_every else None
     console = Console()
     device = open_camera(_chosen(camera, rig))
@@ -182,7 +183,8 @@ def frame_line(frame: RawFrame, figures: FrameFigures) -> str:
 
 
 def frames_folder(out: Path) -> Path:
-    """Return the folder, made if need be; raises AppError where it cannot be."""
+    """Return the folder, made if need be; raises AppError where it cannot be, or a session is."""
+    refuse_inside_session(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
@@ -196,6 +198,11 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     Beside it a preview (PNG) and the facts (JSON). Every file appears whole or not at all, the
     camera's bytes last; no name comes from the camera. Raises AppError.
     """
+    import cv2
+
+    from emmc_rig.pages.frame_view import preview
+    from emmc_rig.session.frame_file import frame_facts, suffix_of
+
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
     original = stem.with_suffix(suffix_of(frame))
@@ -207,13 +214,14 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
         "sha256": frame.sha256,
         **frame_facts(frame),
     }
-    try:
-        told = (json.dumps(facts, indent=2) + "\n").encode()
-        write_whole(SYSTEM_DISK, stem.with_suffix(".png"), png.tobytes())
-        write_whole(SYSTEM_DISK, stem.with_suffix(".json"), told)
-        write_whole(SYSTEM_DISK, original, frame.original)
-    except OSError as fault:
-        raise AppError(f"{original}: cannot be written ({fault.strerror})") from fault
+    files = {
+        stem.with_suffix(".png"): png.tobytes(),
+        stem.with_suffix(".json"): (json.dumps(facts, indent=2) + "\n").encode(),
+        original: frame.original,
+    }
+    for path, data in files.items():
+        with new_file(path) as partial:
+            partial.write_bytes(data)
     return original
 
 

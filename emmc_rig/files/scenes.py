@@ -28,12 +28,30 @@ class Scene:
     """A light field (v, u, y, x, 3), where it came from, and its disparity where that is known.
 
     `disparity_px` is (y, x), pixels per view step, of the centre view; None for measured scenes.
+    NumPy takes a scene as its light field: `psi @ scene`.
     """
 
     name: str
     light_field: np.ndarray
     disparity_px: np.ndarray | None
     provenance: str
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of every view."""
+        return self.light_field.shape[2], self.light_field.shape[3]
+
+    @property
+    def views(self) -> tuple[int, int]:
+        """Rows and columns of views."""
+        return self.light_field.shape[0], self.light_field.shape[1]
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.light_field, dtype=dtype, copy=copy)
+
+    def __repr__(self) -> str:
+        (v, u), (rows, columns) = self.views, self.size
+        return f"Scene({self.name!r}, {v}x{u} views of {rows}x{columns})"
 
 
 @dataclass(frozen=True)
@@ -68,6 +86,10 @@ def open_scene(
     Raises:
         SceneError: nothing by that name (the message lists the built-in ones), unreadable,
             or smaller than asked for.
+
+    >>> import emmc_rig as emmc
+    >>> emmc.scene("near-planar", size=(24, 32))
+    Scene('near-planar', 5x5 views of 24x32)
     """
     if spec in SCENES:
         shape = _asked_shape(size, views)

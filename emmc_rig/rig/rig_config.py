@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from drivers.clock import SYSTEM_CLOCK
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
 from emmc_rig.rig.hardware import Rig, open_camera, open_stage, simulated_rig
 from simulators.bench import RAYS_PER_VIEW
 
@@ -111,6 +113,44 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     if beside.is_file():
         described["stage"] = str(beside.resolve())
     return {"kind": "real", **described}
+
+
+@dataclass(frozen=True)
+class RigChoice:
+    """Which devices a capture is to use; they are opened by `emmc_rig.capture`, not before."""
+
+    name: str
+    description: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        settings = ", ".join(
+            f"{key}={value!r}" for key, value in self.description.items() if key != "kind"
+        )
+        return f"RigChoice({self.name!r}, {settings})"
+
+
+def rig(
+    name: str,
+    *,
+    scene: str = "deep-occlusions",
+    size: tuple[int, int] | None = None,
+    seed: int = 0,
+    rays: int | None = None,
+    real_time: bool = False,
+) -> RigChoice:
+    """Return a rig: "simulated", or the YAML file that names real devices.
+
+    The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
+    of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
+    cent needs 1024. real_time: moves and exposures take their time. Raises AppError.
+
+    >>> import emmc_rig as emmc
+    >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
+    'simulated'
+    """
+    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
+    imaged = ImagedRig(scene=scene, size=size, seed=seed, real_time=real_time, **traced)
+    return RigChoice(name, rig_description(name, imaged))
 
 
 @contextmanager

@@ -25,9 +25,9 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
-from emmc_rig.model.files import whole_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.session.readings import decoded, fused_shot, mean_dark, shot_frames, whiteboards
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
 Group = h5py.Group
@@ -42,7 +42,7 @@ def export_hdf5(
     """Write a session to an HDF5 file: whole, or not at all.
 
     Every frame's digest is checked on the way. Raises AppError for a session that is not
-    complete or not good, and where the file cannot be written.
+    complete or not good, where a file of that name is there, and where it cannot be written.
     """
     missing = session.missing()
     if missing:
@@ -50,11 +50,8 @@ def export_hdf5(
             f"{session.folder}: {len(missing)} of {len(session.needed)} frames are missing; "
             "resume it with `emmc-rig capture` first"
         )
-    try:
-        with whole_file(path) as part, h5py.File(part, "w") as file:
-            _write(session, file, compress, on_frame)
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+    with new_file(path) as part, h5py.File(part, "w") as file:
+        _write(session, file, compress, on_frame)
 
 
 def _write(
@@ -84,6 +81,7 @@ def _write(
     data["kind"] = _texts([frame.kind for frame in frames])
     data["shot"] = [frame.bench.shot for frame in frames]
     data["masks_in"] = [frame.bench.masks_in for frame in frames]
+    data["plan"] = [line.get("plan", 0) for line in lines]
     data["view"] = [frame.view or (-1, -1) for frame in frames]
     data["sha256"] = _texts([line["sha256"] for line in lines])
     _fused(session, entry)
@@ -92,8 +90,8 @@ def _write(
     process["version"] = session.header["versions"]["emmc-rig"]
     for name, kind, text in (
         ("plan", "application/yaml", session.plan_yaml),
-        ("camera", "application/json", session.frozen_file("camera.json").decode()),
-        ("rig", "application/json", session.frozen_file("rig.json").decode()),
+        ("camera", "application/json", session.holding(CAMERA).decode()),
+        ("rig", "application/json", session.holding(RIG).decode()),
     ):
         note = _group(process, name, "NXnote")
         note["type"], note["data"] = kind, text

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
-from emmc_rig.capture.simulate import simulate
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruct import PSI, open_dictionary, read_capture
+from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.methods import MethodSettings, reconstruct
@@ -43,7 +41,7 @@ RIVALS = ("adaptive-fast", "tv", "tv-dict")
 
 
 @dataclass(frozen=True)
-class Ablation:
+class Ablation(Figures):
     """One row: what was left out, its PSNR and seconds, and both less those of the whole."""
 
     name: str
@@ -52,33 +50,26 @@ class Ablation:
     buys_db: float
     costs_s: float
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
-
-def ablations(
-    scene: str, camera_name: str, camera: Camera, size: tuple[int, int], seed: int, folder: Path
-) -> Iterator[Ablation]:
+def ablations(scene: str, camera: Camera, size: tuple[int, int], seed: int) -> Iterator[Ablation]:
     """Yield the whole method, then the method without each piece, its rivals, and the oracle.
 
-    The frames are made once, by `simulate` into an existing folder. The whole runs twice, so that
-    compiling is not counted.
+    The frames are exposed once. The whole runs twice, so that compiling is not counted.
     """
-    simulate(scene, camera_name, camera, size, seed, folder)
-    capture, psi = read_capture(folder), ImagingMatrix.load(folder / PSI)
     truth = open_scene(scene, size=size, views=camera.views, seed=seed).light_field
+    psi = camera.psi(size)
+    frames = camera.expose(truth, seed, psi)
     dictionary = open_dictionary(None, camera.views, psi.binning)
 
     def run(method: str, settings: MethodSettings) -> tuple[float, float]:
         result = reconstruct(
             method,
             psi,
-            capture.readings,
-            capture.noise_sigma,
+            frames.readings,
+            frames.noise_sigma,
             dictionary,
             settings,
-            capture.usable,
+            frames.usable,
         )
         return psnr_db(result.light_field, truth), result.seconds
 
@@ -95,9 +86,9 @@ def ablations(
     started = time.perf_counter()
     known = reconstruct_adaptive(
         psi,
-        capture.readings,
-        capture.noise_sigma,
-        usable=capture.usable,
+        frames.readings,
+        frames.noise_sigma,
+        usable=frames.usable,
         disparity=matched_disparity(truth),
     )
     decibels, seconds = psnr_db(known.light_field, truth), time.perf_counter() - started

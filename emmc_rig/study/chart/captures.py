@@ -13,14 +13,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.capture.simulate import exposed
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.points import digest_of
+from emmc_rig.study.sweep import digest_of
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
@@ -115,7 +114,7 @@ def _write(
     path: Path, camera: Camera, light_field: Array, disparity_px: Array | None, seed: int
 ) -> None:
     psi = build_imaging_matrix(camera, (light_field.shape[2], light_field.shape[3]))
-    shots = exposed(camera, psi, light_field, np.random.default_rng(seed))
+    shots = camera.expose(light_field, seed, psi)
     psi.save(path.with_suffix(".psi"))
     with whole_file(path) as partial, h5py.File(partial, "w") as file:
         file["truth"], file["readings"] = light_field, shots.readings

@@ -7,7 +7,6 @@ runs, the peak of memory; only then the truth is read and compared. Each job's p
 from __future__ import annotations
 
 import json
-import math
 import os
 import statistics
 import sys
@@ -24,11 +23,11 @@ from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
-from emmc_rig.reconstruct import open_dictionary
-from emmc_rig.study.benchmarks.memory import forget_peak, peak_memory_mib
 from emmc_rig.study.chart.captures import Frames, read_frames, read_truth
 from emmc_rig.study.chart.peers import PEERS, Given
 from emmc_rig.study.chart.scores import scored
@@ -150,19 +149,14 @@ def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
             save_thumbnail(where, light_field, lines)
 
 
-def _plain(value: object) -> object:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def answered(job: dict) -> dict:
     """Return the figures of a job, or why there are none: these are not kept."""
     try:
-        figures = measured(job)
+        return measured(job)
     except KNOWN as fault:
         return {"failed": str(fault), "keep": False}
     except MemoryError:
         return {"failed": "not enough memory", "keep": False}
-    return {key: _plain(value) for key, value in figures.items()}
 
 
 def main() -> None:

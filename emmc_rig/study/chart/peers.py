@@ -24,7 +24,7 @@ from reconstruction.patches import (
     sense_atoms,
     sense_patches,
 )
-from reconstruction.result import Reconstruction
+from reconstruction.result import Reconstruction, Status
 
 STEPS, ATOMS, STRIDE = 100, 20, 5
 
@@ -129,7 +129,9 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
 def _result(method: str, light_field: NDArray, steps: int, started: float) -> Reconstruction:
     clipped = np.clip(light_field, 0, 1).astype(np.float32)
     seconds = time.perf_counter() - started
-    return Reconstruction(method, np.ascontiguousarray(clipped), "done", "", steps, (), seconds, {})
+    return Reconstruction(
+        method, np.ascontiguousarray(clipped), Status.CONVERGED, "", steps, (), seconds, {}
+    )
 
 
 PEERS = {

@@ -18,7 +18,7 @@ from tempfile import TemporaryFile
 from typing import IO
 
 from emmc_rig.errors import AppError
-from emmc_rig.study.benchmarks.memory import forget_peak
+from emmc_rig.files.memory import forget_peak
 
 MODULE = "emmc_rig.study.chart.measure"
 

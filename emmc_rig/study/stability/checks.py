@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.reconstruct import open_dictionary
 from emmc_rig.study.stability.trial import Setup, Trial, taken
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct

@@ -19,6 +19,7 @@ from reconstruction.choices import choose_mu, first_light_field, smooth_guess
 from reconstruction.differences import norm_squared
 from reconstruction.methods import MethodSettings
 from reconstruction.problem import Problem, colour_metric
+from reconstruction.result import Status
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -120,7 +121,7 @@ def step_sizes(trial: Trial) -> list[Finding]:
         found = solved(trial, "tv", MethodSettings(tv=chosen))
         value = found.objective[-1][1]
         finite = bool(np.isfinite(found.light_field).all())
-        stopped = found.status != "converged"
+        stopped = found.status != Status.CONVERGED
         reached = value / objective
         honest = reached < 1.05 or stopped
         findings.append(

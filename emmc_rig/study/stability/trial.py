@@ -10,19 +10,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.capture.simulate import exposed_readings
-from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.sweep import NotApplicableError
 from simulators.raycaster import World
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
-
-
-class NotApplicableError(AppError):
-    """This fault cannot befall this camera or scene; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +116,6 @@ def taken(
         clean = change_clean(clean)
     # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
     clean = np.maximum(clean, 0)
-    shots = exposed_readings(setup.camera, size, clean, np.random.default_rng(setup.seed))
+    shots = setup.camera.read_out(clean, setup.seed)
     usable = shots.usable if unusable is None else shots.usable & ~unusable
     return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
