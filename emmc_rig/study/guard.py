@@ -25,7 +25,7 @@ from emmc_rig.model.lightfield import psnr_db
 from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 MOST_FALL_DB = 0.3
-"""Below its stored figure: seeds, machines and numbers of threads move a figure by at most 0.1."""
+"""Below its stored figure, which fails."""
 STORED = "guard.json"
 CAMERA = "scenario-ii-cfa"
 NOISES = (0.0005, 0.004)

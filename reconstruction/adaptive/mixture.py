@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 WINDOW_PX = 12.0
-"""Deviation of the window, in pixels: some 36 of the held-out readings, of 2 %. Eight and six cost
-or gain at most 0.1 dB on four crops (fish, dice, buttercup, begonia)."""
+"""Deviation of the window, in pixels: some 36 of the held-out readings, of 2 %. Eight costs
+or gains at most 0.1 dB, six 0.2 dB, on four crops (fish, dice, buttercup, begonia)."""
 POWER = 2.0
-"""Of 1 / E: 1 and 3 cost or gain at most 0.1 dB on these four."""
+"""Of 1 / E: 1 and 3 cost or gain at most 0.15 dB on these four."""
 PRIOR_READINGS = 4.0
 """Readings that the whole picture's mean square counts for at every place."""
 

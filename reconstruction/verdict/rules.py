@@ -55,8 +55,8 @@ UNEXPLAINED = Limits(0.75, 1.1)
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
 MISFIT = Limits(8.0, float("inf"))
-"""Times their noise that readings are missed by. Without noise one shot of a clean capture is
-missed by up to 4 times it."""
+"""Times their noise that readings are missed by. Nearly without noise (0.0005), one clean
+shot of the fish is missed by 4 times it."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods to which one shot nearly does."""
