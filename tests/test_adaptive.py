@@ -18,6 +18,8 @@ from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
+from reconstruction.adaptive.search import Volume, per_pixel
+from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
@@ -284,6 +286,9 @@ def test_frames_of_another_psi_are_not_passed_over_in_silence(bayer, planted):
 def test_bad_inputs_are_refused_in_one_line(bayer):
     with pytest.raises(ReconstructionError, match="frames of shape"):
         reconstruct_adaptive(bayer, np.zeros((1, 4, 4), np.float32), 0.01)
+    dark, small = np.zeros(bayer.frames_shape, np.float32), np.zeros((4, 4), np.float32)
+    with pytest.raises(ReconstructionError, match="a disparity of shape"):
+        reconstruct_adaptive(bayer, dark, 0.01, disparity=small)
     tiny = bayer.window(slice(0, 4), slice(0, 4))
     with pytest.raises(ReconstructionError, match="do not fit a sensor"):
         reconstruct_adaptive(tiny, np.zeros((1, 4, 4), np.float32), 0.01)
@@ -345,3 +350,33 @@ def test_the_mask_position_that_tells_more_is_expected_to_err_less(bayer, plante
     of_scene = (maps["disparity"], maps["disparity_sigma"], maps["texture"], picture)
     errors = expected_errors(psi, [(0, 0), (0, 1)], *of_scene, 0.004**2, patches=4)
     assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_frames_of_a_plane_are_psi_of_its_surface(random_psi, binning):
+    psi = random_psi(2, (3, 3), (10, 12), 1, binning)
+    texture = np.random.default_rng(1).random((3, 24, 26)).astype(np.float32)
+    rays = np.full((3, 3, *psi.size), -0.7, np.float32)
+    surfaces = Surfaces(psi, rays, np.zeros(rays.shape, np.uint8), 7, layers=1)
+    np.testing.assert_allclose(
+        plane_frames(psi, texture, -0.7, 7), surfaces.forward(texture[None]), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
+    truth, surfaces = plane_scene(bayer, 0.75)
+    frames = bayer.forward(truth.astype(np.float32))
+    texture = textured(surfaces.textures_shape[2:])
+    missed = frames - plane_frames(bayer, texture, 0.0, surfaces.margin)
+    labels = np.arange(-1, 1.1, 0.25)
+    # All patches but one in the even part believe in 0, though not firmly.
+    beliefs = np.full((3, 3, len(labels)), 0.05, np.float32)
+    beliefs[..., 4] = 1 - 0.05 * (len(labels) - 1)
+    beliefs[2, 0] = beliefs[2, 0, ::-1].take(np.arange(len(labels)) + 6, mode="wrap")
+    at = np.array([0.0, 24.0, 47.0]), np.array([0.0, 28.0, 55.0])
+    volume = Volume(labels, at, beliefs, beliefs, np.zeros((3, 3), int), beliefs[..., 0] > 0)
+    noise = np.full(frames.shape, 1e-5, np.float32)
+    used = np.ones(frames.shape, bool)
+    found = swept(volume, bayer, frames, noise, used, texture, missed, surfaces.margin, 0.04, 0.05)
+    disparity = per_pixel(found, bayer.size, 1)[4:-4, 26:-6]
+    assert np.mean(np.abs(disparity - 0.75) < 0.13) > 0.9

@@ -1,5 +1,6 @@
 """`emmc-rig chart --ablation` and `--next-shot`: on tiny scenes, with one row of each kind."""
 
+import numpy as np
 import pytest
 
 from emmc_rig.capture.plan import planned_camera
@@ -8,7 +9,9 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.progress import Silent
 from emmc_rig.session.session import Session
 from emmc_rig.study import ablation, next_shot
+from emmc_rig.study.oracle import STEP_PX, matched_disparity
 from emmc_rig.study.sweep import open_folder
+from simulators.scenes import render
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
@@ -23,10 +26,19 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkey
         "adaptive",
         "without sharpening",
         "tv",
+        ablation.ORACLE,
         "copied true centre view",
     ]
     for row in rows:
         assert row.buys_db == pytest.approx(rows[0].psnr_db - row.psnr_db)
+
+
+def test_the_oracle_matches_the_disparity_that_a_scene_was_rendered_with():
+    scene = render("deep-occlusions", (5, 5), (64, 80), 0)
+    found = matched_disparity(scene.light_field, 6.0)
+    away = np.abs(found - scene.disparity_px)[8:-8, 8:-8]
+    assert np.median(away) < STEP_PX
+    assert np.mean(away < 0.25) > 0.75
 
 
 def row(shots, stated_db, psnr_db):

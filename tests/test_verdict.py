@@ -251,6 +251,15 @@ def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
     assert [LEVELS.index(one.level) for one in verdict.reasons] == [2, 1]
 
 
+def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
+    clean = clean_evidence(three)
+    for times, level in ((4.0, "trust"), (9.0, "doubt")):
+        missed = {"misfit": times, "misfit_row": 12.0, "misfit_column": 30.0}
+        verdict = judged(dataclasses.replace(clean, parameters=missed))
+        assert verdict.level == level
+    assert "row 12, column 30" in verdict.words
+
+
 @pytest.mark.parametrize(
     ("found", "by_tv", "by_adaptive"),
     [

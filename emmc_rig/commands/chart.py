@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from emmc_rig.commands.chart_ablation import chart_ablation
+from emmc_rig.commands.chart_guard import chart_guard
 from emmc_rig.commands.chart_kernels import chart_kernels
 from emmc_rig.commands.chart_next_shot import chart_next_shot
 from emmc_rig.commands.chart_peers import chart_peers
@@ -57,6 +58,9 @@ def chart(
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="instead: PSNR of the default method, against figures")
+    ] = False,
     until: Annotated[
         list[float] | None,
         typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
@@ -83,6 +87,8 @@ def chart(
         chart_peers(one_camera, *timed, out or Path("emmc-peers"))
     elif kernels:
         chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
+    elif guard:
+        chart_guard(scene or [], camera, shape, out or Path("emmc-guard"))
     elif ablation:
         seen, cut = (scene or [DEFAULT_SCENE])[0], shape or STUDIED_SIZE
         chart_ablation(seen, one_camera, cut, seed, out or Path("emmc-ablation"))

@@ -2,7 +2,8 @@
 
 Half-quadratic splitting with momentum: with the noise that is still presumed in the texture falling
 from step to step, remove it (`shrinkage`), then fit the frames again (`texture.fitted`). Once the
-texture is nearly known, what it misses in the frames sharpens the disparity (`refine`).
+texture is nearly known, planes are swept with it (`sweep`), and what it misses in the frames
+sharpens the disparity (`refine`).
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ class TextureSettings(Settings):
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
     fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
+    sweeps: tuple[int, ...] = Field(
+        default=(5, 10), description="steps that search the disparity again first"
+    )
     refine_steps: int = Field(
         default=8, ge=0, description="last steps that sharpen the disparity first"
     )
@@ -80,13 +84,16 @@ def solve(
     settings: TextureSettings,
     layers: bool = True,
     on_step: Callable[[int], None] | None = None,
+    again: Callable[[Array, Array, int], Array] | None = None,
 ) -> Scene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
     not usable. picture: (y, x, c) to begin with, of one colour or three. layers: whether
-    hidden surfaces continue those beside them, else they look like what hides them.
+    hidden surfaces continue those beside them, else they look like what hides them. again: returns
+    the disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given what it
+    misses of the frames, and the margin.
     """
     furthest = float(np.abs(centre).max()) + settings.room_px
     half = max(psi.light_field_shape[:2]) // 2
@@ -120,6 +127,11 @@ def solve(
                 clean[1] = clean[0]
             elif surfaces.hidden.any():
                 clean[1] = background(clean[0], padded, nearer, reach)
+        if again is not None and step in settings.sweeps:
+            found = again(clean[0], frames - surfaces.forward(clean), margin)
+            padded = searched = np.pad(found, around, mode="edge")
+            reach = max(1, int(np.ceil(np.ptp(found) * half)))
+            surfaces = surfaces_of(psi, padded, margin, nearer, colours)
         if step >= max(2, settings.steps - settings.refine_steps):
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
             missed = frames - surfaces.forward(now)

@@ -9,9 +9,12 @@ Edges that views do not reach are told from the scene first (`edges`).
    linear in the surfaces' texture (`rays`).
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
-   `texture`, `shrinkage`, `refine`).
-5. Where total variation explains readings that were kept from both fits better than surfaces do,
-   it is returned (`free`).
+   `texture`, `shrinkage`, `refine`). All fits but the last sweep planes with their texture for a
+   new disparity (`sweep`): where that leads astray the last one, which keeps what the patches
+   agreed on, predicts held-out readings better.
+5. Textures that follow the readings more or less closely, and total variation, are averaged by
+   how well they predict readings kept from all of them (`mixture`).
+6. What is still missed is a light field of its own, if those readings speak for it (`rest`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 """
@@ -33,8 +36,8 @@ from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import search
 from reconstruction.adaptive.edges import dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.free import freedom
 from reconstruction.adaptive.joint import TextureSettings, solve
+from reconstruction.adaptive.mixture import mean_deviation, mean_light_field, weighted
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.parsimony import (
     colour_is_needed,
@@ -44,8 +47,11 @@ from reconstruction.adaptive.parsimony import (
     one_plane,
     plane_bound_db,
 )
-from reconstruction.adaptive.uncertainty import deviation, held_out
+from reconstruction.adaptive.rest import UNEXPLAINED, misfit_of, rest
+from reconstruction.adaptive.sweep import swept
+from reconstruction.adaptive.uncertainty import deviation, held_out, plain_deviation
 from reconstruction.choices import darkness, smooth_guess
+from reconstruction.errors import ReconstructionError
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.result import Progress, Reconstruction, Status
@@ -64,6 +70,9 @@ MOSTLY = 0.5
 """Share of the picture beyond which what surfaces do not explain is told."""
 TRIAL_STEPS = 4
 """Of the fits, with colour and without, that tell whether the scene has any."""
+FAR_OFF = 8.0
+"""Times their noise that readings are missed by beyond which the result is doubted. Without noise
+one shot of the fish is missed by 4 times it, eight of deep-occlusions without a rest by 7."""
 SHADOW = 0.7
 """Strength of the masks' shadow in the readings, as a share of what Psi says, below which Psi is
 called another's: at least 0.93 on clean captures, 0 to 0.25 with masks 4 samples off."""
@@ -96,7 +105,10 @@ class AdaptiveSettings(Settings):
         default=True, description="give what the centre view does not see a texture of its own"
     )
     misfit: float = Field(
-        default=0.0015, gt=0, description="deviation of readings that no model explains"
+        default=0.004, gt=0, description="deviation of readings that no disparity explains"
+    )
+    misfits: tuple[Length, ...] = Field(
+        default=(0.004, 0.0015), min_length=1, description="and no texture, of each one fitted"
     )
     nearer: Literal["larger", "smaller"] = Field(
         default="larger", description="disparity of what is in front; pictures may be flipped"
@@ -109,13 +121,18 @@ class AdaptiveSettings(Settings):
         default=40, ge=1, description="of total variation, from which textures begin"
     )
     free: bool = Field(
-        default=True, description="return total variation where it explains the frames better"
+        default=True, description="average with total variation where it explains the frames"
+    )
+    rest: bool = Field(
+        default=True, description="add what is missed, where readings kept from all speak for it"
     )
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
-    quick = settings.texture.model_copy(update={"steps": 6, "refine_steps": 2, "block_step": 6})
+    quick = settings.texture.model_copy(
+        update={"steps": 6, "refine_steps": 2, "block_step": 6, "sweeps": ()}
+    )
     coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
     return settings.model_copy(update=coarser | fewer)
@@ -129,18 +146,21 @@ def reconstruct_adaptive(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    disparity: Array | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each. usable: pixels to fit (default all). Raises ReconstructionError for inputs that
-    do not fit each other.
+    one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
+    it is known, in place of the one searched. Raises ReconstructionError for inputs that do not
+    fit each other.
     """
     settings = settings or AdaptiveSettings()
     started = clock()
     typical, noise = checked_noise(psi, noise_sigma, usable)
     frames, usable = checked_inputs(psi, frames, typical, usable)
-    total = settings.texture.steps + 3
+    disparity = None if disparity is None else _known(disparity, psi)
+    total = len(settings.misfits) * settings.texture.steps + 3
 
     def tell(step: int) -> None:
         if on_step is not None:
@@ -158,14 +178,14 @@ def reconstruct_adaptive(
     data = _unexplained_by(picture / np.float32(scale), flat, bright, settings)
     volume = _searched(data, settings, lambda: tell(1))
     k = psi.binning
-    centre = search.per_pixel(volume, psi.size, k)
+    centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     searched_s = clock() - started
     tell(2)
     held = held_out(usable)
     # Total variation is what surfaces must beat on the readings kept from both, and their begin.
     start = TVSettings(max_steps=settings.start_steps, objective_every=settings.start_steps + 1)
     plain = reconstruct_tv(given.psi, given.frames, given.typical, start, usable & ~held)
-    precision = np.where(usable & ~held, 1 / data.variance, 0).astype(np.float32)
+    precision = _precision(bright, held, settings.misfits[-1])
     nearer = 1 if settings.nearer == "larger" else -1
     begun = centre_view(plain.light_field) / np.float32(scale)
     needed = Needed(given.psi, centre, begun, settings.texture)
@@ -173,20 +193,44 @@ def reconstruct_adaptive(
     if settings.parsimony:
         needed, spared = _needed(needed, volume, bright.frames, precision, held, nearer, settings)
         left_out += spared
-    found = solve(
-        needed.psi,
-        needed.centre,
-        nearer,
-        bright.frames,
-        precision,
-        needed.picture,
-        needed.texture,
-        settings.layers,
-        on_step=lambda step: tell(2 + step),
-    )
-    seen = found.surfaces.light_field(found.texture) * np.float32(scale)
-    light_field = np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape)
-    missed = bright.frames - found.surfaces.forward(found.texture)
+
+    def again(texture: Array, missed: Array, margin: int) -> Array:
+        beliefs = swept(
+            volume,
+            needed.psi,
+            bright.frames,
+            bright.noise,
+            usable & ~held,
+            texture,
+            missed,
+            margin,
+            settings.slope_px,
+            settings.jump,
+        )
+        return search.per_pixel(beliefs, psi.size, k)
+
+    light_fields, misses = [], []
+    for fit, misfit in enumerate(settings.misfits):
+        # One layout of rays at a time: it is as large as the light field.
+        found = None
+        done = 2 + fit * settings.texture.steps
+        found = solve(
+            needed.psi,
+            needed.centre,
+            nearer,
+            bright.frames,
+            _precision(bright, held, misfit),
+            needed.picture,
+            needed.texture,
+            settings.layers,
+            on_step=lambda step, done=done: tell(done + step),
+            again=again if fit < len(settings.misfits) - 1 else None,
+        )
+        seen = found.surfaces.light_field(found.texture) * np.float32(scale)
+        light_fields.append(np.broadcast_to(np.clip(seen, 0, 1), psi.light_field_shape))
+        misses.append(bright.frames - found.surfaces.forward(found.texture))
+    assert found is not None
+    missed = misses[-1]
     kinds = texture_map(volume, psi.size, k)
     doubt = search.variance_per_pixel(volume, psi.size, k)
     maps = {
@@ -201,22 +245,50 @@ def reconstruct_adaptive(
     decided = _decided(volume)
     judged = _judgement(settings, volume, decided, masks)
     sure = deviation(found, doubt, bright.frames, bright.noise, held)
-    variance = None if sure is None else np.square(sure.sigma * np.float32(scale))
-    if settings.free and variance is not None:
-        rest = given.frames - given.psi.forward(plain.light_field)
-        free = freedom(given.psi, missed * np.float32(scale), rest, given.noise, held)
-        light_field = light_field + free.share[..., None] * (plain.light_field - light_field)
-        variance += free.share * (np.float32(free.variance) - variance)
-        maps["model"][free.share > 0.5] = MODELS.index("free")
-        if free.share.mean() > MOSTLY:
-            judged.append(
-                f"readings kept from the fit speak against surfaces in {free.share.mean():.0%} of "
-                "the picture, where total variation is returned: take more shots"
-            )
+    sigmas: list[Array | float] = (
+        [] if sure is None else [sure.sigma * np.float32(scale)] * len(misses)
+    )
+    if settings.free:
+        plain_missed = given.frames - given.psi.forward(plain.light_field)
+        light_fields.append(plain.light_field)
+        misses.append(plain_missed / np.float32(scale))
+    light_field = light_fields[0]
+    if held.any():
+        share = weighted(misses, bright.noise, held)
+        light_field = mean_light_field(light_fields, share.shares, k)
+        if settings.free:
+            free = share.shares[-1]
+            sigmas.append(plain_deviation(given.psi, plain_missed, given.noise, held, free))
+            maps["model"][free.repeat(k, axis=0).repeat(k, axis=1) > MOSTLY] = MODELS.index("free")
+            if np.mean(free > MOSTLY) > MOSTLY:
+                judged.append(
+                    "readings kept from the fit speak against surfaces in "
+                    f"{np.mean(free > MOSTLY):.0%} of the picture, where total variation is "
+                    "returned: take more shots"
+                )
+        if sure is not None:
+            sigma = mean_deviation(sigmas, share, misses, k)
+    fitted = usable & ~held
+    left = (given.frames - given.psi.forward(light_field)).astype(np.float32)
+    unexplained = misfit_of(left, given.noise, fitted)
+    if settings.rest and unexplained.times > UNEXPLAINED:
+        more = rest(
+            given.psi, given.frames, left, given.typical, fitted, held, settings.start_steps
+        )
+        if more is not None:
+            light_field = np.clip(light_field + more, 0, 1)
+            left = (given.frames - given.psi.forward(light_field)).astype(np.float32)
+            unexplained = misfit_of(left, given.noise, fitted)
+    if unexplained.times > FAR_OFF:
+        judged.append(
+            f"readings are missed by {unexplained.times:.1f} times their noise, most about row "
+            f"{unexplained.row}, column {unexplained.column}: take more shots, or see whether "
+            "noise and Psi are right"
+        )
     if edges is not None:
         light_field = faded(edges, given.psi, light_field, given.frames, all_usable)
-    if variance is not None:
-        maps["sigma"] = np.sqrt(variance)
+    if sure is not None:
+        maps["sigma"] = sigma
     tell(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     return Reconstruction(
@@ -235,6 +307,9 @@ def reconstruct_adaptive(
             "search_seconds": searched_s,
             "held_readings": int(held.sum()),
             "at_end": volume.at_end,
+            "misfit": unexplained.times,
+            "misfit_row": float(unexplained.row),
+            "misfit_column": float(unexplained.column),
             **({} if decided is None else {"decided": decided}),
             **({} if explained is None else {"explained": explained}),
             **{
@@ -269,6 +344,21 @@ class Given:
         psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
         noise = (self.noise / scale**2).astype(np.float32)
         return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+
+def _precision(given: Given, held: NDArray[np.bool_], misfit: float) -> Array:
+    """Return the inverse variance of the readings fitted, 0 of the others."""
+    variance = given.noise + np.float32(misfit**2)
+    return np.where(given.usable & ~held, 1 / variance, 0).astype(np.float32)
+
+
+def _known(disparity: Array, psi: ImagingMatrix) -> Array:
+    """Return a disparity that is given, checked; raises ReconstructionError."""
+    if disparity.shape != psi.size or not np.isfinite(disparity).all():
+        raise ReconstructionError(
+            f"a disparity of shape {disparity.shape} is given, Psi needs {psi.size}, all finite"
+        )
+    return np.asarray(disparity, dtype=np.float32)
 
 
 def _unexplained_by(
@@ -330,7 +420,7 @@ def _needed(
         kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
         left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
         centre = plane.over(psi.size, psi.binning)
-        texture = texture.model_copy(update={"refine_steps": 0})
+        texture = texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
     if may_be_grey(picture):
         quick = texture.model_copy(update={"steps": TRIAL_STEPS, "refine_steps": 0})
         both = (psi, picture), (grey_psi(psi), picture.mean(axis=-1, keepdims=True))

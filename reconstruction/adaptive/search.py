@@ -226,7 +226,8 @@ def _pixel_maps(
     return columns, rows
 
 
-def _interpolated(grid: Array, columns: Array, rows: Array) -> NDArray[np.float32]:
+def interpolated(grid: Array, columns: Array, rows: Array) -> NDArray[np.float32]:
+    """Return the values of a grid (y, x) at fractional columns and rows, linear, (any shape)."""
     found = cv2.remap(grid, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.float32)
 
@@ -237,7 +238,7 @@ def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> N
     square = volume.probability @ np.square(volume.disparities)
     spread = np.maximum(square - np.square(mean), 0).astype(np.float32)
     columns, rows = _pixel_maps(volume, size, binning)
-    return _interpolated(spread, columns, rows)
+    return interpolated(spread, columns, rows)
 
 
 def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
@@ -251,7 +252,7 @@ def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np
 
     def spread(label: int) -> NDArray[np.float32]:
         layer = np.ascontiguousarray(volume.probability[..., label])
-        return _interpolated(layer, columns, rows)
+        return interpolated(layer, columns, rows)
 
     for label in range(len(volume.disparities)):
         chance = spread(label)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.joint import Scene
 from reconstruction.adaptive.refine import slopes
 
@@ -33,6 +34,10 @@ SURE_PX = 0.05
 """Deviation of a disparity that the patches agree on."""
 WITHIN_ONE = 0.6827
 LEAST_SCALE = 0.25
+APART = 0.55
+"""Total variation: its light field's variance over what the readings' misfit is if its errors were
+independent from ray to ray, 0.45 to 0.70 on four captures where it is better than surfaces (wide
+disparities, glass, gloss)."""
 FEWEST = 50
 """Held-out readings below which nothing is fitted."""
 
@@ -142,3 +147,17 @@ def deviation(
     scale = max(float(np.quantile(beyond, WITHIN_ONE)), LEAST_SCALE)
     variance = np.tensordot(np.array([scale, *(scale * weights)], np.float32), parts, axes=1)
     return Deviation(np.sqrt(variance), count, *map(float, weights))
+
+
+def plain_deviation(
+    psi: ImagingMatrix, missed: Array, noise: Array, held: NDArray[np.bool_], share: Array
+) -> float:
+    """Return the standard deviation of total variation's light field, where it has a share.
+
+    missed: what it misses of the frames, noise: their variance, held: the readings kept from the
+    fit, all (shot, pixel_y, pixel_x); share: (pixel_y, pixel_x).
+    """
+    weight = np.where(held, share, 0).astype(np.float64)
+    rows = np.einsum("ssyx->syx", psi.gram)
+    excess = float((weight * (np.square(missed) - noise)).sum())
+    return float(np.sqrt(APART * max(excess, 0.0) / max(float((weight * rows).sum()), 1e-12)))

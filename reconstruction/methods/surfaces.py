@@ -34,7 +34,7 @@ METHODS = (
         "surfaces whose disparity the evidence of patches chooses, and their texture",
         "what is seen lies on surfaces, alike from all views but where one hides another",
         "p patches 81 m^2/2 (2 + l d) + l (d + 28) m^3/6 for d disparities, l texture lengths; "
-        "8 x 12 x 32 N/6",
+        "2 x 8 x 12 x 32 N/6; twice 40 steps of tv",
         "one shot; nothing to train; disparity and standard deviation wanted",
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",

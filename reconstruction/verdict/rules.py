@@ -54,6 +54,9 @@ UNEXPLAINED = Limits(0.75, 1.1)
 """Beyond 1: the smooth picture alone foretells the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
+MISFIT = Limits(8.0, float("inf"))
+"""Times their noise that readings are missed by. Nearly without noise (0.0005), one clean
+shot of the fish is missed by 4 times it."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods to which one shot nearly does."""
@@ -104,7 +107,7 @@ def judged(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     found = [
         reason
-        for rule in (_shots, _masks, _pixels, _noise, _search, _fit)
+        for rule in (_shots, _masks, _pixels, _noise, _search, _misfit, _fit)
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
@@ -302,6 +305,18 @@ def _search(e: Evidence) -> Iterator[Reason]:
         at_end,
         "raise furthest_px, or focus nearer to the scene",
         AT_END.level(at_end),
+    )
+
+
+def _misfit(e: Evidence) -> Iterator[Reason]:
+    times = e.parameters.get("misfit", 0.0)
+    row, column = (e.parameters.get(f"misfit_{axis}", 0.0) for axis in ("row", "column"))
+    yield Reason(
+        f"readings are missed by {times:.1f} times their noise, most about row {row:.0f}, column "
+        f"{column:.0f}",
+        times,
+        "take more shots, or see whether noise and Psi are right",
+        MISFIT.level(times),
     )
 
 

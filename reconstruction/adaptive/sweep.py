@@ -1,0 +1,184 @@
+"""The disparity again, once the texture is nearly known: a plane sweep in the measurement domain.
+
+The texture T predicts the frames for every plane, F_d = Psi L(T, d), one product each. Given that
+pixel p lies at d its reading misses F_d(p) by noise and by what the texture is wrong by there. That
+variance is read off the frames: the mean square, around p, of what the present surfaces miss. Its
+tails are heavy (occlusions), so the log-likelihood is that of a Student t,
+
+    l_d(p) = -(nu + 1) / 2 sum_shots log(1 + (I - F_d)^2(p) / (nu s^2(p))).
+
+It is averaged along the picture's edges (guided filter, He, Sun and Tang 2013), counts for half of
+the readings averaged, since the rays of neighbours cross, and is added to what the patches believe,
+without which it would favour the disparity that T was fitted with. Neighbours agree by belief
+propagation as in the search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import floor
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive.assembly import TAPS, cubic
+from reconstruction.adaptive.bands import in_bands
+from reconstruction.adaptive.labels import compatibility, posteriors
+from reconstruction.adaptive.search import Volume, interpolated
+
+Array = NDArray[np.floating]
+FREEDOM = 3.0
+"""Of the Student t, as of the search's."""
+RADIUS_PX, EDGE = 3, 1e-3
+"""Of the guided filter; EDGE is the variance of the picture, in [0, 1], that counts as an edge."""
+VARIANCE_PX = 4.0
+"""Deviation of the window in which the misses are averaged."""
+STRIDE = 2
+"""Pixels between those whose disparity is asked for."""
+OWN_SHARE = 0.5
+RARE, BEYOND_PX = 0.2, 0.25
+"""Percent of the patches, at either end, whose likeliest disparity may be left out: next to none
+lies there, and with so many planes some fit by chance. And how far beyond the others to look."""
+LEAST_BELIEF = 1e-5
+"""Of a disparity that the patches do not believe in: they may be wrong."""
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _see(weights, colour, texture, disparity, margin, binning, first, last, frames):
+    """Add to pixel rows of frames (shot, pixel_y, pixel_x) what they see of a plane.
+
+    texture: (c, y, x), padded by a margin that no ray leaves.
+    """
+    shots, views_v, views_u, _, stored, columns = weights.shape
+    colours, _, wide = texture.shape
+    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    line, seen = np.empty(wide, np.float32), np.empty((colours, columns), np.float32)
+    for v in range(views_v):
+        down = -disparity * (v - views_v // 2)
+        cubic(np.float32(down - floor(down)), wy)
+        for u in range(views_u):
+            right = -disparity * (u - views_u // 2)
+            cubic(np.float32(right - floor(right)), wx)
+            left = margin + floor(right) - 1
+            for y in range(first * binning, last * binning):
+                top = y + margin + floor(down) - 1
+                for c in range(colours):
+                    a, b = texture[c, top], texture[c, top + 1]
+                    d, e = texture[c, top + 2], texture[c, top + 3]
+                    for x in range(left, left + columns + TAPS - 1):
+                        line[x] = wy[0] * a[x] + wy[1] * b[x] + wy[2] * d[x] + wy[3] * e[x]
+                    for x in range(columns):
+                        at = left + x
+                        seen[c, x] = (
+                            wx[0] * line[at]
+                            + wx[1] * line[at + 1]
+                            + wx[2] * line[at + 2]
+                            + wx[3] * line[at + 3]
+                        )
+                for s in range(shots):
+                    for k in range(stored):
+                        for x in range(columns):
+                            c = min(colour[s, y, x] if stored == 1 else k, colours - 1)
+                            w = weights[s, v, u, y, k, x]
+                            frames[s, y // binning, x // binning] += w * seen[c, x]
+
+
+def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: int) -> Array:
+    """Return the frames (shot, pixel_y, pixel_x) of a texture (c, y, x) on one plane.
+
+    texture: padded by a margin, which the rays of the outermost views must not leave.
+    """
+    frames = np.zeros(psi.frames_shape, dtype=np.float32)
+    texture = np.ascontiguousarray(texture, dtype=np.float32)
+
+    def work(_: int, first: int, last: int) -> None:
+        _see(
+            psi.weights,
+            psi.colour_map,
+            texture,
+            float(disparity),
+            margin,
+            psi.binning,
+            first,
+            last,
+            frames,
+        )
+
+    in_bands(work, psi.frames_shape[1])
+    return frames
+
+
+def _likelihood(residual: Array, variance: Array, used: Array, guide: Array) -> Array:
+    """Return the log-likelihood of every pixel (y, x) of residuals (shot, y, x), averaged."""
+    surprise = np.log1p(np.square(residual) / (FREEDOM * variance)) * used
+    each = (-(FREEDOM + 1) / 2 * surprise.sum(axis=0)).astype(np.float32)
+    mean = cv2.ximgproc.guidedFilter(guide, each, RADIUS_PX, EDGE)
+    return np.asarray(mean, dtype=np.float32) * (2 * RADIUS_PX + 1) ** 2
+
+
+def _smooth(values: Array, used: Array) -> Array:
+    """Return the mean over the used pixels around, shots apart, of (shot, y, x)."""
+    blurred = [
+        cv2.GaussianBlur(a * b, (0, 0), VARIANCE_PX)
+        / np.maximum(cv2.GaussianBlur(b, (0, 0), VARIANCE_PX), 1e-6)
+        for a, b in zip(values, used, strict=True)
+    ]
+    return np.stack(blurred).mean(axis=0)
+
+
+def swept(
+    volume: Volume,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise: Array,
+    used: NDArray[np.bool_],
+    texture: Array,
+    missed: Array,
+    margin: int,
+    slope_px: float,
+    jump: float,
+) -> Volume:
+    """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
+
+    volume: of the search. frames, their variance `noise`, which are used, and what the present
+    surfaces miss: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
+    """
+    weight = used.astype(np.float32)
+    variance = np.maximum(_smooth(np.square(missed), weight), noise.mean(axis=0))
+    k = psi.binning
+    inner = texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
+    pixels = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k).mean(axis=(2, 4))
+    guide = np.ascontiguousarray(np.moveaxis(pixels, 0, -1).astype(np.float32))
+    rows, columns = (np.arange(0, length, STRIDE) for length in psi.frames_shape[1:])
+    at = np.meshgrid(
+        *(
+            np.interp(here, centres, np.arange(len(centres))).astype(np.float32)
+            for here, centres in zip((rows, columns), volume.centres, strict=True)
+        ),
+        indexing="ij",
+    )
+    half = max(psi.light_field_shape[:2]) // 2
+    likeliest = volume.disparities[volume.probability.argmax(axis=-1)]
+    low, high = np.percentile(likeliest, (RARE, 100 - RARE))
+    within = (volume.disparities >= low - BEYOND_PX) & (volume.disparities <= high + BEYOND_PX)
+    within &= np.abs(volume.disparities) * half + TAPS <= margin
+    labels = volume.disparities[within]
+    evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
+    for label, (disparity, belief) in enumerate(
+        zip(labels, np.moveaxis(volume.probability[..., within], -1, 0), strict=True)
+    ):
+        residual = frames - plane_frames(psi, texture, disparity, margin)
+        likelihood = _likelihood(residual, variance, weight, guide)[::STRIDE, ::STRIDE]
+        believed = interpolated(np.ascontiguousarray(belief), at[1], at[0])
+        evidence[..., label] = OWN_SHARE * likelihood + np.log(believed + LEAST_BELIEF)
+    chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
+    return replace(
+        volume,
+        disparities=labels,
+        centres=(rows.astype(float), columns.astype(float)),
+        probability=chances,
+        evidence=evidence,
+    )

@@ -1,0 +1,57 @@
+"""The mean of models by what they miss of held-out readings: weights, light field, deviation."""
+
+import numpy as np
+import pytest
+
+from reconstruction.adaptive.mixture import mean_deviation, mean_light_field, weighted
+
+SHAPE, NOISE = (2, 60, 80), 1e-6
+
+
+@pytest.fixture
+def held():
+    return np.random.default_rng(0).random(SHAPE[1:])[None].repeat(2, axis=0) < 0.1
+
+
+def misses(*deviations):
+    rng = np.random.default_rng(1)
+    return [rng.normal(0, (one**2 + NOISE) ** 0.5, SHAPE) for one in deviations]
+
+
+def noise():
+    return np.full(SHAPE, NOISE)
+
+
+def test_a_model_of_half_the_error_weighs_sixteen_times_as_much(held):
+    share = weighted(misses(0.01, 0.02), noise(), held).shares
+    np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-5)
+    assert np.median(share[0] / share[1]) == pytest.approx(16, rel=0.4)
+
+
+def test_the_better_model_may_differ_from_place_to_place(held):
+    left = np.arange(SHAPE[2]) < SHAPE[2] // 2
+    first, second = misses(1.0, 1.0)
+    missed = [first * np.where(left, 0.01, 0.1), second * np.where(left, 0.1, 0.01)]
+    share = weighted(missed, noise(), held).shares
+    assert share[0, :, :10].min() > 0.9 > 0.1 > share[0, :, -10:].max()
+
+
+def test_models_that_miss_no_more_than_the_noise_weigh_alike(held):
+    share = weighted(misses(0.0, 0.0), noise(), held).shares
+    assert np.abs(share - 0.5).max() < 0.45
+    assert np.abs(share.mean(axis=(1, 2)) - 0.5).max() < 0.2
+
+
+def test_the_mean_of_light_fields_follows_the_shares_of_pixels():
+    shares = np.stack([np.full((2, 3), 0.25), np.full((2, 3), 0.75)]).astype(np.float32)
+    fields = [np.full((3, 3, 4, 6, 3), value, np.float32) for value in (0.4, 0.8)]
+    np.testing.assert_allclose(mean_light_field(fields, shares, 2), 0.7, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("alike", "expected"), [(True, 1.0), (False, 0.5**0.5)])
+def test_independent_errors_make_the_mean_surer_and_equal_ones_do_not(held, alike, expected):
+    first, second = misses(0.02, 0.02)
+    missed = [first, first if alike else second]
+    share = weighted(missed, noise(), held)
+    sigma = mean_deviation([0.1, 0.1], share, missed, 1)
+    np.testing.assert_allclose(sigma, 0.1 * expected, rtol=0.12)
