@@ -21,17 +21,24 @@ class MeanFrame:
     """The mean of `count` frames of one exposure.
 
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
-    the spread between repeats; NaN with one frame.
+    the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
+    extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
     """
 
     mean_dn: NDArray[np.float32]
     variance_dn2: float
     count: int
     exposure_s: float
+    taken_s: float = 0.0
+    extra_variance_dn2: float = 0.0
 
 
 def average(
-    frames: Iterable[NDArray[np.uint16]], exposure_s: float, white_level_dn: int, what: str
+    frames: Iterable[NDArray[np.uint16]],
+    exposure_s: float,
+    white_level_dn: int,
+    what: str,
+    taken_s: float = 0.0,
 ) -> MeanFrame:
     """Return the mean of repeated frames (y, x), uint16.
 
@@ -64,7 +71,7 @@ def average(
     if count > 1:
         spread = float(np.mean(squares - total**2 / count) / (count - 1))
         _check_steady(levels, float(np.sqrt(spread / total.size)), what)
-    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s)
+    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s, taken_s)
 
 
 def _check_steady(levels: list[float], noise: float, what: str) -> None:
