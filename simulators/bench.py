@@ -55,9 +55,10 @@ class MountingErrors:
     skew: tangent of the angle by which a mask's columns lean. distance_share: relative error of
     their distance. distortion_um: third-order radial displacement of the rays at the corner of
     the picture. edge_blur_um: standard deviation of the mask's edges. tilt_deg: of the mask's
-    plane, by which its distance grows with x and with y. bow_um: by which the mask is farther from the
-    sensor at the corner of the picture than in the middle. substrate_um: thickness of its glass,
-    of index `refractive_index`: positive between pattern and sensor, negative on the lens' side.
+    plane, by which its distance grows with x and with y. bow_um: by which the mask is farther from
+    the sensor at the corner of the picture than in the middle. substrate_um: thickness of its
+    glass, of index `refractive_index`: positive between pattern and sensor, negative on the lens'
+    side.
     """
 
     offset_um: tuple[float, float] = (6.5, -4.0)
@@ -304,7 +305,9 @@ class Bench:
         """Return the noise-free readings (pixel_y, pixel_x) of the bench as it now stands."""
         levels = np.array(LAMPS[self.lamp]) * self._lamp.levels(self._seconds())
         lit = levels[levels > 0]
-        if lit.size == 0 or lit.min() == lit.max():
+        if lit.size == 0:
+            return np.zeros(self._light.shape[1:])
+        if lit.min() == lit.max():
             return levels.max() * self._lit(LAMPS[self.lamp])
         return np.sum([levels[c] * self._lit(tuple(np.eye(3)[c])) for c in range(3)], axis=0)
 

@@ -141,7 +141,7 @@ def diffracted(
     amplitude *= np.exp(1j * phase)
     rows, columns = transmittance.shape
     field = np.asarray(fft.ifft2(amplitude))[:rows, :columns]
-    return (field.real**2 + field.imag**2).astype(np.float32)
+    return np.square(np.abs(field)).astype(np.float32)
 
 
 @dataclass(frozen=True)

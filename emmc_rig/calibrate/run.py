@@ -22,7 +22,7 @@ from calibration.planning import (
     Kind,
     Light,
     PlannedFrames,
-    free_error,
+    free_noise,
     plan_free,
     plan_parametric,
 )
@@ -50,19 +50,20 @@ from emmc_rig.output import command_line, versions, write_metrics
 from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
 from emmc_rig.session.session import Session
 
+Array = NDArray[np.floating]
 PLAN, REPORT = "plan.yaml", "report.html"
 PLAN_HEAD = """\
 # Whiteboards for the parametric route, then the shots: emmc-rig capture plan.yaml --rig ...
 # and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
 """
 ROUTES = {
-    "auto": ("parametric", "mixed"),
+    "auto": ("parametric", "mixed", "free", "combined"),
     "parametric": ("parametric",),
     "mixed": ("parametric", "mixed"),
     "free": ("free",),
-    "all": ("parametric", "mixed", "free"),
 }
 FREE_REPEATS = 2
+BOARD_TURN_DEG = 90.0
 TARGET = 0.005
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
@@ -249,19 +250,30 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     lamps = lamps_needed(design)
     few = pinholes = planned = None
     started = time.perf_counter()
+    fitted: list[Setting] = []
     if "parametric" in routes:
         mask = shadow_mask(camera, settings.size)
         planned = parametric_plan(camera, mask, plan_light(bench, mask), settings.target)
-        wanted = few_settings(planned)
-        watcher.begin("whiteboards for the fit", len(wanted))
-        few = bench.capture(wanted, watcher.step)
+        fitted = few_settings(planned)
+    through: list[Setting] = []
     if "free" in routes:
-        wanted = free_settings(camera, lamps, FREE_REPEATS)
-        watcher.begin("whiteboards through the pinhole", len(wanted))
-        pinholes = bench.capture(wanted, watcher.step)
-    watcher.begin("whiteboards to judge by", None)
+        through = free_settings(camera, lamps, FREE_REPEATS)
+        fitted = [one for one in fitted if one.pinhole is None]
     judges = held_out_settings(camera)[: 2 if "parametric" in routes else 1]
-    held_out = bench.capture(judges, watcher.step)
+    watcher.begin("whiteboards", len(fitted) + len(through) + len(judges))
+    boards = bench.capture([*fitted, *through, *judges], watcher.step)
+    first, last = len(fitted), len(fitted) + len(through)
+    held_out = boards.with_frames(boards.frames[last:])
+    if "free" in routes:
+        pinholes = boards.with_frames(boards.frames[first:last])
+    if "parametric" in routes:
+        few = boards.with_frames([one for one in boards.frames[:last] if one.shot == 0])
+    turned = {}
+    if "combined" in routes:
+        watcher.begin("whiteboards, the board turned", 1)
+        turned[BOARD_TURN_DEG] = bench.capture(
+            [Setting(lamp=lamps[0], repeats=4, board_turn_deg=BOARD_TURN_DEG)], watcher.step
+        )
     captured_s = time.perf_counter() - started
     started = time.perf_counter()
     outcome = calibrate(
@@ -273,6 +285,7 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         pinholes,
         settings.fit,
         on_stage=lambda name: watcher.begin(name, None),
+        turned=turned,
     )
     calibrated_s = time.perf_counter() - started
     watcher.begin("sensor", None)
@@ -284,9 +297,9 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
             raise AppError("--stage needs a parametric route: leave --route at auto")
         stage = measured_stage(bench, design, best, watcher)
     watcher.begin("the true Psi, for comparison", None)
-    exact = bench.exact_psi(design)
+    true = bench.true_psi()
     errors = {
-        name: psi_error(one.psi, exact, outcome.good) for name, one in outcome.calibrations.items()
+        name: true_error(one.psi, true, outcome.good) for name, one in outcome.calibrations.items()
     }
     metrics = {
         "camera": settings.camera_name,
@@ -294,7 +307,13 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         "route": settings.route,
         **outcome_figures(outcome),
         "psi_relative_error": errors,
-        "design_relative_error": psi_error(design, exact, outcome.good),
+        "psi_stated_error": {
+            name: stated_error(one, outcome.good) for name, one in outcome.calibrations.items()
+        },
+        "psi_coverage": {
+            name: coverage(one, true, outcome.good) for name, one in outcome.calibrations.items()
+        },
+        "design_relative_error": true_error(design, true, outcome.good),
         "held_out_frames": held_out.exposures,
         "sensor": {name: value for name, value, _, _ in sensor.rows()},
         "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
@@ -312,6 +331,7 @@ def outcome_figures(outcome: Outcome) -> dict:
     return {
         "chosen": outcome.chosen,
         "why": outcome.why,
+        "findings": list(outcome.findings),
         "advice": list(outcome.advice),
         "held_out": {
             name: {
@@ -319,6 +339,7 @@ def outcome_figures(outcome: Outcome) -> dict:
                 "chi2_without_worst_percent": one.trimmed,
                 "neighbour_correlation": one.whiteness,
                 "relative_error": one.relative_error,
+                "chi2_by_kind": dict(one.groups),
             }
             for name, one in outcome.judged.items()
         },
@@ -354,13 +375,47 @@ def measured_stage(
     return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
 
 
-def psi_error(psi: ImagingMatrix, exact: ImagingMatrix, good: NDArray[np.bool_]) -> float:
-    """Return |Psi - exact| / |exact| over the good pixels (pixel_y, pixel_x), Frobenius."""
-    samples = good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)
-    chosen = samples[:, None, :]
-    difference = np.where(chosen, psi.weights - exact.weights, 0)
-    whole = np.where(chosen, exact.weights, 0)
-    return float(np.linalg.norm(difference) / np.linalg.norm(whole))
+def in_three_colours(values: Array, psi: ImagingMatrix) -> NDArray[np.float32]:
+    """Return values shaped as Psi's weights for all three colours: 0 where it stores none."""
+    if psi.colour is None:
+        return np.asarray(values, dtype=np.float32)
+    own = np.arange(3)[:, None] == psi.colour[:, None, None, :, None, :]
+    return np.where(own, values, 0).astype(np.float32)
+
+
+def _of_good(psi: ImagingMatrix, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)[:, None, :]
+
+
+def true_error(psi: ImagingMatrix, true: Array, good: NDArray[np.bool_]) -> float:
+    """Return |Psi - true| / |true| in three colours over the good pixels, Frobenius.
+
+    true: (shot, v, u, y, colour, x). A colour that Psi does not store counts as 0.
+    """
+    chosen = _of_good(psi, good)
+    off = np.where(chosen, in_three_colours(psi.weights, psi) - true, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, true, 0)))
+
+
+def stated_error(known: Calibration, good: NDArray[np.bool_]) -> float:
+    """Return the relative error of Psi that a calibration states, as `true_error`."""
+    chosen = _of_good(known.psi, good)
+    off = np.where(chosen, known.deviation, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, known.psi.weights, 0)))
+
+
+def coverage(known: Calibration, true: Array, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the share of true coefficients within one and two stated deviations.
+
+    Coefficients that are 0 in truth and in Psi do not count.
+    """
+    psi = known.psi
+    chosen = np.broadcast_to(_of_good(psi, good), true.shape)
+    off = np.abs(in_three_colours(psi.weights, psi) - true)
+    stated = in_three_colours(known.deviation, psi)
+    counted = chosen & ((true != 0) | (stated != 0))
+    within = [float((off <= k * stated)[counted].mean()) for k in (1, 2)]
+    return within[0], within[1]
 
 
 def _defect_count(outcome: Outcome) -> int:
@@ -505,4 +560,5 @@ def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
     """Return the error of Psi that the free route's formula expects of so many frames a view."""
     mask = shadow_mask(settings.camera, settings.size)
     bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
-    return free_error(mask, soft_design(settings.camera, mask), plan_light(bench, mask), repeats)
+    light = plan_light(bench, mask)
+    return free_noise(mask, soft_design(settings.camera, mask), light).error(repeats)
