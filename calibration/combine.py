@@ -2,7 +2,8 @@
 
 Every coefficient has two estimates: the pinhole's, with its noise, and that of the fitted mask,
 whose misfit is not known beforehand. The misfit is what the two differ by beyond their deviations,
-over a view and around a pixel (empirical Bayes: Efron 2010, chapter 1); weighing both by their
+over what lies in a view alike close to the mask's edges, and around a pixel (empirical Bayes: Efron
+2010, chapter 1); weighing both by their
 variances, Psi is the model's where it holds and the pinhole's where it does not (dust, a bent mask,
 glass), and its deviation says which.
 """
@@ -20,6 +21,8 @@ from calibration.whiteboard import Calibration
 Array = NDArray[np.floating]
 AROUND_PX = 5
 SURE = 3.0
+LIKE_SLOPES = 6
+TILE = 2
 OUTLIER2 = 16.0
 """Squared deviations beyond which one coefficient is no longer the model's."""
 
@@ -38,9 +41,10 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
         measured, expected = (one.psi.weights[place].astype(np.float64) for one in (free, model))
         noise = np.square(free.deviation[place], dtype=np.float64)
         inherent = np.square(model.deviation[place], dtype=np.float64)
-        misfit = _misfit((measured - expected) ** 2, noise + inherent, usable)
+        squares = (measured - expected) ** 2
+        misfit = _misfit(squares, noise + inherent, _slopes(expected), usable)
         share = (inherent + misfit) / (inherent + misfit + noise)
-        share = np.where((measured - expected) ** 2 > OUTLIER2 * (noise + misfit), 1.0, share)
+        share = np.where(squares > OUTLIER2 * (noise + inherent + misfit), 1.0, share)
         share = np.where(usable, share, 0.0)
         weights[place] = expected + share * (measured - expected)
         variance = np.where(usable, share * noise, inherent + misfit)
@@ -48,16 +52,31 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     return replace(free, psi=replace(free.psi, weights=weights), deviation=deviation, good=good)
 
 
-def _misfit(squares: Array, variance: Array, usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the variance of the model's misfit, (y, x): that of the view, or of a pixel's
-    surroundings where they differ from it surely.
+def _misfit(
+    squares: Array, variance: Array, slopes: Array, usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the variance of the model's misfit, (y, x): that of the view's coefficients of like
+    slopes, or of a pixel's surroundings where they differ from it surely.
     """
     over = np.where(usable, squares - variance, 0.0)
     # One speck of dust says nothing of the rest of the view.
-    limit = OUTLIER2 * variance
-    calm = usable & (squares < limit)
-    view = max(float(over[calm].mean()), 0.0)
+    calm = usable & (squares < OUTLIER2 * variance + np.median(squares[usable]))
+    limits = np.quantile(slopes[calm], np.linspace(0, 1, LIKE_SLOPES + 1)[1:-1])
+    like = np.digitize(slopes, limits)
+    count = np.maximum(np.bincount(like[calm], minlength=LIKE_SLOPES), 1)
+    sums = np.bincount(like[calm], over[calm], minlength=LIKE_SLOPES)
+    view = np.maximum(sums / count, 0.0)[like]
     inside = uniform_filter(usable.astype(np.float64), AROUND_PX)
-    around = uniform_filter(over, AROUND_PX) / np.maximum(inside, 1e-9)
+    more = uniform_filter(np.where(usable, over - view, 0.0), AROUND_PX) / np.maximum(inside, 1e-9)
     deviation = np.sqrt(2.0) / AROUND_PX * (variance + view)
-    return np.where(np.abs(around - view) > SURE * deviation, np.maximum(around, 0.0), view)
+    return np.where(np.abs(more) > SURE * deviation, np.maximum(view + more, 0.0), view)
+
+
+def _slopes(plane: Array) -> NDArray[np.float64]:
+    """Return the squared slope of a mosaic (y, x), between pixels of one colour of a Bayer tile."""
+    found = np.zeros(plane.shape)
+    for axis in (0, 1):
+        if plane.shape[axis] > 2 * TILE:
+            rise = np.roll(plane, -TILE, axis) - np.roll(plane, TILE, axis)
+            found += rise**2
+    return found

@@ -14,12 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import trim_mean
 
 from calibration.frames import MeanFrame
 
 Array = NDArray[np.floating]
 CHANNELS = 4
 MOST_KNOTS = 8
+TRIMMED = 0.01
 LEAST_DEVIATION = 5e-5
 """Of a check's logarithm: lamps and shutters flicker by that much at best."""
 BEND_PRIOR = 0.2
@@ -52,7 +54,8 @@ class Levels:
 
     drift: peak to peak of the lamp over the checks, the largest of the colours. residual: root
     mean square of the checks' logarithms, over their deviations. bend_known: more than one
-    exposure tells it. deviation: of the lamp's logarithm at any time.
+    exposure tells it. deviation: of the lamp's logarithm, typical; significance: of the largest
+    step of it from the first knot.
     """
 
     knots_s: NDArray[np.float64]
@@ -64,6 +67,7 @@ class Levels:
     drift: float
     colour_drift: float
     deviation: float
+    significance: float
     residual: float
 
     @property
@@ -74,8 +78,8 @@ class Levels:
 
     @property
     def drifting(self) -> bool:
-        """Whether the lamp drifts by more than the deviation and enough to matter."""
-        return self.drift > max(LEAST_DRIFT, SIGNIFICANT * self.deviation)
+        """Whether the lamp drifts beyond its deviation and enough to matter."""
+        return self.drift > LEAST_DRIFT and self.significance > SIGNIFICANT
 
     def corrected(self, frame: MeanFrame, dark_dn: Array, channels: NDArray[np.uint8]) -> MeanFrame:
         """Return a frame as a straight sensor sees it under the lamp of the first check.
@@ -100,7 +104,8 @@ def check_of(board: str, frame: MeanFrame, dark_dn: Array, channels: NDArray[np.
     """Return the check that a frame is; dark_dn, channels: (y, x), as `Levels.corrected`'s."""
     above = (frame.mean_dn - dark_dn).astype(np.float64)
     means = tuple(
-        float(above[channels == c].mean()) if (channels == c).any() else float("nan")
+        # Hot pixels saturate, and would bend the mean.
+        float(trim_mean(above[channels == c], TRIMMED)) if (channels == c).any() else np.nan
         for c in range(CHANNELS)
     )
     level = max(float(above.mean()), 1e-9)
@@ -151,11 +156,12 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
     freedom = max(len(checks) * len(channels) - size, 1)
     residual = float(np.sqrt(np.sum(left**2) / freedom))
     lamp = np.zeros((count, CHANNELS))
-    worst = 0.0
+    deviations, steps = [], []
     for k, channel in enumerate(channels):
         part = slice(k * per_channel + len(boards), (k + 1) * per_channel)
         lamp[1:, channel] = solution[part]
-        worst = max(worst, float(np.sqrt(np.diag(covariance)[part].max())))
+        deviations.append(np.sqrt(np.diag(covariance)[part]) * max(residual, 1.0))
+        steps.append(np.abs(lamp[1:, channel]))
     known = bool(np.ptp([one.exposure_s for one in checks if one.board == boards[0]]) > 0) or any(
         np.ptp([one.exposure_s for one in checks if one.board == board]) > 0 for board in boards
     )
@@ -170,6 +176,7 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         brightest,
         float(spread.max()),
         float(np.ptp(differences, axis=0).max()),
-        worst * max(residual, 1.0),
+        float(np.median(deviations)),
+        float(np.max(np.array(steps) / np.array(deviations))),
         residual,
     )

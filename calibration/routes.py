@@ -36,6 +36,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 MOST_PIXELS_WITH_DEVIATION = 2_000_000
 LARGEST_FLICKER = 0.01
+BRIGHTEST_MASK = 0.95
+"""No mask that codes lets nearly all light through everywhere."""
 LARGEST_MOVE_UM = 1.0
 
 
@@ -123,6 +125,8 @@ def calibrate(
     judges = as_readings(held_out, design.layout, good)
     if not judges:
         raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
+    for board in judges:
+        refuse_without_mask(board)
     calibrations: dict[str, Calibration] = {}
     bare: dict[str, Calibration] = {}
     judged: dict[str, HeldOut] = {}
@@ -184,7 +188,7 @@ def calibrate(
             calibrations = {name: without(board, one) for name, one in calibrations.items()}
     if seen_colours is not None:
         findings.append(
-            f"the colour filters let {1 - np.diag(seen_colours).min():.1%} of their neighbours' "
+            f"the colour filters let {seen_colours.largest:.1%} of their neighbours' "
             "light through: Psi has three colours for every pixel"
         )
         if plain is None:
@@ -210,6 +214,16 @@ def calibrate(
         tuple(advice),
         tuple(findings),
     )
+
+
+def refuse_without_mask(board: Board) -> None:
+    """Raise CalibrationError for an open whiteboard that reads as if no mask were in the beam."""
+    readings = board.reading[board.usable]
+    if readings.size and np.percentile(readings, 2) > BRIGHTEST_MASK:
+        raise CalibrationError(
+            f"{board.name}: it reads {np.median(readings):.2f} of the whiteboard without masks, "
+            "and no pixel much less: is the mask in the beam?"
+        )
 
 
 def _mixed(

@@ -19,6 +19,9 @@ from calibration.boards import BoardSet, as_readings
 from calibration.fit import FitSettings
 from calibration.placement import SCALARS, Placement, designed_placement, labels
 from calibration.planning import (
+    MODEL_ERROR,
+    MOST_FRAMES,
+    REFERENCE_FRAMES,
     Kind,
     Light,
     PlannedFrames,
@@ -53,7 +56,7 @@ from emmc_rig.session.session import Session
 Array = NDArray[np.floating]
 PLAN, REPORT = "plan.yaml", "report.html"
 PLAN_HEAD = """\
-# Whiteboards for the parametric route, then the shots: emmc-rig capture plan.yaml --rig ...
+# Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
 # and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
 """
 ROUTES = {
@@ -64,6 +67,9 @@ ROUTES = {
 }
 FREE_REPEATS = 2
 BOARD_TURN_DEG = 90.0
+PLANNED_DARKS = 4
+LONGER_DARK = 1.25
+"""Of the planned exposure through the pinhole: metering may choose a longer one."""
 TARGET = 0.005
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
@@ -72,7 +78,10 @@ STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
 
 @dataclass(frozen=True)
 class CalibrateSettings:
-    """What to calibrate: camera, size, route (a key of ROUTES), Psi's error to plan for, seed."""
+    """What to calibrate: camera, size, route (a key of ROUTES); what to plan for.
+
+    target: relative error of Psi. most_frames: of the plan, None: as many as it takes.
+    """
 
     camera_name: str
     camera: Camera
@@ -83,6 +92,7 @@ class CalibrateSettings:
     truth: BenchTruth = field(default_factory=BenchTruth)
     fit: FitSettings = field(default_factory=FitSettings)
     map_stage: bool = False
+    most_frames: int | None = None
 
 
 def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
@@ -137,87 +147,112 @@ def held_out_settings(camera: Camera) -> list[Setting]:
 
 
 def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Light) -> Plan:
-    """Return the plan of a capture: whiteboards of the parametric route, and the camera's shots."""
-    pinholes = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
+    """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
+    repeats = max(1, *(count for kind, count in planned.counts.items() if kind.pinhole))
     fitted = [
         OpenBoard(mask_um=kind.stage_um, repeats=count)
         for kind, count in planned.counts.items()
-        if kind.pinhole is None and count
+        if kind.pinhole is None
     ]
     judging = [
         OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
         for one in held_out_settings(settings.camera)
     ]
-    views = tuple(view for view, count in pinholes.items() if count)
+    # The metering chooses the real exposures; darks on both sides of them are interpolated.
+    longest_s = light.exposure_s * light.pinhole_times * LONGER_DARK
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
         camera=settings.camera_name,
         shots=tuple(PlannedShot() for _ in settings.camera.shots),
         whiteboards=Boards(
-            views=views,
+            views="all",
             shots=(0,),
-            repeats=max([1, *pinholes.values()]),
+            repeats=repeats,
             references=max(2, planned.reference_frames),
             open=(*fitted, *judging),
         ),
         darks=Darks(
-            exposure_s=(METERING_EXPOSURE_S, round(light.exposure_s, 4)),
-            repeats=max(2, planned.dark_frames),
+            exposure_s=(
+                METERING_EXPOSURE_S,
+                round(light.exposure_s, 4),
+                round(longest_s, 3),
+            ),
+            repeats=max(4, planned.dark_frames),
         ),
     )
 
 
+def combined_plan(
+    camera: Camera, mask: ShadowMask, light: Light, target: float, most_frames: int | None = None
+) -> PlannedFrames:
+    """Return the whiteboards for all routes in one: the same number of every view, and open ones.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with at
+    most `most_frames` frames in all (default: MOST_FRAMES before every view).
+    """
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    opened = {Kind(None, stage): 2 for stage in stages}
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    others = sum(opened.values()) + judging + REFERENCE_FRAMES + 3 * PLANNED_DARKS
+    views = camera.views[0] * camera.views[1]
+    most = MOST_FRAMES if most_frames is None else (most_frames - others) // views
+    if most < 1:
+        raise AppError(
+            f"--frames {most_frames}: a plan opens each of the {views} views at least once, and "
+            f"takes {others} frames beside: name at least {views + others}"
+        )
+    soft = soft_design(camera, mask)
+    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    if planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached"
+            f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
+            f"{planned.expected_error:.3%}, with {others + most * views}; raise --target"
+            f"{'' if most_frames is None else ' or --frames'}"
+        )
+    return replace(planned, counts={**opened, **planned.counts}, dark_frames=3 * PLANNED_DARKS)
+
+
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
-    kind reach the target by each route.
+    kind reach the target. Raises AppError where none do.
     """
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
     light = plan_light(bench, mask)
-    planned = parametric_plan(camera, mask, light, settings.target)
-    free = plan_free(mask, soft_design(camera, mask), light, settings.target, len(camera.shots))
-    repeats = max(free.counts.values()) // len(camera.shots)
-    lamps = lamps_needed(build_imaging_matrix(camera, (16, 16)))
-    exposures = {"open_s": light.exposure_s, "pinhole_s": light.exposure_s * light.pinhole_times}
-
-    def rows(plan: PlannedFrames) -> list[dict]:
-        return [
+    planned = combined_plan(camera, mask, light, settings.target, settings.most_frames)
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    metrics = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "target_relative_error": settings.target,
+        "model_error": MODEL_ERROR,
+        "exposures": {
+            "open_s": light.exposure_s,
+            "pinhole_s": light.exposure_s * light.pinhole_times,
+        },
+        "dark_frames": planned.dark_frames,
+        "reference_frames": planned.reference_frames,
+        "held_out_frames": judging,
+        "whiteboards": [
             {
                 "pinhole": None if kind.pinhole is None else list(kind.pinhole),
                 "stage_um": list(kind.stage_um),
                 "frames": count,
             }
-            for kind, count in plan.counts.items()
-        ]
-
-    plan = {
-        "camera": settings.camera_name,
-        "size": list(settings.size),
-        "target_relative_error": settings.target,
-        "exposures": exposures,
-        "parametric": {
-            "dark_frames": 2 * planned.dark_frames,
-            "reference_frames": planned.reference_frames,
-            "whiteboards": rows(planned),
-            "frames": planned.exposures + planned.dark_frames,
-            "expected_relative_error": planned.expected_error,
-        },
-        "free": {
-            "dark_frames": 2 * free.dark_frames,
-            "reference_frames": free.reference_frames,
-            "repeats": repeats,
-            "lamps": list(lamps),
-            "frames": free.exposures + free.dark_frames,
-            "expected_relative_error": free.expected_error,
-        },
+            for kind, count in planned.counts.items()
+        ],
+        "frames": planned.exposures + judging,
+        "expected_relative_error": planned.expected_error,
+        "command": command_line(),
+        "versions": versions(),
     }
     to_capture = capture_plan(settings, planned, light).model_dump(
         mode="json", exclude_defaults=True
     )
     text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
     (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
-    metrics = {**plan, "command": command_line(), "versions": versions()}
     write_metrics(folder, metrics)
     return metrics
 
