@@ -3,7 +3,8 @@
 Under a lamp of one colour after another, the whiteboard without masks tells the share K[f, c] that
 pixels behind filter f see of colour c. A mask of transmittances T_c then looks to them like
 sum_c K[f, c] T_c, which is what a fit under white light needs; and a coefficient of Psi has the
-share K[f, c] T_c of that in colour c.
+part K[f, c] T_c in colour c. The parts in other colours than the pixel's own are the model's; its
+own is what they leave of the coefficient measured.
 """
 
 from __future__ import annotations
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.floating]
 LEAST_CROSSTALK = 2e-3
 LEAST_SHARE = 5e-4
-LEAST_SUM = 1e-6
 MEDIAN_DEVIATION = 1.2533
 """Of a median of normal values, over that of their mean."""
 
@@ -84,15 +84,26 @@ def mixing(mask: ShadowMask, filters: Crosstalk) -> ShadowMask:
     return replace(mask, cells=cells)
 
 
-def colour_shares(
+@dataclass(frozen=True, eq=False)
+class OtherColours:
+    """What of every coefficient is in other colours than the pixel's own, and how sure.
+
+    weights, deviation: (shot, v, u, y, colour, x), 0 in a pixel's own colour, which `own` marks.
+    """
+
+    weights: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+    own: NDArray[np.bool_]
+
+
+def other_colours(
     known: Parametric,
     plain: ShadowMask,
     crosstalk: Crosstalk,
     design: ImagingMatrix,
     stages: Stages,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the share of every coefficient in each colour, (shot, v, u, y, colour, x), and the
-    deviation of a coefficient that the model's misfit makes of it.
+) -> OtherColours:
+    """Return what the model says of the colours that a pixel's filter lets through beside its own.
 
     plain: the mask as designed. Raises CalibrationError where a pixel sums several samples.
     """
@@ -105,24 +116,26 @@ def colour_shares(
     shots, v, u, y, _, x = layout.shape
     three = replace(layout, shape=(shots, v, u, y, 3, x), colour=None)
     through = 3 * psi_at(Shadow(mask, at), three, stages).weights
-    filters, unsure = (
-        np.moveaxis(matrix[design.colour], -1, 2)[:, None, None].astype(np.float32)
+    own = np.arange(3)[:, None] == design.colour[:, None, None, :, None, :]
+    share, unsure = (
+        np.where(own, 0, np.moveaxis(matrix[design.colour], -1, 2)[:, None, None])
         for matrix in (crosstalk.seen, crosstalk.deviation)
     )
-    each = np.maximum(filters * through, 0)
-    total = each.sum(axis=4, keepdims=True)
-    shares = np.where(total > LEAST_SUM, each / np.maximum(total, LEAST_SUM), filters)
-    own = np.arange(3)[:, None] == design.colour[:, None, None, :, None, :]
-    misfit = np.zeros((v, u)) if known.misfit is None else known.misfit
-    others = np.where(own, 0, filters) * misfit[None, :, :, None, None, None].astype(np.float32)
-    more = np.where(own, np.sqrt(np.square(others).sum(axis=4, keepdims=True)), others)
-    more = np.sqrt(np.square(more) + np.square(unsure * through))
-    return shares.astype(np.float32), more.astype(np.float32)
+    missed = np.zeros_like(through)
+    if known.misfit is not None:
+        for shot, row, column, colour in np.ndindex(shots, v, u, 3):
+            plane = through[shot, row, column, :, colour]
+            missed[shot, row, column, :, colour] = known.misfit[row, column].variance(plane)
+    deviation = np.sqrt(share**2 * missed + (unsure * through) ** 2)
+    return OtherColours((share * through).astype(np.float32), deviation.astype(np.float32), own)
 
 
-def in_three_colours(known: Calibration, shares: Array, spread: Array) -> Calibration:
-    """Return a calibration of one colour a pixel in three: see `colour_shares`."""
-    weights = (known.psi.weights * shares).astype(np.float32)
-    deviation = np.sqrt(np.square(known.deviation * shares) + np.square(spread))
+def in_three_colours(known: Calibration, others: OtherColours) -> Calibration:
+    """Return a calibration of one colour a pixel in three."""
+    mine = known.psi.weights - others.weights.sum(axis=4, keepdims=True)
+    weights = np.where(others.own, np.maximum(mine, 0), others.weights).astype(np.float32)
+    spread = np.square(others.deviation)
+    own = np.square(known.deviation) + spread.sum(axis=4, keepdims=True)
+    deviation = np.sqrt(np.where(others.own, own, spread))
     psi = replace(known.psi, weights=weights, colour=None)
     return replace(known, psi=psi, deviation=deviation.astype(np.float32))

@@ -20,13 +20,14 @@ from calibration.choice import (
     prediction_variance,
     worst,
 )
-from calibration.colours import colour_shares, crosstalk, in_three_colours, mixing
-from calibration.combine import OUTLIER2, combined
+from calibration.colours import crosstalk, in_three_colours, mixing, other_colours
+from calibration.combine import combined
 from calibration.defects import Defects, find_defects
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings
 from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
 from calibration.levels import fit_levels
+from calibration.misfit import Misfit, measured_misfit
 from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
 from calibration.placement import Tolerances
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -45,14 +46,13 @@ LARGEST_MOVE_UM = 1.0
 class Parametric:
     """What the parametric routes know of the bench: fit and mask, with its defects if sought.
 
-    misfit: of the model at whiteboards through the pinhole, of one view's coefficients, (v, u);
-    a view that none opens has the largest of the others.
+    misfit: of the model at whiteboards through the pinhole, by view; None without any.
     """
 
     fit: Fit
     mask: ShadowMask
     defects: Defects | None = None
-    misfit: NDArray[np.float64] | None = None
+    misfit: Mapping[tuple[int, int], Misfit] | None = None
 
     @property
     def shadow(self) -> Shadow:
@@ -198,10 +198,8 @@ def calibrate(
             )
         by = mixed or parametric
         assert by is not None
-        shares, spread = colour_shares(by, plain, seen_colours, design, shot_stages(camera))
-        calibrations = {
-            name: in_three_colours(one, shares, spread) for name, one in calibrations.items()
-        }
+        others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
+        calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
     return Outcome(
         chosen.route,
         why,
@@ -245,25 +243,23 @@ def _mixed(
 def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """Return the model with its misfit, from what it leaves of every pinhole's whiteboard.
 
-    Many pixels tell few parameters, so that a board the fit has seen is as good as held out.
+    A view that none opens has the largest of the others. Many pixels tell few parameters, so that
+    a board the fit has seen is as good as held out.
     """
     shadow = one.shadow
-    views = shadow.mask.views
-    misfit = np.full(views, np.nan)
+    found: dict[tuple[int, int], Misfit] = {}
     for board in seen:
         if board.views_open.sum() != 1:
             continue
-        use = board.usable
-        residual2 = (board.reading[use] - predicted_by_shadow(shadow, board)[use]) ** 2
-        variance = board.variance[use].astype(np.float64)
-        calm = residual2 < OUTLIER2 * variance + np.median(residual2)
-        excess = float(np.mean(residual2[calm] - variance[calm]))
-        v, u = np.argwhere(board.views_open)[0]
-        misfit[v, u] = np.fmax(misfit[v, u], np.sqrt(max(excess, 0.0)))
-    if np.isnan(misfit).all():
+        predicted = predicted_by_shadow(shadow, board)
+        squares = (board.reading - predicted) ** 2
+        v, u = (int(place) for place in np.argwhere(board.views_open)[0])
+        found[v, u] = measured_misfit(squares, board.variance, predicted, board.usable)
+    if not found:
         return one
-    misfit[np.isnan(misfit)] = np.nanmax(misfit)
-    return replace(one, misfit=misfit)
+    worst_of = max(found.values(), key=lambda misfit: misfit.level)
+    every = {view: found.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
+    return replace(one, misfit=every)
 
 
 def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
@@ -320,9 +316,12 @@ def _counting_misfit(known: Calibration, one: Parametric) -> Calibration:
     """Return a model's calibration with its misfit in the deviations."""
     if one.misfit is None:
         return known
-    missed = one.misfit / (known.psi.weights.shape[4] * known.psi.binning**2)
-    squares = np.square(missed).astype(np.float32)[None, :, :, None, None, None]
-    return replace(known, deviation=np.sqrt(np.square(known.deviation) + squares))
+    deviation = np.square(known.deviation, dtype=np.float64)
+    scale = known.psi.weights.shape[4] * known.psi.binning**2
+    for shot, v, u, stored in np.ndindex(deviation.shape[:3] + deviation.shape[4:5]):
+        plane = known.psi.weights[shot, v, u, :, stored].astype(np.float64) * scale
+        deviation[shot, v, u, :, stored] += one.misfit[v, u].variance(plane) / scale**2
+    return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
 def _white(boards: BoardSet, design: ImagingMatrix, shot: int) -> NDArray[np.float32]:
