@@ -10,7 +10,8 @@ import yaml
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
-from emmc_rig.calibrate.checks.command import run_checks
+from emmc_rig.calibrate.checks.command import CHECKS, run_checks
+from emmc_rig.calibrate.checks.rows import judged
 from emmc_rig.calibrate.checks.scenes import moved_truth
 from emmc_rig.calibrate.drift import run_drift
 from emmc_rig.calibrate.report import write_calibration_report
@@ -78,7 +79,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     run, camera_file, tmp_path
 ):
     frames = []
-    for target in ("0.005", "0.0015"):
+    for target in ("0.005", "0.0025"):
         out = tmp_path / target
         code, said, _ = run(
             "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
@@ -115,15 +116,31 @@ def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
     assert not out.exists()
 
 
-def test_a_missed_target_of_a_check_is_exit_code_1(run, tmp_path):
-    out = tmp_path / "check"
-    arguments = ["--check", "psi", "--camera", "sensor-side-binary", "--size", "24x32"]
-    code, said, error = run("calibrate", *arguments, "--rays", "16", "--out", out)
-    rows = json.loads((out / "metrics.json").read_text())["rows"]
-    assert any(row["verdict"] == "missed" for row in rows)
+def test_a_missed_target_of_a_check_is_exit_code_1(run, monkeypatch, tmp_path):
+    rows = [judged("reached", 1.0, 2.0, ".1f"), judged("not reached", 3.0, 2.0, ".1f")]
+    monkeypatch.setitem(CHECKS, "psi", lambda settings: (rows, {}))
+    code, said, error = run("calibrate", "--check", "psi", "--out", tmp_path / "check")
     assert code == 1
-    assert "missed:" in " ".join(error.split())
-    assert "measured" in said
+    assert "1 of 2 missed: not reached" in " ".join(error.split())
+    assert "reached" in said
+    assert json.loads((tmp_path / "check" / "metrics.json").read_text())["rows"]
+
+
+@pytest.mark.parametrize("effect", ["shipped", "together"])
+def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_the_bench(
+    run, camera_file, tmp_path, effect
+):
+    out = tmp_path / "check"
+    arguments = ["--camera", camera_file, "--size", "48x64", "--rays", "256", "--out", out]
+    code, said, error = run("calibrate", "--check", effect, *arguments)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert code == 0, (said, error)
+    assert {row["verdict"] for row in metrics["rows"]} == {"met"}
+    if effect == "together":
+        found = " ".join(metrics["details"][effect]["findings"])
+        for named in ("tilted", "bowed", "glass", "lamp drifted", "response loses", "uneven",
+                      "colour filters"):  # fmt: skip
+            assert named in found
 
 
 def test_the_stage_is_mapped_and_shown(camera_file, tmp_path):

@@ -586,7 +586,10 @@ def calibrate_session(
 
 
 def _save(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
-    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
+    best = outcome.mixed or outcome.parametric
+    known = {"parametric": outcome.parametric, "mixed": outcome.mixed, "combined": best}.get(
+        outcome.chosen
+    )
     chosen.psi.save(folder / PSI)
     save_calibration(folder / CALIBRATION, chosen, known)
 
