@@ -105,7 +105,7 @@ def calibrate(
 
     few: whiteboards for the parametric routes. pinholes: for the free one, every view of every
     shot. held_out: whiteboards through the open aperture under a white lamp that no route sees;
-    the first at the position of shot 0, which the free route can predict. turned: an open
+    one at the position of shot 0, which the free route can predict. turned: an open
     whiteboard at that position and its references, by the degrees that the board was turned.
     Raises CalibrationError for whatever makes the whiteboards unfit.
     """
@@ -159,7 +159,14 @@ def calibrate(
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes.pinholes(), design), good=good)
         calibrations["free"] = free
-        judged["free"] = _judged_measured("free", free, judges[0], design.binning)
+        stage_um = shot_stages(camera)[0]
+        still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
+        if not still:
+            raise CalibrationError(
+                "the free route is judged by an open whiteboard where the mask stands in the "
+                "first shot: hold one out there"
+            )
+        judged["free"] = _judged_measured("free", free, still[0], design.binning)
         frames["free"] = pinholes.exposures
         best = mixed or parametric
         if "combined" in routes and best is not None and few is not None:
@@ -168,24 +175,17 @@ def calibrate(
             if np.isfinite(model.deviation).all():
                 both = combined(free, model, good)
                 calibrations["combined"] = both
-                judged["combined"] = _judged_measured("combined", both, judges[0], design.binning)
+                judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
                 frames["combined"] = few.exposures
     chosen, why = choose([judged[name] for name in judged if name in routes])
-    known = calibrations[chosen.route]
     if chosen.chi2 > AT_THE_NOISE:
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
-        calibrations[chosen.route] = known = _less_sure(known, missed)
+        calibrations[chosen.route] = _less_sure(calibrations[chosen.route], missed)
         advice.append(
             f"a whiteboard differs from the chosen Psi by {chosen.relative_error:.2%} of its "
             f"level, {chosen.chi2:.1f} times the noise's variance; what is worst: "
             f"{_worst_groups(chosen)}; look at its residual map"
         )
-    if turned:
-        boards = {turn: as_readings(one, design.layout, good)[0] for turn, one in turned.items()}
-        board = board_over_angle(known.psi, boards)
-        findings += angle_findings(board)
-        if board.uneven:
-            calibrations = {name: without(board, one) for name, one in calibrations.items()}
     if seen_colours is not None:
         findings.append(
             f"the colour filters let {seen_colours.largest:.1%} of their neighbours' "
@@ -200,6 +200,12 @@ def calibrate(
         assert by is not None
         others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
+    if turned:
+        boards = {turn: as_readings(one, design.layout, good)[0] for turn, one in turned.items()}
+        board = board_over_angle(calibrations[chosen.route].psi, boards)
+        findings += angle_findings(board)
+        if board.uneven:
+            calibrations = {name: without(board, one) for name, one in calibrations.items()}
     return Outcome(
         chosen.route,
         why,

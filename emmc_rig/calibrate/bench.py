@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards import BoardFrame, BoardSet, channels_of
-from calibration.frames import MeanFrame, average
+from calibration.frames import MeanFrame, average, before_and_after
 from calibration.levels import Check, check_of
 from calibration.sensor import Pair
 from calibration.whiteboard import LAMP_COLOURS
@@ -32,7 +32,8 @@ from simulators.flaws import (
 )
 
 Array = NDArray[np.floating]
-DARK_REPEATS = 4
+DARK_REPEATS = 2
+"""Before all whiteboards, and after them."""
 REFERENCE_REPEATS = 4
 CHECK_EVERY = 5
 """Whiteboards between two looks at the same one, which tell what the lamp does."""
@@ -192,7 +193,8 @@ class WhiteboardBench:
         noise = self.camera.sensor.noise
         began_s = self.seconds
         frames = (self._exposed(setting, exposure_s, masks_in) for _ in range(count))
-        mean = average(frames, exposure_s, noise.white_level_dn, what)
+        lit = setting.lamp != "off"
+        mean = average(frames, exposure_s, noise.white_level_dn, what, lit=lit)
         return replace(mean, taken_s=(began_s + self.seconds) / 2)
 
     def _exposed(self, setting: Setting, exposure_s: float, masks_in: bool) -> NDArray[np.uint16]:
@@ -246,7 +248,8 @@ class WhiteboardBench:
             frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
         seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
         seen_again("without masks", self._frames(plain, board_s, False, 2, "reference"))
-        return BoardSet(tuple(darks.values()), references, tuple(frames), tuple(checks))
+        both = tuple(before_and_after(dark, self._dark(t)) for t, dark in darks.items())
+        return BoardSet(both, references, tuple(frames), tuple(checks))
 
     def _references(
         self, settings: Sequence[Setting], board_s: float, on_frame: Callable[[str], None]

@@ -154,7 +154,8 @@ def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
     if first is None:
         raise AppError(f"{session.folder}: frame {frames[0].id} was not captured yet; resume it")
     mosaics = (frame.mosaic for frame, _ in decoded(session, frames))
-    return average(mosaics, first["exposure_s"], first["white_level_dn"], frames[0].id)
+    return average(mosaics, first["exposure_s"], first["white_level_dn"], frames[0].id,
+                   lit=frames[0].kind != "dark")  # fmt: skip
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:

@@ -23,8 +23,8 @@ SENSOR = {
     "bend": 0.01,
     "crosstalk": 0.05,
     "row_noise_electrons": 3.0,
-    "dark_electrons_per_s": 200.0,
-    "warming_k": 8.0,
+    "dark_electrons_per_s": 100.0,
+    "warming_k": 1.0,
 }
 BOARD, LAMP = BoardFlaws(0.1, 0.1, 1.0), LampFlaws(0.02, 0.01)
 
