@@ -1,3 +1,103 @@
-"""The application: bench sessions, reports and the command line, over the camera model."""
+"""Compressed light-field acquisition with coded masks: camera model, rig, calibration, solvers.
 
-__version__ = "0.1.0"
+>>> import emmc_rig as emmc
+>>> camera = emmc.camera("rgbw-bayer-1shot")
+>>> scene = emmc.scene("deep-occlusions", size=(24, 32))
+>>> psi = camera.psi(scene.size)
+>>> frames = camera.expose(scene, seed=0, psi=psi)  # psi @ scene: the same without noise
+>>> result = emmc.reconstruct(psi, frames, "tv")  # by default the method "adaptive"
+>>> result.light_field.shape, result.verdict.level in ("trust", "doubt", "do not use")
+((5, 5, 24, 32, 3), True)
+
+Functions: `camera`, `scene`, `reconstruct`, `rig`, `capture`, `calibrate`, `open_frames`.
+What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
+mend are of the classes in `ERRORS`, each one line that says what to do.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from emmc_rig.version import __version__
+
+if TYPE_CHECKING:
+    from emmc_rig.calibrate.session import calibrate
+    from emmc_rig.capture.command import capture
+    from emmc_rig.errors import ERRORS
+    from emmc_rig.files.cameras import find_camera as camera
+    from emmc_rig.files.scenes import Scene
+    from emmc_rig.files.scenes import open_scene as scene
+    from emmc_rig.model.camera import Camera
+    from emmc_rig.model.frames import Frames
+    from emmc_rig.model.sensing import ImagingMatrix as Psi
+    from emmc_rig.reconstruct.inputs import open_frames
+    from emmc_rig.reconstruct.result import Result
+    from emmc_rig.reconstruct.solve import reconstruct
+    from emmc_rig.rig.rig_config import rig
+    from emmc_rig.session.session import Session
+
+_HOME = {
+    "calibrate": "emmc_rig.calibrate.session:calibrate",
+    "camera": "emmc_rig.files.cameras:find_camera",
+    "capture": "emmc_rig.capture.command:capture",
+    "rig": "emmc_rig.rig.rig_config:rig",
+    "scene": "emmc_rig.files.scenes:open_scene",
+    "open_frames": "emmc_rig.reconstruct.inputs:open_frames",
+    "reconstruct": "emmc_rig.reconstruct.solve:reconstruct",
+    "Camera": "emmc_rig.model.camera:Camera",
+    "ERRORS": "emmc_rig.errors:ERRORS",
+    "Frames": "emmc_rig.model.frames:Frames",
+    "Psi": "emmc_rig.model.sensing:ImagingMatrix",
+    "Result": "emmc_rig.reconstruct.result:Result",
+    "Scene": "emmc_rig.files.scenes:Scene",
+    "Session": "emmc_rig.session.session:Session",
+}
+"""Where each public name is defined; it is imported when it is first used."""
+
+__all__ = [
+    "ERRORS",
+    "Camera",
+    "Frames",
+    "Psi",
+    "Result",
+    "Scene",
+    "Session",
+    "__version__",
+    "calibrate",
+    "camera",
+    "capture",
+    "open_frames",
+    "reconstruct",
+    "rig",
+    "scene",
+]
+
+
+class _PublicModule(ModuleType):
+    """The package as a module in which a public name is never its folder of the same name.
+
+    Importing `emmc_rig.capture.plan` would bind `emmc_rig.capture` to the folder.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _HOME[name].partition(":")
+    value = getattr(import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+sys.modules[__name__].__class__ = _PublicModule

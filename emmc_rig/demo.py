@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,9 @@ from calibration.whiteboard import (
     measure_psi,
 )
 from emmc_rig.capture.direct import capture_shots, capture_whiteboards, whiteboard_exposures
-from emmc_rig.hardware import simulated_rig
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
+from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import (
     export_pictures,
@@ -32,10 +33,9 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, save_frames, versions, write_metrics
-from emmc_rig.reconstruct import open_dictionary
-from emmc_rig.report import ReportContent, write_report
-from emmc_rig.scene import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.pages.report import ReportContent, write_report
+from emmc_rig.progress import Silent, Watcher
+from emmc_rig.rig.hardware import simulated_rig
 from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.rules import Verdict
@@ -44,33 +44,11 @@ from reconstruction.verdict.run import reconstruct_judged
 Array = NDArray[np.floating]
 
 
-class Watcher(Protocol):
-    """Whoever shows the progress of a long run."""
-
-    def begin(self, stage: str, steps: int | None) -> None:
-        """A stage begins; steps is None where it is not known how many there will be."""
-        ...
-
-    def step(self, detail: str) -> None:
-        """One step of the current stage is done."""
-        ...
-
-
-class Silent:
-    """A watcher that shows nothing."""
-
-    def begin(self, stage: str, steps: int | None) -> None:
-        """Ignore it."""
-
-    def step(self, detail: str) -> None:
-        """Ignore it."""
-
-
 @dataclass(frozen=True)
 class DemoSettings:
     """What to run: scene and camera with their names, size (rows, columns) or None, seed.
 
-    method: see `reconstruction.methods`; dictionary: see `emmc_rig.reconstruct.open_dictionary`.
+    method: see `reconstruction.methods`; dictionary: see `emmc_rig.files.dictionaries`.
     """
 
     scene: str

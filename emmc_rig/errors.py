@@ -1,5 +1,24 @@
-"""Errors of the application: each message says what is wrong and what to do, in one line."""
+"""Errors that a user can mend: one line each, what is wrong and what to do."""
+
+from __future__ import annotations
+
+from calibration.errors import CalibrationError
+from drivers.errors import DriverError
+from emmc_rig.model.errors import ModelError
+from reconstruction.errors import ReconstructionError
 
 
 class AppError(Exception):
     """Root of the application's errors; shown to the user as one line."""
+
+
+class WrongUsageError(AppError):
+    """An option's value that cannot be read: the command was typed wrongly."""
+
+
+class StoppedError(AppError):
+    """Somebody stopped the program; the message says what is kept and how to go on."""
+
+
+ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
+"""The roots of each package's errors: `except emmc_rig.ERRORS` catches what the user can mend."""

@@ -1,76 +1,27 @@
-"""How far a long command is: progress bars on a terminal, plain lines elsewhere."""
+"""Who watches a long run: its stages and steps, shown by whoever cares, or by nobody."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
-
-if TYPE_CHECKING:
-    from reconstruction.result import Progress as SolverProgress
-
-console = Console(stderr=True)
+from typing import Protocol
 
 
-class Bars:
-    """A `Watcher` that draws progress bars on a terminal, and plain lines elsewhere."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._task: TaskID | None = None
+class Watcher(Protocol):
+    """Whoever shows the progress of a long run."""
 
     def begin(self, stage: str, steps: int | None) -> None:
-        """Finish the stage before and start a bar."""
-        self.finish()
-        self._task = self._progress.add_task(stage, total=steps, detail="")
-        if not console.is_terminal:
-            console.print(stage)
+        """A stage begins; steps is None where it is not known how many there will be."""
+        ...
 
     def step(self, detail: str) -> None:
-        """Advance the current bar."""
-        if self._task is not None:
-            self._progress.update(self._task, advance=1, detail=detail)
-
-    def advance(self, progress: SolverProgress) -> None:
-        """Show how far a solver is."""
-        if self._task is not None:
-            change = progress.relative_change
-            detail = "" if change is None else f"change {change:.1e}"
-            self._progress.update(
-                self._task, completed=progress.step, total=progress.total, detail=detail
-            )
-
-    def finish(self) -> None:
-        """Fill the current bar: a solver may stop before its last step."""
-        if self._task is not None:
-            done = self._progress.tasks[-1].completed or 1
-            self._progress.update(self._task, total=done, completed=done, detail="")
+        """One step of the current stage is done."""
+        ...
 
 
-@contextmanager
-def shown_bars() -> Iterator[Bars]:
-    """Yield bars, drawn until the block ends; the last one is filled if it ends well."""
-    with Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("[dim]{task.fields[detail]}"),
-        console=console,
-        disable=not console.is_terminal,
-    ) as progress:
-        bars = Bars(progress)
-        yield bars
-        bars.finish()
+class Silent:
+    """A watcher that shows nothing."""
+
+    def begin(self, stage: str, steps: int | None) -> None:
+        """Ignore it."""
+
+    def step(self, detail: str) -> None:
+        """Ignore it."""

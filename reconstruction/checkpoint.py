@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import h5py
-import numpy as np
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.reading import stored_arrays
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import Iteration, LearningState
 from reconstruction.online import OnlineState
@@ -48,31 +48,21 @@ def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) ->
     """
     if not path.is_file():
         raise DictionaryError(f"{path}: no checkpoint to resume from; train without --resume")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise DictionaryError(f"{path}: not a checkpoint of a training by this program")
-            found = json.loads(_text(file, "purpose"))
-            history = tuple(Iteration(**done) for done in json.loads(_text(file, "history")))
-            wanted = json.loads(json.dumps(purpose))
-            differing = [k for k in wanted if found.get(k) != wanted[k]]
-            if differing:
-                told = ", ".join(f"{k} {found.get(k)} (now {wanted[k]})" for k in differing)
-                raise DictionaryError(
-                    f"{path}: of a training with {told}: resume with the same, or delete it"
-                )
-            names = [field.name for field in fields(kind) if field.name != "history"]
-            arrays = {name: np.asarray(file[name]) for name in names}
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as fault:
-        raise DictionaryError(
-            f"{path}: damaged or cut short ({_one_line(fault)}); delete it and train anew"
-        ) from fault
+    with stored_arrays(path, DictionaryError, "delete it and train anew") as stored:
+        if stored.attributes.get("format") != FORMAT:
+            raise DictionaryError(f"{path}: not a checkpoint of a training by this program")
+        found = json.loads(stored.text("purpose"))
+        history = tuple(Iteration(**done) for done in json.loads(stored.text("history")))
+        wanted = json.loads(json.dumps(purpose))
+        differing = [k for k in wanted if found.get(k) != wanted[k]]
+        if differing:
+            shown = ", ".join(f"{k} {found.get(k)} (now {wanted[k]})" for k in differing)
+            raise DictionaryError(
+                f"{path}: of a training with {shown}: resume with the same, or delete it"
+            )
+        names = [field.name for field in fields(kind) if field.name != "history"]
+        arrays = {name: stored.array(name) for name in names}
     return kind(**arrays, history=history)
-
-
-def _text(file: h5py.File, name: str) -> str:
-    value = np.asarray(file[name]).item()
-    return value.decode("utf-8")
 
 
 def _one_line(fault: Exception) -> str:

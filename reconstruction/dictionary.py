@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.reading import stored_arrays
 from reconstruction.errors import DictionaryError
 
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
@@ -133,22 +134,15 @@ class Dictionary:
         Raises DictionaryError: no such file, not HDF5, cut short or damaged, or no dictionary.
         """
         path = Path(path)
-        if not path.is_file():
-            raise DictionaryError(f"{path}: no such file; `emmc-rig train` makes a dictionary")
-        try:
-            with h5py.File(path, "r") as file:
-                found = file.attrs.get("format")
-                if found != FORMAT:
-                    raise DictionaryError(
-                        f"{path}: not a dictionary of this program (format {found!r}, "
-                        f"needs {FORMAT!r}); `emmc-rig train` makes one"
-                    )
-                atoms, kind = np.asarray(file["atoms"]), str(file.attrs["kind"])
-                provenance = np.asarray(file["provenance"]).item().decode("utf-8")
-        except (OSError, RuntimeError, KeyError, AttributeError, ValueError) as fault:
-            raise DictionaryError(
-                f"{path}: damaged or cut short ({_one_line(fault)}); copy it again or train anew"
-            ) from fault
+        with stored_arrays(path, DictionaryError, "`emmc-rig train` makes a dictionary") as stored:
+            format_ = stored.attributes.get("format")
+            if format_ != FORMAT:
+                raise DictionaryError(
+                    f"{path}: not a dictionary of this program (format {format_!r}, "
+                    f"needs {FORMAT!r}); `emmc-rig train` makes one"
+                )
+            atoms, kind = stored.array("atoms"), str(stored.attributes["kind"])
+            provenance = stored.text("provenance")
         try:
             return cls(atoms, kind, provenance)
         except DictionaryError as fault:

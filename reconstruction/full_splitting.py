@@ -28,7 +28,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
 from reconstruction.problem import Problem, colour_metric
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 METHOD = "full-splitting"
@@ -147,7 +147,7 @@ def reconstruct_full_splitting(
     return Reconstruction(
         method=METHOD,
         light_field=np.clip(light_field, 0, 1).astype(np.float32),
-        status="converged" if converged else "step limit reached",
+        status=Status.CONVERGED if converged else Status.STEP_LIMIT,
         advice="" if converged else "raise max_steps or loosen rtol",
         steps=step,
         objective=tuple(history),

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Status(StrEnum):
+    """How a reconstruction ended; its advice says what to do about all but the first."""
+
+    CONVERGED = "converged"
+    STEP_LIMIT = "step limit reached"
+    INCOMPLETE = "incomplete"
+    DOUBTFUL = "doubtful"
+    IN_TILES = "in tiles"
 
 
 @dataclass(frozen=True)
@@ -24,7 +35,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when `status` is converged.
+    """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when converged.
 
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
     it found, by name: `disparity` (y, x) in pixels per view step, ... left_out: what of the model
@@ -34,7 +45,7 @@ class Reconstruction:
 
     method: str
     light_field: NDArray[np.float32]
-    status: str
+    status: Status
     advice: str
     steps: int
     objective: tuple[tuple[int, float], ...]

@@ -41,7 +41,7 @@ from reconstruction.patches import (
     sense_patches,
     window,
 )
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 FLAT = 1e-3
@@ -307,7 +307,7 @@ def reconstruct_sparse(
     return Reconstruction(
         method=f"dict-{settings.solver.method}",
         light_field=np.clip(found.light_field, 0, 1),
-        status="converged" if found.converged == 1 and not found.empty else "incomplete",
+        status=Status.CONVERGED if found.converged == 1 and not found.empty else Status.INCOMPLETE,
         advice="; ".join(advice),
         steps=round(found.passes),
         objective=(),

@@ -10,21 +10,23 @@ lies further than the overlap hardly matters, see OVERLAP.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import lcm
 from pathlib import Path
 from typing import Any, Protocol
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.errors import SensingError
+from emmc_rig.model.reading import StoredArrays, stored_arrays
 from emmc_rig.model.sensing import FORMAT, ImagingMatrix
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, patched_weights, reconstruct
+from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.methods.tv_dict import patched_weights
 from reconstruction.result import Reconstruction
 
 OVERLAP = 48
@@ -65,31 +67,25 @@ class SavedPsi:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with self._opened() as file:
-            weights = file["weights"]
-            assert isinstance(weights, h5py.Dataset)
+        with self._opened() as stored:
+            weights = stored.dataset("weights")
             self.size = weights.shape[3], weights.shape[5]
-            self.binning = int(np.asarray(file.attrs["binning"]))
-            self.checksum = str(file.attrs["sha256"])
+            self.binning = int(np.asarray(stored.attributes["binning"]))
+            self.checksum = str(stored.attributes["sha256"])
 
-    def _opened(self) -> h5py.File:
-        try:
-            file = h5py.File(self._path, "r")
-        except OSError as fault:
-            why = " ".join(str(fault).split())
-            raise SensingError(f"{self._path}: cannot be read ({why})") from fault
-        if file.attrs.get("format") != FORMAT or "weights" not in file:
-            file.close()
-            raise SensingError(f"{self._path}: not an imaging matrix of this program")
-        return file
+    @contextmanager
+    def _opened(self) -> Iterator[StoredArrays]:
+        with stored_arrays(self._path, SensingError, "measure Psi again") as stored:
+            if stored.attributes.get("format") != FORMAT or "weights" not in stored:
+                raise SensingError(f"{self._path}: not an imaging matrix of this program")
+            yield stored
 
     def window(self, rows: slice, columns: slice) -> ImagingMatrix:
         """Return the imaging matrix of some samples; the slices are multiples of k."""
-        with self._opened() as file:
-            weights: Any = file["weights"]
-            colour: Any = file.get("colour")
+        with self._opened() as stored:
+            colour = stored.dataset("colour") if "colour" in stored else None
             return ImagingMatrix(
-                weights[:, :, :, rows, :, columns],
+                stored.dataset("weights")[:, :, :, rows, :, columns],
                 None if colour is None else colour[:, rows, columns],
                 self.binning,
             )

@@ -46,7 +46,7 @@ from reconstruction.differences import stencils
 from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
 from reconstruction.problem import Problem, colour_metric
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 
@@ -144,7 +144,7 @@ def reconstruct_tv(
     return Reconstruction(
         method=method_name(settings.order, patch_term is not None),
         light_field=np.clip(result, 0, 1, out=result),
-        status="converged" if converged else "step limit reached",
+        status=Status.CONVERGED if converged else Status.STEP_LIMIT,
         advice="" if converged else "raise max_steps or loosen rtol",
         steps=step,
         objective=tuple(history),

@@ -18,7 +18,8 @@ from emmc_rig.capture import writer
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
-from emmc_rig.session import journal, session, storage
+from emmc_rig.session import journal, lock, session, storage
+from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
 
 PLAN = """
@@ -28,7 +29,7 @@ whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
 darks: null
 settle_s: 0.1
 """
-WATCHED = frozenset(module.__file__ for module in (storage, journal, session, writer))
+WATCHED = frozenset(module.__file__ for module in (storage, journal, lock, session, writer))
 
 
 class Countdown(Unwatched):
@@ -77,11 +78,12 @@ class Lines(Countdown):
 def capture_into(folder, watcher=None):
     """Begin a session in a folder, or go on with the one there, as a new program would."""
     rig = still_rig()
-    try:
-        opened, plan = Session(folder / "s"), plan_and_camera(PLAN)[0]
-    except AppError:
-        opened, plan = begun(folder, storage.SYSTEM_DISK, rig, PLAN)
-    Sequencer(opened, plan, rig, watcher).run()
+    with held(folder / "s"):
+        try:
+            opened, plan = Session(folder / "s"), plan_and_camera(PLAN)[0]
+        except AppError:
+            opened, plan = begun(folder, storage.SYSTEM_DISK, rig, PLAN)
+        Sequencer(opened, plan, rig, watcher).run()
     return opened
 
 

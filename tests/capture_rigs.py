@@ -13,7 +13,7 @@ import yaml
 from drivers.camera import CameraIdentity, RawFileCamera
 from emmc_rig.capture.command import Wish, new_session, planned_frames
 from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.hardware import Rig
+from emmc_rig.rig.hardware import Rig
 from simulators.clock import ManualClock
 from simulators.dng import encode_dng
 from simulators.still import StillStage

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix

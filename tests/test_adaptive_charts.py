@@ -2,22 +2,22 @@
 
 import pytest
 
-from emmc_rig import ablation, next_shot
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.capture.plan import planned_camera
 from emmc_rig.capture.until import refuse_without_choice
-from emmc_rig.journal import open_folder
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.session.session import Session
+from emmc_rig.study import ablation, next_shot
+from emmc_rig.study.points import open_folder
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
 
-def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(tmp_path, monkeypatch):
+def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch):
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
     camera = find_camera(CAMERA)
-    rows = list(ablation.ablations("deep-occlusions", CAMERA, camera, SIZE, 0, tmp_path))
+    rows = list(ablation.ablations("deep-occlusions", camera, SIZE, 0))
     assert [row.name for row in rows] == [
         "adaptive",
         "without sharpening",

@@ -10,11 +10,7 @@ import yaml
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
-from emmc_rig.calibrate.checks.command import CHECKS, run_checks
-from emmc_rig.calibrate.checks.rows import judged
-from emmc_rig.calibrate.checks.scenes import moved_truth
 from emmc_rig.calibrate.drift import run_drift
-from emmc_rig.calibrate.report import write_calibration_report
 from emmc_rig.calibrate.run import (
     CalibrateSettings,
     in_three_colours,
@@ -22,11 +18,15 @@ from emmc_rig.calibrate.run import (
     run_calibration,
     true_error,
 )
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.results import save_frames
+from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import save_frames
-from emmc_rig.scene import fine_scene
+from emmc_rig.pages.calibration_page import write_calibration_report
+from emmc_rig.study.checks.command import CHECKS, run_checks
+from emmc_rig.study.checks.rows import judged
+from emmc_rig.study.checks.scenes import moved_truth
 
 SIZE = ["--size", "32x40", "--rays", "64"]
 

@@ -14,12 +14,13 @@ from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
-from emmc_rig import camera_commands, hardware
-from emmc_rig.benchmarks.ptp import picture_timing
-from emmc_rig.camera_commands import register, save_frame
+from emmc_rig.commands import device_cameras
+from emmc_rig.commands.device_cameras import register, save_frame
 from emmc_rig.errors import AppError
-from emmc_rig.frame_view import frame_figures, histogram, histogram_text, preview
-from emmc_rig.hardware import open_camera, scene_simulator
+from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text, preview
+from emmc_rig.rig import hardware
+from emmc_rig.rig.hardware import open_camera, scene_simulator
+from emmc_rig.study.benchmarks.ptp import picture_timing
 from simulators.clock import ManualClock
 from simulators.dng import encode_dng
 from simulators.ptp import PtpUsbFunction
@@ -38,7 +39,7 @@ def run(monkeypatch, tmp_path):
     clock = ManualClock()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        camera_commands, "open_camera", lambda spec: open_camera(spec, clock, SimulatedUsb(clock))
+        device_cameras, "open_camera", lambda spec: open_camera(spec, clock, SimulatedUsb(clock))
     )
     app = typer.Typer()
     register(app)
@@ -141,7 +142,7 @@ def test_ctrl_c_in_a_download_leaves_no_file_and_frees_the_camera(tmp_path, monk
         raise KeyboardInterrupt
 
     camera.on_progress = interrupt
-    monkeypatch.setattr(camera_commands, "open_camera", lambda spec: camera)
+    monkeypatch.setattr(device_cameras, "open_camera", lambda spec: camera)
     app = typer.Typer()
     register(app)
     done = CliRunner().invoke(app, ["snap", "--out", str(tmp_path / "frames")])

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import camera_figures, camera_rows, draw_camera, find_camera
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
+from emmc_rig.pages.camera_sheet import camera_figures, camera_rows, draw_camera
 
 
 def camera(**settings: object) -> Camera:

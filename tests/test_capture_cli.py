@@ -17,7 +17,8 @@ import yaml
 from programs import program
 
 from emmc_rig.session.listing import sessions_in
-from emmc_rig.session.session import Session, only_program
+from emmc_rig.session.lock import held
+from emmc_rig.session.session import Session
 from emmc_rig.session.storage import part_of
 
 RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
@@ -184,7 +185,7 @@ def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
 
 
 def test_the_psi_of_a_session_is_that_of_the_demo_s_road(captured):
-    from emmc_rig.camera_sheet import find_camera
+    from emmc_rig.files.cameras import find_camera
     from emmc_rig.model.camera import build_imaging_matrix
     from emmc_rig.session.readings import session_readings
 
@@ -257,15 +258,38 @@ def test_a_misspelt_key_in_a_plan_names_the_nearest(run, tmp_path):
     assert "did you mean 'retries'" in one_line(err)
 
 
-def test_an_edited_plan_does_not_go_on_with_the_session(captured, run, tmp_path):
-    session = captured / "plan-session"
-    plan_file(tmp_path, settle_s=0.25)
-    code, _, err = run("capture", "plan.yaml", *RIG, "--out", session)
-    assert code == 1
-    assert "settle_s is 0.25, not 0.0" in one_line(err)
+def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    taken = {path.name: path.read_bytes() for path in (copy / "frames").iterdir()}
+    shots = [{"exposure_s": [0.02, 0.06]}, {"exposure_s": 0.03, "repeats": 3}]
+    plan_file(tmp_path, shots=shots, settle_s=0.25)
+    code, out, err = run("capture", "plan.yaml", "--out", copy)
+    assert code == 0, err
+    assert "62 frames taken stay, 3 of them exposed as before" in err
+    assert "1 taken in" in out
+    now = {path.name: path.read_bytes() for path in (copy / "frames").iterdir()}
+    assert len(now) == 63
+    assert {name: now[name] for name in taken} == taken
+    session = Session(copy)
+    assert session.stored["shot-1-e0-r2"]["exposure_s"] == 0.03
+    assert session.stored["shot-1-e0-r2"]["plan"] == 1
+    code, out, _ = run("session", "show", copy)
+    assert "plan 0       62 frames, by plan.yaml" in out
+    assert "plan 1       1 frames, by amended-1-plan.yaml" in out
+    assert "settle_s is 0.25, not 0.0" in out
+    assert run("session", "list", copy)[1].count("63/63") == 1
+    assert run("session", "verify", copy)[0] == 0
+    assert run("session", "export", copy, "--out", "x.h5")[0] == 0
+    with h5py.File("x.h5") as file:
+        assert np.sum(file["entry/data/plan"][:]) == 1
+    assert run("capture", copy)[1].count("0 taken in") == 1
+
+
+def test_another_scene_does_not_go_on_with_the_session(captured, run, tmp_path):
     other_scene = ["--rig", "simulated", "--scene", "dark", "--size", "24x32"]
     plan_file(tmp_path)
-    code, _, err = run("capture", "plan.yaml", *other_scene, "--out", session)
+    code, _, err = run("capture", "plan.yaml", *other_scene, "--out", captured / "plan-session")
     assert code == 1
     assert "another rig" in one_line(err)
 
@@ -283,11 +307,12 @@ def test_a_plan_edited_inside_the_session_is_told(captured, run, tmp_path):
 
 
 def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
-    session = Session(captured / "plan-session")
-    with only_program(session):
+    with held(captured / "plan-session"):
         code, _, err = run("capture", captured / "plan-session")
-    assert code == 1
-    assert "another program" in one_line(err)
+        assert code == 1
+        assert f"(process {os.getpid()} on " in one_line(err)
+        assert run("session", "prune", captured / "plan-session")[0] == 1
+        assert run("session", "show", captured / "plan-session")[0] == 0
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write anywhere")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from capture_kills import capture_into
 
-from emmc_rig.session.session import FRAMES, Session
+from emmc_rig.session.session import FRAMES, LOCK, Session
 from emmc_rig.session.verify import verify
 
 RANDOM_LINES = 220
@@ -69,6 +69,9 @@ def assert_made_whole(folder, expected):
     assert verdict.is_complete
     assert not verdict.leftovers
     assert opened.is_complete
+    assert not [
+        path for path in folder.rglob("*") if path.name.startswith(".") or path.name == LOCK
+    ]
     assert len(opened.stored) == len(expected)
 
 

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.capture.estimate import estimate
 from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
     Plan,
-    first_difference,
+    differences,
     load_plan,
     plan_schema,
     planned_camera,
@@ -22,8 +21,9 @@ from emmc_rig.capture.plan import (
     schema_text,
 )
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.results import shown_bytes, shown_seconds
 from emmc_rig.model.camera import shipped_cameras
-from emmc_rig.output import shown_bytes, shown_seconds
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 WINDOW_UM = 40_000.0
@@ -228,6 +228,6 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
 
 def test_what_differs_between_two_plans_is_named():
     one, other = plan_of(), plan_of(settle_s=0.5)
-    assert first_difference(one, one) == ""
-    assert first_difference(other, one) == "settle_s is 0.5, not 0.0"
-    assert "shots has 3 entries, not 1" in first_difference(one, plan_of(shots=[{}]))
+    assert differences(one, one) == []
+    assert differences(other, one) == ["settle_s is 0.5, not 0.0"]
+    assert differences(one, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"

@@ -7,18 +7,19 @@ import sys
 import numpy as np
 import pytest
 
-from emmc_rig.benchmarks.memory import peak_memory_mib
-from emmc_rig.chart import recommend
-from emmc_rig.chart.captures import Capture, kept_capture, read_frames, read_truth
-from emmc_rig.chart.front import POOLED, Mark, charts, pareto_front
-from emmc_rig.chart.lock import timing_lock
-from emmc_rig.chart.peers import PEERS, Given
-from emmc_rig.chart.plan import ChartSettings, Configuration, Point, charted_points, sweeps
-from emmc_rig.chart.recommend import Problem, Row, advised, parse_budget, parse_wanted, read_rows
-from emmc_rig.chart.scaling import growths
-from emmc_rig.chart.scores import angular_snr_db, scored, swept_disparity
+from emmc_rig.advice import recommend
+from emmc_rig.advice.recommend import Problem, Row, advised, parse_budget, parse_wanted, read_rows
 from emmc_rig.errors import AppError
+from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.lightfield import replicate_centre
+from emmc_rig.study.chart.advice_rows import advice_rows
+from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
+from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
+from emmc_rig.study.chart.lock import timing_lock
+from emmc_rig.study.chart.peers import PEERS, Given
+from emmc_rig.study.chart.plan import ChartSettings, Configuration, Point, charted_points, sweeps
+from emmc_rig.study.chart.scaling import growths
+from emmc_rig.study.chart.scores import angular_snr_db, scored, swept_disparity
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from simulators.scenes import render
@@ -169,7 +170,7 @@ def test_a_child_keeps_the_lock_when_its_parent_is_gone(tmp_path):
 
 def test_the_peak_of_memory_is_not_the_parents():
     held = np.ones(200 * 2**17)
-    code = "from emmc_rig.benchmarks.memory import peak_memory_mib; print(peak_memory_mib())"
+    code = "from emmc_rig.files.memory import peak_memory_mib; print(peak_memory_mib())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 0 < float(told.stdout) < 150 < peak_memory_mib()
     assert held.nbytes == 200 * 2**20
@@ -244,7 +245,7 @@ def test_the_work_of_a_chart_is_a_line_in_the_size_of_the_light_field():
     # A window of a tenth: 2 of the yardstick's that stay, 3 for what grows.
     whole = figures(0.5, 25.0, window_cpu_s=0.23, window_values=38_400)
     points = {Point(Capture("dark", "cam"), Configuration("tv")): whole}
-    (found,) = recommend.rows_of(points)
+    (found,) = advice_rows(points)
     assert (found.fixed, found.per_million) == (pytest.approx(2), pytest.approx(3e6 / 384_000))
     assert found.seconds(768_000, 0.2) == pytest.approx(0.2 * (2 + 6))
     assert found.gain_db == 7
@@ -280,7 +281,7 @@ def test_the_shipped_chart_knows_this_versions_methods_and_says_how_it_was_measu
     for one in rows:
         MethodSettings.model_validate(one.settings)
         assert one.per_million > 0
-    path = recommend.resources.files("emmc_rig.chart").joinpath(recommend.SHIPPED)
+    path = recommend.resources.files("emmc_rig.advice").joinpath(recommend.SHIPPED)
     assert {"Machine", "Load", "Command line"} <= set(json.loads(path.read_text())["measured"])
 
 

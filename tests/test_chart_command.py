@@ -12,23 +12,23 @@ import numpy as np
 import pytest
 from pages import Page
 
-from emmc_rig.chart import lock, measure, plan
-from emmc_rig.chart import run as chart_run
-from emmc_rig.chart.captures import Capture, kept_capture
-from emmc_rig.chart.command import chart_settings, run_chart
-from emmc_rig.chart.lock import timing_lock
-from emmc_rig.chart.measure import measured
-from emmc_rig.chart.peers import Peer
-from emmc_rig.chart.recommend import ADVICE, read_rows
-from emmc_rig.chart.reference import Reference
-from emmc_rig.chart.rows import COLUMNS
-from emmc_rig.chart.run import POINTS, ChartStopped
-from emmc_rig.chart.worker import working
-from emmc_rig.demo import Silent
+from emmc_rig.advice.recommend import ADVICE, read_rows
+from emmc_rig.advice.reference import Reference
 from emmc_rig.errors import AppError
-from emmc_rig.journal import digest_of
+from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
-from emmc_rig.output import METRICS
+from emmc_rig.progress import Silent
+from emmc_rig.study.chart import lock, measure, plan
+from emmc_rig.study.chart import run as chart_run
+from emmc_rig.study.chart.captures import Capture, kept_capture
+from emmc_rig.study.chart.command import chart_settings, run_chart
+from emmc_rig.study.chart.lock import timing_lock
+from emmc_rig.study.chart.measure import measured
+from emmc_rig.study.chart.peers import Peer
+from emmc_rig.study.chart.rows import COLUMNS
+from emmc_rig.study.chart.run import POINTS, ChartStopped
+from emmc_rig.study.chart.worker import working
+from emmc_rig.study.points import digest_of
 from simulators.scenes import render
 
 SIZE = (24, 32)

@@ -97,6 +97,13 @@ def test_kernels_are_charted_against_the_triad(run, tmp_path):
     names = [row["name"] for row in metrics["kernels"]]
     assert names == ["triad", "forward", "adjoint", "data step", "TV step"]
     assert metrics["reconstruction_peak_gib"] > 0
+    assert [start["name"] for start in metrics["starts"]] == [
+        "python",
+        "import numpy",
+        "import emmc_rig",
+        "emmc-rig --help",
+    ]
+    assert all(start["seconds"] > 0 for start in metrics["starts"])
     assert "TV step" in out
 
 

@@ -8,12 +8,12 @@ import h5py
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.demo import DemoSettings, run_demo
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import load_hdf5, psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.scene import open_scene
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings
 from reconstruction.tv import TVSettings

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.cli import app
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.stability import detector
-from emmc_rig.stability.detector import (
+from emmc_rig.study.stability import detector
+from emmc_rig.study.stability.detector import (
     ALL,
     Case,
     cases,
@@ -22,7 +22,7 @@ from emmc_rig.stability.detector import (
     told,
     wrong,
 )
-from reconstruction.result import Reconstruction
+from reconstruction.result import Reconstruction, Status
 from reconstruction.verdict.evidence import Read, gathered
 
 SMALL = (32, 40)
@@ -43,7 +43,7 @@ def evidence():
     white = np.full(psi.light_field_shape, 0.5, np.float32)
     usable = np.ones(psi.frames_shape, dtype=bool)
     read = Read(psi.forward(white), usable, ~usable, np.zeros(psi.frames_shape))
-    result = Reconstruction("tv", white, "converged", "", 1, (), 0.0, {})
+    result = Reconstruction("tv", white, Status.CONVERGED, "", 1, (), 0.0, {})
     return gathered(psi, read, 1e-4, result).as_dict()
 
 

@@ -22,8 +22,8 @@ from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import open_stage, probe_port
-from emmc_rig.stage_config import parse_stage
+from emmc_rig.rig.hardware import open_stage, probe_port
+from emmc_rig.rig.stage_config import parse_stage
 from simulators.apt import Z825, AptController
 from simulators.grbl import BENCH_AXES, GrblController
 from simulators.wire import PtyServer

@@ -30,8 +30,8 @@ from calibration.parametric import psi_at
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
+from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.scene import fine_scene
 from simulators.bench import MountingErrors
 from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR
 

@@ -20,15 +20,15 @@ from programs import exit_code
 from drivers.camera import CameraIdentity
 from drivers.errors import RawFrameError
 from drivers.raw import RawFrame
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import simulated_rig
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live import watch as watch_module
 from emmc_rig.live.alignment import grid_direction, measure
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
 from emmc_rig.live.server import application
 from emmc_rig.live.watch import Watch
-from emmc_rig.scene import fine_scene
+from emmc_rig.rig.hardware import simulated_rig
 
 BLACK, WHITE = 256, 4095
 PATIENCE_S = 20.0

@@ -8,11 +8,11 @@ import pytest
 import uvicorn
 from browsers import MARKS, open_browser
 
-from emmc_rig.camera_sheet import find_camera
-from emmc_rig.hardware import simulated_rig
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.server import application
 from emmc_rig.live.watch import Watch
-from emmc_rig.scene import fine_scene
+from emmc_rig.rig.hardware import simulated_rig
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException

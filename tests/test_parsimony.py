@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_adaptive import plane_scene, quick
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS

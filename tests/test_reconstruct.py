@@ -6,17 +6,15 @@ import h5py
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.frames import read_frames
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.reconstruct import (
-    load_settings,
-    open_dictionary,
-    read_capture,
-    run_in_tiles,
-    run_reconstruct,
-)
-from emmc_rig.simulate import simulate
+from emmc_rig.reconstruct.inputs import load_settings
+from emmc_rig.reconstruct.solve import reconstruct_folder
+from emmc_rig.reconstruct.tiles import reconstruct_folder_in_tiles
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
@@ -28,7 +26,7 @@ SCENE, CAMERA, SIZE = "deep-occlusions", "rgbw-bayer-2shots", (36, 44)
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frames")
-    simulate(SCENE, CAMERA, find_camera(CAMERA), SIZE, 0, folder)
+    simulate_into(folder, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0)
     return folder
 
 
@@ -36,7 +34,7 @@ def frames(tmp_path_factory):
 def test_frames_become_a_light_field_with_pictures_and_metrics(
     frames, tmp_path, method, dictionary
 ):
-    metrics = run_reconstruct(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
+    metrics = reconstruct_folder(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
     light_field = load_hdf5(tmp_path / "light_field.h5")
     assert light_field.shape == (5, 5, *SIZE, 3)
     assert metrics["method"] == method
@@ -46,7 +44,7 @@ def test_frames_become_a_light_field_with_pictures_and_metrics(
 
 
 def test_the_noise_level_is_that_of_the_usable_pixels(frames):
-    capture = read_capture(frames)
+    capture = read_frames(frames)
     with h5py.File(frames / "frames.h5") as file:
         deviation = np.asarray(file["deviation"])
         error = np.asarray(file["readings"]) - np.asarray(file["noise_free"])
@@ -58,17 +56,17 @@ def test_the_noise_level_is_that_of_the_usable_pixels(frames):
 
 def test_folders_that_hold_no_capture_are_refused(frames, tmp_path):
     with pytest.raises(AppError, match=r"holds no frames\.h5"):
-        run_reconstruct(tmp_path, tmp_path, "tv")
+        reconstruct_folder(tmp_path, tmp_path, "tv")
     whole = (frames / "frames.h5").read_bytes()
     (tmp_path / "frames.h5").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(AppError, match="cannot be read"):
-        read_capture(tmp_path)
+        read_frames(tmp_path)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["readings"] = np.zeros((1, 2, 2))
     (tmp_path / "frames.h5").unlink()
     (tmp_path / "other.h5").rename(tmp_path / "frames.h5")
     with pytest.raises(AppError, match="deviation"):
-        read_capture(tmp_path)
+        read_frames(tmp_path)
 
 
 def test_settings_come_from_yaml_and_a_misspelt_key_names_the_nearest(tmp_path):
@@ -99,10 +97,10 @@ def test_dictionaries_come_by_name_or_file(tmp_path):
 
 
 def test_tiles_give_the_light_field_of_the_whole(frames, tmp_path):
-    metrics = run_in_tiles(frames, tmp_path, "tv", 1000)
+    metrics = reconstruct_folder_in_tiles(frames, tmp_path, "tv", 1000)
     whole = load_hdf5(tmp_path / "light_field.h5")
     assert metrics["tiles"] == 1
-    assert run_in_tiles(frames, tmp_path, "tv", 20)["tiles"] == 6
+    assert reconstruct_folder_in_tiles(frames, tmp_path, "tv", 20)["tiles"] == 6
     np.testing.assert_allclose(load_hdf5(tmp_path / "light_field.h5"), whole, atol=1e-4)
 
 
@@ -110,19 +108,19 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
     atoms = np.random.default_rng(0).normal(size=(10, 3, 3, 9, 9, 3))
     Dictionary.normalised(atoms, "ksvd").save(tmp_path / "small.h5")
     with pytest.raises(DictionaryError, match="3x3 views"):
-        run_reconstruct(frames, tmp_path, "dict-omp", dictionary_spec=str(tmp_path / "small.h5"))
+        reconstruct_folder(frames, tmp_path, "dict-omp", dictionary_spec=str(tmp_path / "small.h5"))
 
 
 def test_a_misspelt_method_is_told_first(tmp_path):
     with pytest.raises(ReconstructionError, match="did you mean 'tv'"):
-        run_reconstruct(tmp_path, tmp_path, "tvv")
+        reconstruct_folder(tmp_path, tmp_path, "tvv")
 
 
 def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames, tmp_path):
     settings = load_settings(None).model_copy(
         update={"adaptive": AdaptiveSettings(texture=TextureSettings(steps=3, refine_steps=1))}
     )
-    metrics = run_reconstruct(frames, tmp_path, "adaptive", settings=settings, truth=SCENE)
+    metrics = reconstruct_folder(frames, tmp_path, "adaptive", settings=settings, truth=SCENE)
     assert metrics["psnr_db"] > 12
     with h5py.File(tmp_path / "maps.h5") as file:
         shapes = {name: values.shape for name, values in file.items()}

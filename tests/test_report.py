@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.report import DisplayCurve, ReportContent, render, write_report
+from emmc_rig.pages.report import DisplayCurve, ReportContent, render, write_report
 
 VIEWS, HEIGHT, WIDTH = 5, 48, 64
 

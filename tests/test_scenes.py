@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from emmc_rig.files.scenes import box_average, fine_scene, open_scene
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import centre_view, psnr_db, save_hdf5, save_views
-from emmc_rig.scene import box_average, fine_scene, open_scene
 from simulators.raycaster import Ball, Card, World
 from simulators.scenes import SCENES, Scene, render
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import FAULTS, trial
 from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.neighbour_kernels import neighbour_range

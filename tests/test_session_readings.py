@@ -12,10 +12,10 @@ from capture_rigs import begun
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import open_camera, simulated_rig
+from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
-from emmc_rig.scene import fine_scene
+from emmc_rig.rig.hardware import open_camera, simulated_rig
+from emmc_rig.rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.readings import session_readings, whiteboards
 from simulators.clock import ManualClock

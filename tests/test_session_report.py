@@ -8,16 +8,16 @@ import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
 
-from emmc_rig.benchmarks import session as session_benchmark
 from emmc_rig.capture.checks import figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.display import CaptureDisplay
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.frame_view import thinned
-from emmc_rig.session.contact_sheet import sheet
+from emmc_rig.pages.frame_view import thinned
+from emmc_rig.pages.session_sheet import sheet
+from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SYSTEM_DISK
-from emmc_rig.session.timeline import overlap, run_entries, timeline_svg
+from emmc_rig.study.benchmarks import session as session_benchmark
 from simulators.disk import SimulatedDisk
 from simulators.still import StillStage
 

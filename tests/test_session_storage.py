@@ -1,20 +1,25 @@
 """What a session keeps through power cuts, full disks and damage: everything it counted."""
 
+import copy
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import begun, frame_bytes, plan_and_camera, still_rig
+from capture_rigs import PLAN_YAML, begun, frame_bytes, plan_and_camera, still_rig
 
+from emmc_rig.capture.amend import amendment
+from emmc_rig.capture.expand import expand
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
+from emmc_rig.session.lock import held
 from emmc_rig.session.prune import prune
-from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Session, only_program
+from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
 from simulators.disk import PowerCutError, SimulatedDisk
@@ -227,7 +232,8 @@ def test_a_line_after_a_torn_one_is_read(tmp_path):
     assert again.unreadable == 1
 
 
-def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path):
+def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path, monkeypatch):
+    monkeypatch.setattr("secrets.token_hex", lambda count: "0" * 2 * count)
     outside = tmp_path / "outside"
     outside.write_bytes(b"precious")
     target = tmp_path / "frame.dng"
@@ -327,13 +333,54 @@ def test_a_folder_of_frames_that_somebody_removed_is_filled_again(on_disk, tmp_p
     assert {name: again.read(name) for name in undisturbed[1]} == undisturbed[1]
 
 
+def amended(disk):
+    """Let the second shot be taken once more, and be exposed otherwise from now on."""
+    session = Session(ROOT / "s", disk)
+    text = PLAN_YAML.replace(
+        "mask_um: [48, 24]", "mask_um: [48, 24]\n    exposure_s: 0.03\n    repeats: 2"
+    )
+    plan, camera = plan_and_camera(text)
+    rig = {"kind": "x"}
+    edit = amendment(session, plan, camera, rig, expand(plan, camera, still_rig().window_um))
+    if edit is None:
+        return session, plan
+    camera_data = camera.model_dump(mode="json")
+    return session.amend(Frozen(text, camera_data, rig, edit.frames), edit.changes), plan
+
+
+def test_a_power_cut_in_an_amendment_leaves_the_plan_before_or_the_one_after(undisturbed):
+    _, taken = undisturbed
+    rng = np.random.default_rng(3)
+    begun_disk = SimulatedDisk()
+    run_on(begun_disk)
+    whole = copy.deepcopy(begun_disk)
+    amended(whole)
+    held_by = []
+    for cut in range(begun_disk.operations + 1, whole.operations + 1):
+        disk = copy.deepcopy(begun_disk)
+        disk.cut_power_at(cut)
+        with pytest.raises(PowerCutError):
+            amended(disk)
+        survived = disk.after_power_cut(rng)
+        held_by.append(Session(ROOT / "s", survived).amendments)
+        session, plan = amended(survived)
+        assert session.amendments == 1
+        Sequencer(session, plan, still_rig()).run()
+        verdict = verify(Session(ROOT / "s", survived))
+        assert verdict.is_complete
+        assert not verdict.leftovers
+        now = frames_on(survived)
+        assert len(now) == len(taken) + 1
+        assert {name: now[name] for name in taken} == taken
+    assert held_by[0] == 0
+    assert len(held_by) == 4 * 5 + 2
+
+
 def test_two_programs_do_not_work_on_one_session(on_disk):
-    with (
-        only_program(on_disk),
-        pytest.raises(AppError, match="another program"),
-        only_program(Session(on_disk.folder)),
-    ):
+    who = rf"held by `.*` \(process {os.getpid()} on .*, since "
+    with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
         pass
+    assert not (on_disk.folder / LOCK).exists()
 
 
 def test_a_folder_that_is_no_session_is_told(tmp_path):

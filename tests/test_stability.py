@@ -8,21 +8,21 @@ import pytest
 from pages import Page
 
 from emmc_rig import cli
-from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
-from emmc_rig.output import METRICS
-from emmc_rig.page import Section
-from emmc_rig.stability import command as stability_command
-from emmc_rig.stability import draw
-from emmc_rig.stability import run as stability_run
-from emmc_rig.stability.breaking import Span, below_best, below_view, span, strength_at, told
-from emmc_rig.stability.command import BREAKS_CSV, POINTS_CSV, run_stability
-from emmc_rig.stability.curves import POOLED, curves
-from emmc_rig.stability.faults import FAULTS
-from emmc_rig.stability.plan import Point, planned, stability_settings
-from emmc_rig.stability.rows import breaking_rows
-from emmc_rig.stability.run import POINTS, StabilityStopped
+from emmc_rig.pages.page import Section
+from emmc_rig.progress import Silent
+from emmc_rig.study.stability import command as stability_command
+from emmc_rig.study.stability import draw
+from emmc_rig.study.stability import run as stability_run
+from emmc_rig.study.stability.breaking import Span, below_best, below_view, span, strength_at, told
+from emmc_rig.study.stability.command import BREAKS_CSV, POINTS_CSV, run_stability
+from emmc_rig.study.stability.curves import POOLED, curves
+from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.plan import Point, planned, stability_settings
+from emmc_rig.study.stability.rows import breaking_rows
+from emmc_rig.study.stability.run import POINTS, StabilityStopped
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from simulators.scenes import render

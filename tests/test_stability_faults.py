@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from calibration.placement import designed_placement
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import save_views
-from emmc_rig.stability.faults import FAULTS, find_fault, trial
-from emmc_rig.stability.mask_faults import misplaced_psi
-from emmc_rig.stability.shot_faults import flicker_gains
-from emmc_rig.stability.trial import NotApplicableError, Setup
+from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
+from emmc_rig.study.stability.mask_faults import misplaced_psi
+from emmc_rig.study.stability.shot_faults import flicker_gains
+from emmc_rig.study.stability.trial import NotApplicableError, Setup
 from simulators import changes
 from simulators.scenes import render
 

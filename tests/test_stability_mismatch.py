@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from calibration.drift import DriftSettings
-from emmc_rig.camera_sheet import find_camera
-from emmc_rig.stability import mismatch
-from emmc_rig.stability.faults import FAULTS, trial
-from emmc_rig.stability.mismatch import Mismatch, MismatchSettings, measure_mismatch, mended
-from emmc_rig.stability.mismatch_section import mismatch_sections, recovered_share
-from emmc_rig.stability.trial import NotApplicableError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.study.stability import mismatch
+from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.mismatch import Mismatch, MismatchSettings, measure_mismatch, mended
+from emmc_rig.study.stability.mismatch_section import mismatch_sections, recovered_share
+from emmc_rig.study.stability.trial import NotApplicableError
 
 SIZE = (48, 56)
 DRIFT = DriftSettings(blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6)

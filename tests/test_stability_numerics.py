@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emmc_rig.stability import conditions, numerics
-from emmc_rig.stability import rounding as rounding_checks
-from emmc_rig.stability.checks import (
+from emmc_rig.study.stability import conditions, numerics
+from emmc_rig.study.stability import rounding as rounding_checks
+from emmc_rig.study.stability.checks import (
     BROKEN,
     SOUND,
     WEAK,
@@ -17,10 +17,10 @@ from emmc_rig.stability.checks import (
     outcome_of,
     solved,
 )
-from emmc_rig.stability.numerics import identical, measure_numerics
-from emmc_rig.stability.numerics_section import numerics_section
-from emmc_rig.stability.reference import Reference
-from emmc_rig.stability.rounding import relative, rounding, step_sizes
+from emmc_rig.study.stability.numerics import identical, measure_numerics
+from emmc_rig.study.stability.numerics_section import numerics_section
+from emmc_rig.study.stability.reference import Reference
+from emmc_rig.study.stability.rounding import relative, rounding, step_sizes
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.methods import METHODS, MethodSettings
 from reconstruction.problem import colour_metric

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.stability import beside, theory
-from emmc_rig.stability.faults import FAULTS, trial
-from emmc_rig.stability.plan import stability_settings
-from emmc_rig.stability.theory import (
+from emmc_rig.study.stability import beside, theory
+from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.plan import stability_settings
+from emmc_rig.study.stability.theory import (
     Place,
     Seen,
     TheoryPoint,
@@ -21,14 +21,14 @@ from emmc_rig.stability.theory import (
     patch_texture,
     predicted,
 )
-from emmc_rig.stability.theory_section import (
+from emmc_rig.study.stability.theory_section import (
     Compared,
     compared,
     judged,
     rank_correlation,
     theory_sections,
 )
-from emmc_rig.stability.trial import Trial
+from emmc_rig.study.stability.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.problem import OPPONENT
 from reconstruction.theory.patch import SIDE, PatchModel, Texture

@@ -37,7 +37,7 @@ class HardwareRig:
     """The real stage that the command line names."""
 
     def __init__(self, spec):
-        from emmc_rig.hardware import open_stage
+        from emmc_rig.rig.hardware import open_stage
 
         self._open, self._spec, self._stage = open_stage, spec, None
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from emmc_rig.demo import Silent
 from emmc_rig.model.lightfield import save_hdf5
-from emmc_rig.tables.command import run_tables
-from emmc_rig.tables.console import shown
-from emmc_rig.tables.grids import MEAN
-from emmc_rig.tables.library import Cut
-from emmc_rig.tables.mosaic import Piece, Tile, composed, telling_pieces
-from emmc_rig.tables.plan import PARTS, cells_of, distinct
-from emmc_rig.tables.rows import COLUMNS
-from emmc_rig.tables.run import TablesSettings
+from emmc_rig.progress import Silent
+from emmc_rig.study.tables.command import run_tables
+from emmc_rig.study.tables.console import shown
+from emmc_rig.study.tables.grids import MEAN
+from emmc_rig.study.tables.library import Cut
+from emmc_rig.study.tables.mosaic import Piece, Tile, composed, telling_pieces
+from emmc_rig.study.tables.plan import PARTS, cells_of, distinct
+from emmc_rig.study.tables.rows import COLUMNS
+from emmc_rig.study.tables.run import TablesSettings
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.methods import MethodSettings
@@ -192,7 +192,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
     folder, outcome = whole
     (folder / "mine.txt").write_text("keep")
     before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
-    from emmc_rig.tables import run as module
+    from emmc_rig.study.tables import run as module
 
     monkeypatch.setattr(module, "reconstruct", None)
     again = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
@@ -238,7 +238,7 @@ def test_a_dictionary_that_saw_the_scene_is_refused(run, scenes, tmp_path):
 
 
 def test_ctrl_c_is_told_with_how_to_go_on(run, scenes, monkeypatch):
-    from emmc_rig.tables import command
+    from emmc_rig.study.tables import command
 
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
@@ -252,7 +252,7 @@ def test_ctrl_c_is_told_with_how_to_go_on(run, scenes, monkeypatch):
 
 
 def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
-    from emmc_rig.tables import command
+    from emmc_rig.study.tables import command
 
     def full(*arguments, **named):
         raise OSError(28, "No space left on device")

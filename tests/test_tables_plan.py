@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emmc_rig.errors import AppError
-from emmc_rig.tables import paper
-from emmc_rig.tables.plan import (
+from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.plan import (
     MASKS,
     PARTS,
     Capture,

@@ -9,25 +9,33 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.demo import Silent
 from emmc_rig.errors import AppError
-from emmc_rig.journal import Journal, digest_of, open_folder
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
-from emmc_rig.pictures import Pictures, pictures_of, telling_lines
-from emmc_rig.tables.demosaic import demosaiced_rggb
-from emmc_rig.tables.dictionaries import (
+from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.progress import Silent
+from emmc_rig.study.points import Journal, digest_of, open_folder
+from emmc_rig.study.tables.demosaic import demosaiced_rggb
+from emmc_rig.study.tables.dictionaries import (
     Given,
     LeaveOneOut,
     TrainingSettings,
     check_not_trained_on,
     trained_on,
 )
-from emmc_rig.tables.library import Cut, Library, middle, scene_specs
-from emmc_rig.tables.plan import PARTS, Capture, Cell, Part
-from emmc_rig.tables.rows import csv_text
-from emmc_rig.tables.run import CELLS, FAST, Forecast, Run, TablesSettings, TablesStopped, do_cells
-from emmc_rig.tables.scores import scored
-from emmc_rig.tables.shots import Sensors
+from emmc_rig.study.tables.library import Cut, Library, middle, scene_specs
+from emmc_rig.study.tables.plan import PARTS, Capture, Cell, Part
+from emmc_rig.study.tables.rows import csv_text
+from emmc_rig.study.tables.run import (
+    CELLS,
+    FAST,
+    Forecast,
+    Run,
+    TablesSettings,
+    TablesStopped,
+    do_cells,
+)
+from emmc_rig.study.tables.scores import scored
+from emmc_rig.study.tables.shots import Sensors
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.learning import LearningSettings
@@ -168,7 +176,7 @@ def test_patches_are_coded_by_the_papers_solver_unless_told():
 def test_nothing_is_done_twice(scenes, tmp_path, monkeypatch):
     run = a_run(scenes, tmp_path / "out")
     first = do_cells(run, Silent())
-    from emmc_rig.tables import run as module
+    from emmc_rig.study.tables import run as module
 
     monkeypatch.setattr(module, "reconstruct", None)
     monkeypatch.setattr(module, "estimate_patches", None)

@@ -19,12 +19,12 @@ from emmc_rig.capture.until import Until
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.contact_sheet import events, sheet
+from emmc_rig.pages.session_sheet import events, sheet
 from emmc_rig.session.decisions import decisions
 from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify
-from reconstruction.result import Reconstruction
+from reconstruction.result import Reconstruction, Status
 from simulators.disk import SimulatedDisk
 
 SIZE = (32, 40)
@@ -272,7 +272,7 @@ def test_a_capture_that_cannot_choose_says_why_and_makes_nothing(tmp_path, chang
 
 def result_with(**maps):
     light_field = np.full((3, 3, 8, 8, 3), 0.5, np.float32)
-    return Reconstruction("adaptive", light_field, "converged", "", 1, (), 1.0, {}, maps)
+    return Reconstruction("adaptive", light_field, Status.CONVERGED, "", 1, (), 1.0, {}, maps)
 
 
 def planar_result(sigma):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emmc_rig.camera_sheet import find_camera
+from emmc_rig.files.cameras import find_camera
 from reconstruction.differences import gradient, norm_squared, variation
 from reconstruction.patch_term import from_patches
 from reconstruction.tv import TVSettings, reconstruct_tv
@@ -63,7 +63,7 @@ def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_st
 
 def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
     pytest.importorskip("pyproximal")
-    from emmc_rig.benchmarks.variational import PeerProblem
+    from emmc_rig.study.benchmarks.variational import PeerProblem
 
     psi = coded_psi("rggb", 2, 3, (4, 6), (2, 3), np.float64)
     truth, frames = capture(psi)
@@ -93,7 +93,7 @@ def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
 
 def test_the_steps_of_both_are_timed():
     pytest.importorskip("pyproximal")
-    from emmc_rig.benchmarks.variational import variational_timings
+    from emmc_rig.study.benchmarks.variational import variational_timings
 
     rows = list(variational_timings(find_camera("rgbw-bayer-1shot"), (16, 20), 1))
     assert [row.name for row in rows] == [

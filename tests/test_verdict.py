@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.cli import app
+from emmc_rig.commands.simulate import simulate_into
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.simulate import simulate
-from emmc_rig.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import FAULTS, trial
 from reconstruction.methods import MethodSettings
-from reconstruction.result import Reconstruction
+from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
 from reconstruction.tv import TVSettings
 from reconstruction.verdict.displaced import displaced
@@ -223,7 +223,14 @@ def test_a_capture_without_a_fault_is_trusted(scene, camera):
 
 def clean_evidence(three):
     empty = Reconstruction(
-        "tv", np.full(three.light_field_shape, 0.5, np.float32), "converged", "", 1, (), 0.0, {}
+        "tv",
+        np.full(three.light_field_shape, 0.5, np.float32),
+        Status.CONVERGED,
+        "",
+        1,
+        (),
+        0.0,
+        {},
     )
     usable = everywhere(three)
     read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
@@ -303,7 +310,7 @@ def folders(tmp_path_factory):
     for name in ("right", "wrong"):
         folder = tmp_path_factory.mktemp(name)
         camera = find_camera("rgbw-bayer-2shots")
-        simulate("non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0, folder)
+        simulate_into(folder, "non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0)
         if name == "wrong":
             psi = ImagingMatrix.load(folder / "psi.h5")
             dataclasses.replace(psi, weights=np.roll(psi.weights, 6, axis=(3, 5))).save(

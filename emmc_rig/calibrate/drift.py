@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from calibration.defects import mask_with_losses
@@ -18,12 +17,13 @@ from calibration.parametric import psi_at, shot_stages
 from calibration.placement import SCALARS, Placement
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
+from emmc_rig.files.frames import FRAMES, PSI, read_frames
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, versions, write_metrics
-from emmc_rig.reconstruct import FRAMES, read_capture
 
-PSI, CALIBRATION = "psi.h5", "calibration.h5"
+CALIBRATION = "calibration.h5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +46,15 @@ def read_calibration(folder: Path) -> Known:
         )
     psi = ImagingMatrix.load(folder / PSI)
     camera = Camera.model_validate_json(psi.camera_json)
-    try:
-        with h5py.File(path, "r") as file:
-            if "aperture" not in file:
-                raise AppError(
-                    f"{path}: this Psi is of the free route, which does not know where the mask "
-                    "sits; calibrate with --route parametric or mixed"
-                )
-            scalars = {name: float(np.asarray(file.attrs[name])) for name in SCALARS}
-            aperture = np.asarray(file["aperture"])
-            lost = np.asarray(file["lost"]) if "lost" in file else None
-    except (OSError, KeyError) as fault:
-        why = " ".join(str(fault).split())
-        raise AppError(f"{path}: cannot be read ({why}); calibrate again") from fault
+    with stored_arrays(path, AppError, "calibrate again") as stored:
+        if "aperture" not in stored:
+            raise AppError(
+                f"{path}: this Psi is of the free route, which does not know where the mask "
+                "sits; calibrate with --route parametric or mixed"
+            )
+        scalars = {name: float(np.asarray(stored.attributes[name])) for name in SCALARS}
+        aperture = stored.array("aperture")
+        lost = stored.array("lost") if "lost" in stored else None
     rows = tuple(tuple(map(float, row)) for row in aperture)
     placement = Placement(**scalars, aperture=rows)
     mask = shadow_mask(camera, psi.size)
@@ -75,7 +71,7 @@ def run_drift(
     The mended Psi is written even where nothing has drifted: it is then the calibration's own.
     """
     known = read_calibration(known_folder)
-    capture = read_capture(frames_folder)
+    capture = read_frames(frames_folder)
     if capture.readings.shape != known.psi.frames_shape:
         raise AppError(
             f"{frames_folder / FRAMES}: {capture.readings.shape[0]} frames of "

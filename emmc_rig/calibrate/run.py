@@ -35,8 +35,7 @@ from calibration.shadow import ShadowMask, shadow_mask
 from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, lamps_needed
 from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
-from emmc_rig.calibrate.drift import CALIBRATION, PSI
-from emmc_rig.calibrate.report import write_calibration_report
+from emmc_rig.calibrate.drift import CALIBRATION
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Boards,
@@ -45,13 +44,13 @@ from emmc_rig.capture.plan import (
     Plan,
     PlannedShot,
 )
-from emmc_rig.demo import Silent, Watcher
 from emmc_rig.errors import AppError
+from emmc_rig.files.frames import PSI
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.output import command_line, versions, write_metrics
-from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
-from emmc_rig.session.session import Session
+from emmc_rig.pages.calibration_page import write_calibration_report
+from emmc_rig.progress import Silent, Watcher
 
 Array = NDArray[np.floating]
 PLAN, REPORT = "plan.yaml", "report.html"
@@ -533,7 +532,7 @@ def run_calibrate(
     Writes psi.h5, calibration.h5, metrics.json and report.html.
     """
     run = run_calibration(settings, watcher)
-    _save(folder, run.outcome, run.outcome.calibration)
+    save_outcome(folder, run.outcome, run.outcome.calibration)
     write_calibration_report(
         folder / REPORT,
         run.outcome,
@@ -546,46 +545,8 @@ def run_calibrate(
     return run.metrics
 
 
-def calibrate_session(
-    session: Session, folder: Path, route: str = "auto", watcher: Watcher | None = None
-) -> dict:
-    """Calibrate a session's whiteboards into an existing folder and return the metrics.
-
-    Writes what `run_calibrate` writes. `auto` takes the parametric routes where the session has
-    whiteboards for them, and the free one else. Raises AppError or CalibrationError.
-    """
-    watcher = watcher or Silent()
-    if route not in ROUTES:
-        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
-    started = time.perf_counter()
-    watcher.begin("frames", None)
-    outcome = session_outcome(
-        session,
-        None if route == "auto" else ROUTES[route],
-        lambda name: watcher.begin(name, None),
-    )
-    metrics = {
-        "camera": session.header["title"] or session.folder.name,
-        "session": str(session.folder),
-        "size": list(outcome.calibration.psi.size),
-        "route": route,
-        **outcome_figures(outcome),
-        "calibration_seconds": time.perf_counter() - started,
-        "command": command_line(),
-        "versions": versions(),
-    }
-    shots = taken_shots(session)
-    chosen = outcome.calibration
-    if len(shots) < chosen.psi.shots:
-        # What `reconstruct --psi` takes with the session's own shots.
-        chosen = chosen.of_shots(shots, camera_json_of(session, shots))
-    _save(folder, outcome, chosen)
-    write_calibration_report(folder / REPORT, outcome, metrics)
-    write_metrics(folder, metrics)
-    return metrics
-
-
-def _save(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
+def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
+    """Write psi.h5 and calibration.h5 of the calibration chosen into an existing folder."""
     best = outcome.mixed or outcome.parametric
     known = {"parametric": outcome.parametric, "mixed": outcome.mixed, "combined": best}.get(
         outcome.chosen

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.capture.plan import Checks
-from emmc_rig.frame_view import thinned
+from emmc_rig.pages.frame_view import thinned
 from emmc_rig.session.planned import PlannedFrame
 
 BRIGHT_PERCENTILE = 99.9
@@ -27,6 +27,10 @@ class FrameRefusedError(DriverError):
     def __init__(self, frame_id: str, reason: str, advice: str) -> None:
         super().__init__(f"frame {frame_id} {reason}: {advice}")
         self.reason = reason
+
+
+class SaturatedError(FrameRefusedError):
+    """A frame too bright for its exposure, which a second try at that exposure would be too."""
 
 
 @dataclass(frozen=True)
@@ -79,18 +83,29 @@ def check(
                 "switch the lamp off and cover the bench",
             )
         return
-    if found.bright_dn < checks.smallest_signal * span:
+    # Nothing can be metered from less than one DN.
+    least_dn = max(checks.smallest_signal * span, planned.kind == "metering")
+    if found.bright_dn < least_dn:
         raise FrameRefusedError(
             planned.id,
             f"is black, its brightest pixels {max(0.0, found.bright_dn) / span:.2%} of white",
-            "check lamp, lens cap and exposure",
+            f"check lamp and lens cap, or raise {exposure_setting(planned)} in the plan",
         )
     if not may_saturate and found.saturated > checks.largest_saturated_share:
-        raise FrameRefusedError(
+        raise SaturatedError(
             planned.id,
             f"is saturated in {found.saturated:.1%} of its pixels",
-            "shorten the exposure in the plan, or dim the lamp",
+            f"lower {exposure_setting(planned)} in the plan",
         )
+
+
+def exposure_setting(planned: PlannedFrame) -> str:
+    """Return the key of the plan that sets a frame's exposure."""
+    if planned.kind == "dark":
+        return "darks.exposure_s"
+    if planned.kind == "shot":
+        return f"shots.{planned.bench.shot}.exposure_s"
+    return "whiteboards.exposure_s" if planned.metered_by is None else "whiteboards.level"
 
 
 def _same(one: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:

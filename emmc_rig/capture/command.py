@@ -1,4 +1,7 @@
-"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on."""
+"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on.
+
+Whoever calls holds the session meanwhile (`emmc_rig.session.lock.held`), from before it is read.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import Estimate, estimate
 from emmc_rig.capture.expand import expand
@@ -20,28 +22,32 @@ from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import (
     METERING_EXPOSURE_S,
     Plan,
-    first_difference,
     load_plan,
     planned_camera,
 )
+from emmc_rig.capture.preflight import refuse_impossible
+from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import Watcher
-from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
+from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.model.settings import validated
-from emmc_rig.output import command_line, shown_bytes, versions
-from emmc_rig.rig_config import Ask, opened_rig
+from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
+from emmc_rig.rig.hardware import Rig
+from emmc_rig.rig.rig_config import Ask, RigChoice, opened_rig
+from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
+    REPORT,
     Frozen,
     Session,
     is_session,
-    only_program,
     wall_time,
 )
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
@@ -51,7 +57,7 @@ DISK_RESERVE_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Wish:
-    """What to capture and where to; rig: see `emmc_rig.rig_config`, None on resuming alike.
+    """What to capture and where to; rig: see `emmc_rig.rig.rig_config`, None on resuming alike.
 
     until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
     """
@@ -71,23 +77,25 @@ def session_folder(plan_path: Path) -> Path:
 
 
 def wish_from_plan(
-    plan_path: Path, out: Path | None, rig: Mapping[str, Any], until_db: float | None = None
+    plan_path: Path, out: Path, rig: Mapping[str, Any], until_db: float | None = None
 ) -> Wish:
     """Return what a plan file asks for; raises AppError."""
     plan = load_plan(plan_path)
     camera = planned_camera(plan, plan_path.parent)
     text = plan_path.read_text(encoding="utf-8")
-    return Wish(plan_path, plan, text, camera, out or session_folder(plan_path), rig, until_db)
+    return Wish(plan_path, plan, text, camera, out, rig, until_db)
 
 
 def wish_from_session(
-    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None = None
+    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
 ) -> Wish:
-    """Return what a session was begun for; raises AppError."""
+    """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
     session = Session(folder)
-    plan = validated(Plan, yaml.safe_load(session.plan_yaml), str(folder), AppError)
+    plan = validated(
+        Plan, parse_yaml(session.plan_yaml, str(folder), AppError), str(folder), AppError
+    )
     camera = validated(Camera, session.camera, str(folder), CameraError)
-    return Wish(folder, plan, session.plan_yaml, camera, folder, rig or session.rig, until_db)
+    return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
 
 
 def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
@@ -105,27 +113,27 @@ def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
 def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
     """Return the session that the wish goes on with; None where it is to be begun.
 
-    Raises AppError when the folder is in the way, or the session was begun with another plan,
-    camera or rig.
+    Raises AppError when the folder is in the way, or frames were taken by another rig.
     """
     if is_session(wish.out):
         session = Session(wish.out, disk)
-        _refuse_changes(wish, session)
+        if session.stored and json.loads(json.dumps(dict(wish.rig))) != session.rig:
+            raise AppError(
+                f"session {session.folder.name} was begun with another rig: "
+                f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
+            )
         return session
     if (wish.out / HEADER).is_file():
         raise AppError(
             f"{wish.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
         )
     if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
-        raise AppError(
-            f"--out {wish.out}: holds something else than a session; choose another folder"
-        )
+        raise AppError(f"--out {wish.out}: holds something else than a session; name another --out")
     return None
 
 
 def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK) -> Session:
     """Begin the wish's session; raises AppError where it cannot be made."""
-    frozen = Frozen(wish.plan_yaml, _camera_data(wish.camera), dict(wish.rig), frames)
     about = {
         "title": wish.plan.title or wish.plan_path.stem,
         "created": wall_time(),
@@ -133,31 +141,12 @@ def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTE
         "versions": versions(),
         **({} if wish.until_db is None else {"until_db": wish.until_db}),
     }
-    return Session.create(wish.out, frozen, about, disk)
+    return Session.create(wish.out, _frozen(wish, frames), about, disk)
 
 
-def _camera_data(camera: Camera) -> dict[str, Any]:
-    return camera.model_dump(mode="json")
-
-
-def _refuse_changes(wish: Wish, session: Session) -> None:
-    frozen = validated(Plan, yaml.safe_load(session.plan_yaml), str(session.folder), AppError)
-    difference = first_difference(wish.plan, frozen)
-    if difference:
-        raise AppError(
-            f"{wish.plan_path}: was edited since session {session.folder.name} began with it "
-            f"({difference} as there): take the edit back, or name another --out"
-        )
-    if json.loads(json.dumps(_camera_data(wish.camera))) != session.camera:
-        raise AppError(
-            f"{wish.plan.camera}: the camera was edited since session {session.folder.name} began; "
-            "take the edit back, or name another --out"
-        )
-    if json.loads(json.dumps(dict(wish.rig))) != session.rig:
-        raise AppError(
-            f"session {session.folder.name} was begun with another rig: {json.dumps(session.rig)}; "
-            "name the same, or another --out"
-        )
+def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
+    camera = wish.camera.model_dump(mode="json")
+    return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
 
 
 def estimated(frames: tuple[PlannedFrame, ...], plan: Plan, rig: Rig) -> Estimate:
@@ -211,6 +200,32 @@ def disk_faults_told(session: Session) -> Iterator[None]:
         ) from fault
 
 
+@contextmanager
+def way_on_told(wish: Wish, session: Session) -> Iterator[None]:
+    """Say with a fault how to go on; a session without a frame goes, for there is nothing to keep.
+
+    A fault of the plan's is mended in the plan, which may hold for a session that has begun.
+    """
+    try:
+        yield
+    except BaseException as fault:
+        kept = len(session.stored)
+        if not kept:
+            session.forget()
+        if not isinstance(fault, GaveUpError):
+            raise
+        if not is_session(session.folder):
+            way = "nothing was captured; mend it, then run the same command"
+        elif is_session(wish.plan_path):
+            way = (
+                f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
+                f"the plan that you edited: emmc-rig capture COPY.yaml --out {wish.out}"
+            )
+        else:
+            way = f"{kept} frames are kept: mend it, then run the same command"
+        raise AppError(f"{fault}; {way}") from fault
+
+
 def run_capture(
     wish: Wish,
     watcher: Watcher,
@@ -220,7 +235,8 @@ def run_capture(
 ) -> tuple[Session, Outcome] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
-    agreed: is told what it will take. Raises AppError or a `DriverError`.
+    agreed: is told what it will take, once nothing speaks against it. Raises AppError or a
+    `DriverError`.
     """
     control = control or Control()
     if wish.until_db is not None:
@@ -228,19 +244,130 @@ def run_capture(
     with ExitStack() as open_things:
         session = begun_session(wish)
         rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
-        frames = planned_frames(wish, rig) if session is None else still_possible(wish, session)
+        planned = planned_frames(wish, rig)
+        edit = None
+        if session is None:
+            frames = planned
+        elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
+            watcher.tell(edit.words(len(session.stored)))
+            frames = tuple(frame for frame in edit.frames if frame.id not in session.stored)
+        else:
+            frames = still_possible(wish, session)
+        refuse_impossible(rig, frames)
+        if session is not None:
+            refuse_other_camera(session, rig)
         expected = estimated(frames, wish.plan, rig)
         refuse_small_disk(wish.out, expected)
         if not agreed(expected):
             return None
-        session = session or new_session(wish, frames)
-        open_things.enter_context(only_program(session))
-        refuse_other_camera(session, rig)
+        if session is None:
+            session = new_session(wish, planned)
+            open_things.enter_context(held(session.folder))
         with interruptible(control, watcher.tell), disk_faults_told(session):
-            if wish.until_db not in (None, session.target_db):
-                session.note("until", target_db=wish.until_db, wall=wall_time())
-            choose = None if session.target_db is None else Until(session, watcher)
-            return session, Sequencer(session, wish.plan, rig, watcher, control, choose).run()
+            if edit is not None:
+                session = session.amend(_frozen(wish, edit.frames), edit.changes)
+            with way_on_told(wish, session):
+                if wish.until_db not in (None, session.target_db):
+                    session.note("until", target_db=wish.until_db, wall=wall_time())
+                choose = None if session.target_db is None else Until(session, watcher)
+                run = Sequencer(session, wish.plan, rig, watcher, control, choose)
+                return session, run.run()
+
+
+def asked_for(
+    plan: Path, folder: Path, rig: Mapping[str, Any] | None, until_db: float | None
+) -> Wish:
+    """Return what a plan file asks for, or what a session was begun for; raises AppError.
+
+    folder: of the session. rig: see `rig_description`; a session has its own, and an edited plan
+    for a session that is there keeps it.
+    """
+    if is_session(plan):
+        return wish_from_session(plan, rig, until_db, folder)
+    if rig is None and is_session(folder):
+        rig = Session(folder).rig
+    if rig is None:
+        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+    return wish_from_plan(plan, folder, rig, until_db)
+
+
+def capture_session(
+    plan: Path,
+    rig: Mapping[str, Any] | None,
+    out: Path | None,
+    until_db: float | None,
+    watcher: Watcher,
+    ask: Ask,
+    agreed: Callable[[Estimate], bool] = lambda expected: True,
+    control: Control | None = None,
+) -> tuple[Session, Outcome] | None:
+    """Capture what is missing of a plan or session, and write the session's report.
+
+    See `asked_for` and `run_capture`. None where `agreed` says no. Raises StoppedError when
+    somebody stopped it: what was captured is kept, and the same call goes on.
+    """
+    if not plan.exists():
+        raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
+    folder = out or (plan if is_session(plan) else session_folder(plan))
+    go_on = f"go on with: emmc-rig capture {folder}"
+    with held(folder):
+        wish = asked_for(plan, folder, rig, until_db)
+        try:
+            captured = run_capture(wish, watcher, ask, agreed, control)
+        except KeyboardInterrupt as stop:
+            begun = is_session(folder)
+            kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
+            raise StoppedError(f"stopped at once; {kept}") from stop
+        if captured is None:
+            return None
+        session, outcome = captured
+        try:
+            write_sheet(session, session.folder / REPORT, quick_pictures(session))
+        except AppError as fault:
+            watcher.tell(f"no report: {fault}")
+    if not outcome.complete:
+        raise StoppedError(
+            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
+            f"{go_on}"
+        )
+    return captured
+
+
+def ask_at_prompt(what: str) -> None:
+    """Ask a person to do something at the bench, and wait until Enter is pressed."""
+    input(f"please {what}, then press Enter ")
+
+
+def capture(
+    plan: str | Path,
+    rig: RigChoice | None = None,
+    *,
+    out: str | Path | None = None,
+    until_db: float | None = None,
+    watcher: Watcher | None = None,
+    ask: Ask = ask_at_prompt,
+) -> Session:
+    """Run a plan on a rig and return its session; run again, it goes on where it stopped.
+
+    Args:
+        plan: a plan (YAML), or the folder of a session to go on with.
+        rig: what `emmc_rig.rig` returns; a session has its own.
+        out: folder of the session (default: PLAN-session beside the plan).
+        until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
+        watcher: is told what is captured.
+        ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
+
+    Raises:
+        AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
+        DriverError: what a device says.
+    """
+    description = None if rig is None else rig.description
+    folder = None if out is None else Path(out)
+    captured = capture_session(
+        Path(plan), description, folder, until_db, watcher or Unwatched(), ask
+    )
+    assert captured is not None  # nobody is asked whether to agree
+    return captured[0]
 
 
 def write_new(path: Path, text: str) -> None:
@@ -253,4 +380,6 @@ def write_new(path: Path, text: str) -> None:
     except FileExistsError as fault:
         raise AppError(f"{path}: exists already; name another --out") from fault
     except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+        raise AppError(
+            f"{path}: cannot be written ({fault.strerror}); name another --out"
+        ) from fault

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from emmc_rig.signals import ENDING, handled
+from emmc_rig.capture.signals import ENDING, handled
 
 PAUSE_POLL_S = 0.05
 

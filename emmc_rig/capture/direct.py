@@ -12,9 +12,9 @@ from calibration.whiteboard import Whiteboards
 from emmc_rig.capture.expand import mask_offsets_um
 from emmc_rig.capture.plan import METERING_EXPOSURE_S
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
+from emmc_rig.rig.hardware import Rig
 
 WHITEBOARD_LEVEL = 0.7
 MAX_EXPOSURE_S = 30.0

@@ -25,10 +25,10 @@ from rich.progress import (
 from rich.text import Text
 
 from drivers.raw import RawFrame
-from emmc_rig.camera_commands import pressed_keys
 from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
-from emmc_rig.frame_view import histogram, histogram_text, thinned
+from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
 
 KEY_POLL_S = 0.1

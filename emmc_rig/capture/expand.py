@@ -147,7 +147,9 @@ def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[Plann
     metered = boards.exposure_s is None
     for place, board in enumerate(boards.open):
         if any(board.mask_um) and not own_um:
-            raise AppError(f"whiteboards.open.{place}.mask_um: no mask of this camera moves")
+            raise AppError(
+                f"whiteboards.open.{place}.mask_um: no mask of this camera moves: leave it out"
+            )
         x_um, y_um = board.mask_um
         moved = {
             axis: own_um[axis] + further
@@ -205,7 +207,10 @@ def mask_offsets_um(camera: Camera, shot: int) -> dict[str, float]:
         if name in camera.shot_masks(shot)
     }
     if len(wanted) > 1:
-        raise AppError(f"shot {shot} moves two masks apart, the rig has one mask stage")
+        raise AppError(
+            f"shot {shot} moves two masks apart, the rig has one mask stage: give both one place, "
+            f"shots.{shot}.mask_um"
+        )
     return {
         axis: value for x_um, y_um in wanted for axis, value in (("mask_x", x_um), ("mask_y", y_um))
     }

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from emmc_rig.camera_sheet import find_camera
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, Shot
-from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
 
 METERING_EXPOSURE_S = 0.01
 SCHEMA_FILE = "plan.schema.json"
@@ -191,7 +193,7 @@ def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
         return own
     moving = camera.moving_masks or tuple(camera.masks)
     if not moving:
-        raise AppError(f"shots.{place}: the camera has no mask to move")
+        raise AppError(f"shots.{place}: the camera has no mask to move: leave its place out")
     if shot.mask_um is not None:
         offsets = dict.fromkeys(moving, shot.mask_um)
     else:
@@ -222,18 +224,23 @@ def schema_path() -> Path:
     return Path(str(resources.files("emmc_rig.capture") / SCHEMA_FILE))
 
 
-def first_difference(one: Plan, other: Plan) -> str:
-    """Return what differs first between two plans, "" for equal ones."""
-    return _difference(one.model_dump(), other.model_dump(), "")
+def differences(one: Plan, other: Plan) -> list[str]:
+    """Return what differs between two plans, in words; nothing for equal ones."""
+    return list(_differences(one.model_dump(), other.model_dump(), ""))
 
 
-def _difference(one: Any, other: Any, where: str) -> str:
+def _differences(one: Any, other: Any, where: str) -> Iterator[str]:
     if isinstance(one, dict) and isinstance(other, dict):
-        pairs = [(f"{where}.{key}", one[key], other.get(key)) for key in one]
+        for key in one:
+            yield from _differences(one[key], other.get(key), f"{where}.{key}")
     elif isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
         if len(one) != len(other):
-            return f"{where.lstrip('.')} has {len(one)} entries, not {len(other)}"
-        pairs = [(f"{where}.{i}", a, b) for i, (a, b) in enumerate(zip(one, other, strict=True))]
-    else:
-        return "" if one == other else f"{where.lstrip('.')} is {one!r}, not {other!r}"
-    return next(filter(None, (_difference(a, b, name) for name, a, b in pairs)), "")
+            yield f"{where.lstrip('.')} has {len(one)} entries, not {len(other)}"
+        for place, (a, b) in enumerate(zip(one, other, strict=False)):
+            yield from _differences(a, b, f"{where}.{place}")
+    elif one != other:
+        yield f"{where.lstrip('.')} is {_shown(one)}, not {_shown(other)}"
+
+
+def _shown(value: Any) -> str:
+    return json.dumps(value, default=str)

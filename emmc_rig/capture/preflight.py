@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from drivers.camera import Limits
+from emmc_rig.capture.checks import exposure_setting
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
+from emmc_rig.rig.hardware import Rig
 from emmc_rig.session.planned import PlannedFrame
 
 ROUNDING = 1e-9
@@ -25,12 +26,13 @@ def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:
         if chosen and exposure_s is not None and not _within(exposure_s, exposures_s):
             raise AppError(
                 f"frame {frame.id}: the camera exposes from {exposures_s[0]:g} to "
-                f"{exposures_s[1]:g} s, not {exposure_s:g} s: change the plan"
+                f"{exposures_s[1]:g} s, not {exposure_s:g} s: change "
+                f"{exposure_setting(frame)} in the plan"
             )
         if not _within(frame.gain, gains):
             raise AppError(
                 f"frame {frame.id}: the camera's gain goes from {gains[0]:g} to {gains[1]:g}, not "
-                f"to {frame.gain:g}: change the plan"
+                f"to {frame.gain:g}: change shots.{frame.bench.shot}.gain in the plan"
             )
 
 
@@ -45,7 +47,8 @@ def _refuse_place(rig: Rig, frame: PlannedFrame, axis: str, offset_um: float) ->
     if not low_um <= rig.zero_um[axis] + offset_um <= high_um:
         raise AppError(
             f"frame {frame.id}: {axis} cannot go {offset_um:g} um from its zero "
-            f"({rig.zero_um[axis]:g} um), it reaches {low_um:g} to {high_um:g} um"
+            f"({rig.zero_um[axis]:g} um), it reaches {low_um:g} to {high_um:g} um: change the "
+            "place in the plan, or zero_um in the rig's file"
         )
 
 

@@ -23,6 +23,7 @@ from drivers.errors import (
     UsbPermissionError,
     UsbUnavailableError,
 )
+from emmc_rig.capture.checks import SaturatedError
 from emmc_rig.capture.plan import Retries
 from emmc_rig.errors import AppError
 
@@ -33,6 +34,7 @@ HOPELESS = (
     FolderCameraError,
     LimitExceededError,
     PortPermissionError,
+    SaturatedError,
     SpeedLimitError,
     UnknownAxisError,
     UsbClaimedError,
@@ -49,9 +51,8 @@ class GaveUpError(AppError):
     """The capture stops because a fault stays; everything captured so far is kept."""
 
     def __init__(self, frame_id: str, reason: str) -> None:
-        super().__init__(
-            f"frame {frame_id}: {reason}; what was captured is kept, the same command goes on"
-        )
+        named = reason.startswith(f"frame {frame_id} ")
+        super().__init__(reason if named else f"frame {frame_id}: {reason}")
 
 
 @dataclass(frozen=True)

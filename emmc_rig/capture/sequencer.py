@@ -41,9 +41,9 @@ from emmc_rig.capture.retries import Budget, mending
 from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
-from emmc_rig.hardware import Rig
-from emmc_rig.output import command_line, shown_bytes, versions
-from emmc_rig.registration import Shift, registered
+from emmc_rig.files.results import command_line, shown_bytes, versions
+from emmc_rig.rig.hardware import Rig
+from emmc_rig.rig.registration import Shift, registered
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
@@ -352,6 +352,7 @@ class Sequencer:
         exposure_s = frame.exposure_s if frame.exposure_s is not None else self._camera.exposure_s
         entry = {
             "run": self._run,
+            "plan": self._session.amendments,
             **frame_facts(frame),
             "exposure_s": exposure_s,
             "gain": frame.gain if frame.gain is not None else self._camera.gain,

@@ -97,7 +97,9 @@ class Until:
         begun = sorted({frame.bench.shot for frame in shots if frame.id in session.stored})
         first = min(frame.bench.shot for frame in shots)
         wanted = dict.fromkeys([first, *decided, *begun])
-        return tuple(shot for shot in wanted if shot is not None)
+        # An amended plan may have fewer shots than it was once decided of.
+        planned = {frame.bench.shot for frame in shots}
+        return tuple(shot for shot in wanted if shot in planned)
 
     def _decide(self, shots: tuple[int, ...], now_s: Callable[[], float]) -> None:
         session, target_db = self._session, self._session.target_db

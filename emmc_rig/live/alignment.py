@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
-from emmc_rig.registration import registered, without_tile
+from emmc_rig.rig.registration import registered, without_tile
 
 LONGEST_PX = 2048
 """Figures are taken from the middle of the frame: a mask is as askew there as elsewhere."""

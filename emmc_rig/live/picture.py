@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.frame_view import BAYER, srgb_codes
+from emmc_rig.pages.frame_view import BAYER, srgb_codes
 
 Kind = Literal["mosaic", "colour"]
 KINDS = get_args(Kind)

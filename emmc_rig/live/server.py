@@ -27,6 +27,8 @@ from emmc_rig.live.watch import Watch
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 PATIENCE_S = 10.0
+LARGEST = 1e12
+"""No position, exposure or number of pixels comes near it."""
 LONGEST_BODY = 4096
 PAGE = {
     "": ("page.html", "text/html"),
@@ -172,7 +174,7 @@ def _actions(watch: Watch) -> Mapping[str, Callable[..., None]]:
 def _finite(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise AppError(f"{value!r} is not a number")
-    if not abs(value) < float("inf"):
+    if not abs(value) < LARGEST:
         raise AppError("the value is not finite")
     return float(value)
 
@@ -188,7 +190,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise _RefusedError(413, f"more than {LONGEST_BODY} bytes")
     try:
         values = json.loads(data or b"{}")
-    except ValueError as fault:
+    except (ValueError, RecursionError) as fault:
         raise _RefusedError(400, "not JSON") from fault
     if not isinstance(values, dict):
         raise _RefusedError(400, "send a JSON object")
@@ -197,7 +199,10 @@ async def _body(request: Request) -> dict[str, Any]:
 
 def _number(query: Mapping[str, str], name: str, default: float, kind: type = float) -> Any:
     try:
-        return kind(query.get(name, default))
+        value = kind(query.get(name, default))
+        if not abs(value) < LARGEST:
+            raise OverflowError
+        return value
     except (ValueError, OverflowError) as fault:
         raise _RefusedError(400, f"{name}={query[name]}: a number is wanted") from fault
 

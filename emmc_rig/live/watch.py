@@ -20,8 +20,8 @@ from drivers.errors import DriverError, NotHomedError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.errors import AppError
-from emmc_rig.frame_view import frame_figures, histogram
 from emmc_rig.live.alignment import measure
+from emmc_rig.pages.frame_view import frame_figures, histogram
 
 IDLE_S = 10.0
 """Without anybody who asks for this long, no frame is taken."""

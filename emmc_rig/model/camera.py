@@ -10,14 +10,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy import sparse
 
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
     Footprint,
     cell_weights,
@@ -27,19 +28,24 @@ from emmc_rig.model.geometry import (
 )
 from emmc_rig.model.masks import AnyPattern, cfa_tile
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
-from emmc_rig.model.settings import Settings, read_yaml, validated
+from emmc_rig.model.settings import Settings, validated
 
+SHORTEST, LONGEST = 1e-6, 1e9
+"""Of lengths (um or mm) and seconds: beyond them a unit was mistaken."""
+MOST_CELLS = 2**27
+"""Of a mask as drawn: 1.6 GB."""
+Positive = Annotated[float, Field(gt=SHORTEST, lt=LONGEST)]
+Offset = Annotated[float, Field(gt=-LONGEST, lt=LONGEST)]
 FILTER_COLOURS = {"none": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 
 
 class Lens(Settings):
     """The lens: D, and the aperture cells that the views stand for."""
 
-    distance_mm: float = Field(default=50.0, gt=0, description="D, from the sensor to the lens")
-    aperture_cell_mm: float = Field(
-        default=5.0, gt=0, description="between the centres of two views"
-    )
+    distance_mm: Positive = Field(default=50.0, description="D, from the sensor to the lens")
+    aperture_cell_mm: Positive = Field(default=5.0, description="between the centres of two views")
     aperture_fill: float = Field(
         default=1.0, ge=0, le=1, description="open width of a cell; 0: a point"
     )
@@ -54,7 +60,7 @@ class Sensor(Settings):
     """The sensor: its colour filters, sampling step and pixel size."""
 
     cfa: str | tuple[str, ...] = "mono"
-    sample_pitch_um: float = Field(default=24.0, gt=0)
+    sample_pitch_um: Positive = 24.0
     pixel_fill: float = Field(
         default=1.0, ge=0, le=1, description="open width of a sample; 0: a point"
     )
@@ -81,7 +87,7 @@ class Mask(Settings):
     """One coded mask: where it stands, its cells and their pattern."""
 
     distance_mm: float = Field(ge=0, description="d, from the sensor")
-    cell_um: float = Field(gt=0)
+    cell_um: Positive
     pattern: AnyPattern
     spare_cells: int = Field(default=8, ge=0, description="beyond the beam, for a misplaced mask")
 
@@ -90,13 +96,13 @@ class Shot(Settings):
     """One exposure: which masks, moved by how much (x, y), behind which colour filter."""
 
     masks: tuple[str, ...] | None = None
-    offset_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    exposure_s: float | None = Field(default=None, gt=0)
+    offset_um: dict[str, tuple[Offset, Offset]] = Field(default_factory=dict)
+    exposure_s: Positive | None = None
     filter: Literal["none", "red", "green", "blue"] = "none"
 
 
 class Camera(Settings):
-    """A camera.
+    """A camera with coded masks: `camera.psi(size)` models it, `camera.expose(scene)` uses it.
 
     total_exposure_s: divided evenly by the number of shots; a shot may name its own instead.
     footprint_splits: see `_transmittances`; more for two masks of cells as fine as their shadow.
@@ -109,8 +115,8 @@ class Camera(Settings):
     sensor: Sensor = Sensor()
     masks: dict[str, Mask] = Field(default_factory=dict)
     shots: tuple[Shot, ...] = Field((Shot(),), min_length=1)
-    more_shots_step_um: dict[str, tuple[float, float]] | None = None
-    total_exposure_s: float = Field(default=0.05, gt=0)
+    more_shots_step_um: dict[str, tuple[Offset, Offset]] | None = None
+    total_exposure_s: Positive = 0.05
     footprint_splits: int = Field(default=3, ge=1, le=9)
 
     @model_validator(mode="after")
@@ -177,6 +183,53 @@ class Camera(Settings):
             return shot.model_copy(update={"offset_um": offsets})
 
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
+
+    def psi(self, size: tuple[int, int]) -> ImagingMatrix:
+        """Return the imaging matrix for light fields of `size` (rows, columns) samples.
+
+        Raises CameraError, see `build_imaging_matrix`.
+        """
+        return build_imaging_matrix(self, size)
+
+    def expose(
+        self,
+        scene: ArrayLike,
+        seed: int | np.random.Generator = 0,
+        psi: ImagingMatrix | None = None,
+    ) -> SimulatedFrames:
+        """Return the frames of a light field (v, u, y, x, c), with the sensor's noise (eq. 14).
+
+        psi: the camera's, where it is at hand; built otherwise. What the same Psi reconstructs
+        looks better than a measurement would: a rig, simulated or real, has its own geometry.
+        """
+        light_field = np.asarray(scene)
+        psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
+        return self.read_out(psi.forward(light_field), seed)
+
+    def read_out(
+        self, noise_free: NDArray[np.floating], seed: int | np.random.Generator = 0
+    ) -> SimulatedFrames:
+        """Return frames with noise whose readings (shot, pixel_y, pixel_x) without it are given."""
+        noise, k = self.sensor.noise, self.sensor.binning
+        light = pixel_light(self, (noise_free.shape[1] * k, noise_free.shape[2] * k))
+        exposures_s = self.exposures_s()[:, None, None]
+        rng = np.random.default_rng(seed)
+        frames_dn = noise.expose_dn(noise_free, exposures_s, light, rng)
+        readings = noise.normalise(frames_dn, exposures_s, light)
+        deviation = np.sqrt(noise.variance(readings, exposures_s, light))
+        usable = ~noise.saturated(frames_dn) & (light > 0)
+        return SimulatedFrames(readings, deviation, usable, frames_dn, noise_free)
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def __repr__(self) -> str:
+        shots, (v, u) = len(self.shots), self.views
+        masks = f"{len(self.masks)} mask{'s' * (len(self.masks) != 1)}"
+        return (
+            f"Camera({self.title!r}, {shots} shot{'s' * (shots > 1)}, {v}x{u} views, "
+            f"{self.sensor.cfa_name}, {masks})"
+        )
 
     def warnings(self) -> list[str]:
         """Return what the model neglects although it matters for this camera."""
@@ -317,6 +370,11 @@ def draw_plates(camera: Camera, size: tuple[int, int]) -> dict[str, Plate]:
         rows = _cell_count(axis_y, mask, [y for _, y in offsets], pitch_um)
         columns = _cell_count(axis_x, mask, [x for x, _ in offsets], pitch_um)
         frames = mask.pattern.frame_count(len(camera.shots))
+        if frames * rows * columns > MOST_CELLS:
+            raise CameraError(
+                f"mask '{name}' would have {rows} x {columns} cells: check the units of cell_um, "
+                "sample_pitch_um, aperture_cell_mm and offset_um, or use a smaller size"
+            )
         cells = mask.pattern.draw(frames, rows, columns, mask.cell_um)
         plates[name] = Plate(cells, mask.cell_um, mask.distance_mm)
     return plates

@@ -6,6 +6,7 @@ view is at x + disparity (u - U // 2) in view u, and likewise along (v, y). Pict
 linear values themselves, with no gamma.
 """
 
+import contextlib
 import os
 import re
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ import h5py
 import numpy as np
 
 from emmc_rig.model.errors import SceneError
+from emmc_rig.model.reading import check_png_size, stored_arrays
 
 _DATASET = "light_field"
 _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
@@ -133,18 +135,11 @@ def load_hdf5(path: str | os.PathLike) -> np.ndarray:
         SceneError: no such file, not HDF5 or cut short, no such dataset, or not a light field.
     """
     path = Path(path)
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file")
-    try:
-        with h5py.File(path, "r") as file:
-            dataset = file.get(_DATASET)
-            if not isinstance(dataset, h5py.Dataset):
-                raise SceneError(
-                    f"{path}: no dataset '{_DATASET}'; it holds {', '.join(sorted(file)) or 'none'}"
-                )
-            lf = np.asarray(dataset[()])
-    except (OSError, RuntimeError) as error:
-        raise SceneError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from error
+    with stored_arrays(path, SceneError, "copy it again") as stored:
+        if _DATASET not in stored:
+            held = ", ".join(sorted(stored.file)) or "none"
+            raise SceneError(f"{path}: no dataset '{_DATASET}'; it holds {held}")
+        lf = stored.array(_DATASET)
     if lf.dtype in (np.uint8, np.uint16):
         lf = lf.astype(np.float32) / np.iinfo(lf.dtype).max
     return check_light_field(lf, str(path))
@@ -421,10 +416,12 @@ def _read_picture(path: Path) -> np.ndarray:
     content = path.read_bytes()
     if not content.startswith(_PNG_START):
         raise SceneError(f"{path}: not a PNG picture")
+    check_png_size(content, str(path), SceneError)
     codes = None
     # OpenCV prints its own complaint about a file that is cut short: see that it has an end first.
     if _PNG_END in content[-32:]:
-        codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        with contextlib.suppress(cv2.error):
+            codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if codes is None:
         raise SceneError(f"{path}: a PNG picture cut short or damaged; copy it again")
     full_scale = 255 if codes.dtype == np.uint8 else 65535

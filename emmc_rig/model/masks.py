@@ -7,6 +7,7 @@ shows frame s in shot s. Reference numbers are those of the paper.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import check_png_size
 from emmc_rig.model.settings import Settings
 
 FILTERS = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": (1, 1, 1)}
@@ -319,7 +321,11 @@ class Picture(Pattern):
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the picture scaled to [0, 1]; raises CameraError when it cannot be read."""
-        picture = cv2.imread(str(self.path), cv2.IMREAD_UNCHANGED) if self.path.exists() else None
+        picture = None
+        with contextlib.suppress(cv2.error, OSError, ValueError):
+            content = self.path.read_bytes()
+            check_png_size(content, f"mask picture {self.path}", CameraError)
+            picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         if picture is None:
             raise CameraError(f"mask picture {self.path}: no such file, or not a picture")
         if picture.dtype not in (np.uint8, np.uint16):

@@ -7,22 +7,22 @@ pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per pixel.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator
 
 from emmc_rig.model import kernels
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.reading import stored_arrays
 
 Array = NDArray[np.floating]
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
@@ -82,6 +82,17 @@ class ImagingMatrix:
     colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
+
+    Psi is an operator: `psi @ light_field` are frames, `psi.T @ frames` is a light field, in their
+    natural shapes; `scipy.sparse.linalg.aslinearoperator(psi)` takes them flattened.
+
+    >>> weights = np.full((1, 1, 1, 4, 3, 6), 1 / 3, dtype=np.float32)
+    >>> psi = ImagingMatrix(weights, colour=None)
+    >>> psi
+    Psi(1 shot, 1x1 views, 4x6, three colours a pixel, 0.00029 MB)
+    >>> frames = psi @ np.ones((1, 1, 4, 6, 3), dtype=np.float32)
+    >>> frames.shape, (psi.T @ frames).shape, psi.shape
+    ((1, 4, 6), (1, 1, 4, 6, 3), (24, 72))
     """
 
     weights: Array
@@ -100,6 +111,22 @@ class ImagingMatrix:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
         if not np.isfinite(self.weights).all():
             raise SensingError("the imaging matrix has entries that are not finite")
+
+    def __repr__(self) -> str:
+        shots, (v, u), (rows, columns) = self.shots, self.light_field_shape[:2], self.size
+        megabytes = self.weights.nbytes / 1e6
+        memory = f"{megabytes:.2g} MB" if megabytes < 1000 else f"{megabytes / 1000:.2g} GB"
+        return (
+            f"Psi({shots} shot{'s' * (shots > 1)}, {v}x{u} views, {rows}x{columns}, "
+            f"{self._sensor()}, {memory})"
+        )
+
+    def _sensor(self) -> str:
+        """Return the name of the colour filter tile, or how many colours a pixel sees."""
+        if self.camera_json:
+            cfa = json.loads(self.camera_json)["sensor"]["cfa"]
+            return cfa if isinstance(cfa, str) else "custom colour filters"
+        return "one colour a pixel" if self.colour is not None else "three colours a pixel"
 
     @property
     def layout(self) -> PsiLayout:
@@ -185,6 +212,27 @@ class ImagingMatrix:
         kernels.back_project(self.weights, self.colour_map, frames, self.binning, light_field)
         return light_field
 
+    def __matmul__(self, light_field: ArrayLike) -> Array:
+        return self.forward(np.asarray(light_field))
+
+    @property
+    def T(self) -> TransposedPsi:  # noqa: N802
+        """Psi^T, whose product with frames is a light field."""
+        return TransposedPsi(self)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type of the weights, and of what the operator returns."""
+        return self.weights.dtype
+
+    def matvec(self, light_field: Array) -> Array:
+        """Return the flattened frames of a flattened light field, as SciPy's solvers call it."""
+        return self.forward(light_field.reshape(self.light_field_shape)).ravel()
+
+    def rmatvec(self, frames: Array) -> Array:
+        """Return the flattened light field Psi^T frames, for flattened frames."""
+        return self.adjoint(frames.reshape(self.frames_shape)).ravel()
+
     @cached_property
     def gram(self) -> NDArray[np.float64]:
         """The blocks of Psi Psi^T: (shot, shot, pixel_y, pixel_x), float64."""
@@ -216,14 +264,6 @@ class ImagingMatrix:
         """Return the Euclidean norm of every row of Psi: (shot, pixel_y, pixel_x)."""
         return np.sqrt(np.einsum("ssyx->syx", self.gram))
 
-    def column_norms(self) -> NDArray[np.float64]:
-        """Return the Euclidean norm of every column of Psi: (v, u, y, x, c)."""
-        squares = np.square(self.weights, dtype=np.float64)
-        if self.colour is None:
-            return np.sqrt(squares.sum(axis=0).transpose(0, 1, 2, 4, 3))
-        seen = self.colour[..., None] == np.arange(3)
-        return np.sqrt(np.einsum("svuyx,syxc->vuyxc", squares[:, :, :, :, 0, :], seen))
-
     @cached_property
     def norm(self) -> float:
         """The operator norm of Psi: the root of the largest eigenvalue of its pixels' blocks."""
@@ -252,10 +292,6 @@ class ImagingMatrix:
         )
         return sparse.csr_array(entries, shape=self.shape)
 
-    def linear_operator(self) -> LinearOperator:
-        """Return Psi for SciPy's iterative solvers, on flattened light fields and frames."""
-        return _FlatPsi(self)
-
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
         if self.weights.shape != reference.weights.shape:
@@ -272,74 +308,52 @@ class ImagingMatrix:
 
     def save(self, path: Path) -> None:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
-        with _psi_file(path, self.layout) as file:
-            file.attrs["sha256"] = self.checksum()
-            file["weights"] = self.weights
+        try:
+            with whole_file(path) as partial, h5py.File(partial, "w") as file:
+                file.attrs.update(
+                    format=FORMAT,
+                    binning=self.binning,
+                    camera=self.camera_json,
+                    sha256=self.checksum(),
+                )
+                if self.colour is not None:
+                    file["colour"] = self.colour
+                file["weights"] = self.weights
+        except OSError as fault:
+            raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
 
     @classmethod
     def load(cls, path: Path) -> ImagingMatrix:
         """Read a saved Psi; raises SensingError when it is not one, or damaged."""
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise SensingError(f"{path}: not an imaging matrix of this program")
-                colour = np.asarray(file["colour"]) if "colour" in file else None
-                matrix = cls(
-                    np.asarray(file["weights"]),
-                    colour,
-                    int(np.asarray(file.attrs["binning"])),
-                    str(file.attrs["camera"]),
-                )
-                expected = file.attrs["sha256"]
-        except (OSError, KeyError) as fault:
-            why = " ".join(str(fault).split())
-            raise SensingError(f"{path}: cannot be read as an imaging matrix ({why})") from fault
+        with stored_arrays(path, SensingError, "measure Psi again") as stored:
+            if stored.attributes.get("format") != FORMAT:
+                raise SensingError(f"{path}: not an imaging matrix of this program")
+            matrix = cls(
+                stored.array("weights"),
+                stored.array("colour") if "colour" in stored else None,
+                int(np.asarray(stored.attributes["binning"])),
+                str(stored.attributes["camera"]),
+            )
+            expected = stored.attributes["sha256"]
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix
 
 
-def save_planes(path: Path, layout: PsiLayout, planes: Iterable[NDArray[np.floating]]) -> None:
-    """Write a Psi whose weights come plane by plane, (y, x), as `ImagingMatrix.save` would.
+@dataclass(frozen=True, eq=False)
+class TransposedPsi:
+    """Psi^T: `psi.T @ frames` is a light field (v, u, y, x, c)."""
 
-    The planes of (shot, v, u) follow one another as in `ImagingMatrix.weights`; one colour stored.
-    """
-    if layout.shape[4] != 1:
-        raise SensingError("planes are written of a Psi with one stored colour")
-    digest = hashlib.sha256(f"{FORMAT}|{layout.binning}|{layout.camera_json}".encode())
-    colour = NO_COLOUR_MAP if layout.colour is None else layout.colour
-    with _psi_file(path, layout) as file:
-        weights = file.create_dataset("weights", layout.shape, np.float32)
-        for place, plane in zip(np.ndindex(layout.shape[:3]), planes, strict=True):
-            values = np.ascontiguousarray(plane, dtype=np.float32)
-            weights[(*place, slice(None), 0)] = values
-            digest.update(values.view(np.uint8).data)
-        digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
-        file.attrs["sha256"] = digest.hexdigest()
+    T: ImagingMatrix
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of Psi^T as a matrix."""
+        rows, columns = self.T.shape
+        return columns, rows
 
-@contextlib.contextmanager
-def _psi_file(path: Path, layout: PsiLayout) -> Iterator[h5py.File]:
-    """Yield an HDF5 file with all but weights and checksum; it appears whole or not at all."""
-    try:
-        with whole_file(path) as partial, h5py.File(partial, "w") as file:
-            file.attrs.update(format=FORMAT, binning=layout.binning, camera=layout.camera_json)
-            if layout.colour is not None:
-                file["colour"] = layout.colour
-            yield file
-    except OSError as fault:
-        raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+    def __matmul__(self, frames: ArrayLike) -> Array:
+        return self.T.adjoint(np.asarray(frames))
 
-
-class _FlatPsi(LinearOperator):
-    """Psi on flattened arrays."""
-
-    def __init__(self, psi: ImagingMatrix) -> None:
-        super().__init__(psi.weights.dtype, psi.shape)
-        self._psi = psi
-
-    def _matvec(self, x: Array) -> Array:
-        return self._psi.forward(x.reshape(self._psi.light_field_shape)).ravel()
-
-    def _rmatvec(self, x: Array) -> Array:
-        return self._psi.adjoint(x.reshape(self._psi.frames_shape)).ravel()
+    def __repr__(self) -> str:
+        return f"{self.T!r}.T"

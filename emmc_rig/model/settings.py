@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 import difflib
-from pathlib import Path
-from typing import Any, TypeVar
+import re
+from typing import Any, TypeVar, get_args
 
-import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 
 class Settings(BaseModel):
     """Base of every configuration object: frozen, no unknown keys, no coercion of NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, data: object) -> object:
+        """Refuse `yes` and `true` where a number is meant: Python would take them for 1."""
+        if isinstance(data, dict):
+            for name, field in cls.model_fields.items():
+                if _holds_truth(data.get(name)) and bool not in _parts(field.annotation):
+                    raise ValueError(f"{name}: a number is meant, not true or false")
+        return data
+
+
+def _holds_truth(value: object) -> bool:
+    if isinstance(value, (list, tuple)):
+        return any(map(_holds_truth, value))
+    return isinstance(value, bool)
+
+
+def _parts(annotation: object) -> set[object]:
+    return {annotation}.union(*(_parts(part) for part in get_args(annotation)))
 
 
 S = TypeVar("S", bound=Settings)
@@ -74,34 +93,46 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
         near = difflib.get_close_matches(key, valid, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
         return f"unknown key '{where}': {hint}"
-    message = first["msg"].replace("\n", " ")
+    message = _in_words(first["msg"].replace("\n", " "))
     if first["type"] == "value_error":
         return f"{where}: {message.removeprefix('Value error, ')}"
     return f"{where}: {message[:1].lower()}{message[1:]}"
 
 
+_WORDS = (
+    (r"valid tuple|valid list|valid array", "list"),
+    (r"valid dictionary or instance of \w+|valid dictionary|valid mapping", "mapping (key: value)"),
+    (r"a valid string", "text"),
+    (r"a valid integer", "a whole number"),
+    (r"a valid number", "a number"),
+    (r"a valid boolean", "true or false"),
+    (r"\bNone\b|NoneType", "nothing"),
+)
+
+
+def _in_words(message: str) -> str:
+    """Return a message of the validator in words of the file's format instead of Python's."""
+    for pattern, words in _WORDS:
+        message = re.sub(pattern, words, message)
+    return message
+
+
+def _kind(data: object) -> str:
+    """Return what plain data are, in words."""
+    if data is None:
+        return "nothing"
+    if isinstance(data, (list, tuple)):
+        return "a list"
+    if isinstance(data, bool):
+        return "true or false"
+    return "a number" if isinstance(data, (int, float)) else "text"
+
+
 def validated(cls: type[S], data: object, source: str, error: type[Exception]) -> S:
     """Return `cls` built from plain data; raise `error` with one line naming `source`."""
     if not isinstance(data, dict):
-        raise error(f"{source}: expected a mapping of settings, found {type(data).__name__}")
+        raise error(f"{source}: holds {_kind(data)}, where settings (key: value) are meant")
     try:
         return cls.model_validate(data)
     except ValidationError as fault:
         raise error(f"{source}: {explain(fault, cls)}") from fault
-
-
-def read_yaml(path: Path, error: type[Exception]) -> object:
-    """Return the content of a YAML file; raise `error` with one line when it cannot be read."""
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as fault:
-        raise error(f"{path}: no such file") from fault
-    except (OSError, UnicodeDecodeError) as fault:
-        raise error(f"{path}: cannot be read ({fault})") from fault
-    except yaml.YAMLError as fault:
-        mark = getattr(fault, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        problem = getattr(fault, "problem", None) or "malformed"
-        raise error(f"{path}: not valid YAML{where}: {problem}") from fault
-    except ValueError as fault:
-        raise error(f"{path}: not valid YAML: {fault}") from fault

@@ -3,7 +3,7 @@
 A capture that ends when the scene needs no more shots writes two kinds of line. `until`: from now
 on the wanted PSNR is `target_db`. `decided`: of the `shots` taken the PSNR stated is `stated_db`;
 `next` is the shot to take now; without one the `spared` shots are not taken, of `spared_frames`
-frames, for the reason in `why`.
+frames, for the reason in `why`. After an amendment of the plan it is decided anew.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def decisions(entries: Iterable[Entry]) -> list[Entry]:
 def ended(entries: Sequence[Entry]) -> Entry | None:
     """Return the decision that no more shots are needed; None while there is none, or no longer."""
     for entry in reversed(entries):
-        if entry["kind"] in ("decided", "until"):
+        if entry["kind"] in ("decided", "until", "amended"):
             return entry if entry.get("next", 0) is None else None
     return None
 

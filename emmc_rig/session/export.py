@@ -27,7 +27,7 @@ from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import whole_file
 from emmc_rig.session.readings import decoded, fused_shot, mean_dark, shot_frames, whiteboards
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
 Group = h5py.Group
@@ -84,6 +84,7 @@ def _write(
     data["kind"] = _texts([frame.kind for frame in frames])
     data["shot"] = [frame.bench.shot for frame in frames]
     data["masks_in"] = [frame.bench.masks_in for frame in frames]
+    data["plan"] = [line.get("plan", 0) for line in lines]
     data["view"] = [frame.view or (-1, -1) for frame in frames]
     data["sha256"] = _texts([line["sha256"] for line in lines])
     _fused(session, entry)
@@ -92,8 +93,8 @@ def _write(
     process["version"] = session.header["versions"]["emmc-rig"]
     for name, kind, text in (
         ("plan", "application/yaml", session.plan_yaml),
-        ("camera", "application/json", session.frozen_file("camera.json").decode()),
-        ("rig", "application/json", session.frozen_file("rig.json").decode()),
+        ("camera", "application/json", session.holding(CAMERA).decode()),
+        ("rig", "application/json", session.holding(RIG).decode()),
     ):
         note = _group(process, name, "NXnote")
         note["type"], note["data"] = kind, text

@@ -15,6 +15,14 @@ from typing import Any
 from emmc_rig.session.storage import Disk, read_whole
 
 Entry = dict[str, Any]
+NEEDED: dict[str, dict[str, type]] = {
+    "created": {"sha256": dict, "frames": int},
+    "amended": {"sha256": dict, "frames": int},
+    "frame": {"id": str, "file": str, "bytes": int, "sha256": str},
+    "discarded": {"id": str},
+    "decided": {"shots": list, "spared": list, "spared_frames": int},
+}
+"""What a line of a kind holds at least, and of which type: one without it counts as damaged."""
 _CHECK = ',"crc32":"'
 _TAIL_CHARACTERS = len(_CHECK) + len('01234567"}')
 _FRAME_HEAD = re.compile(rb'\{"kind":"frame","id":"[^"\\]*","file":"[^"\\]*","bytes":\d+')
@@ -29,7 +37,15 @@ def encode_line(entry: Entry) -> bytes:
 def decode_line(line: bytes) -> Entry | None:
     """Return the entry in a line without its newline; None for one that is torn or damaged."""
     body = _checked(line)
-    return None if body is None else _decoded(body)
+    entry = None if body is None else _decoded(body)
+    return entry if entry is not None and _whole(entry) else None
+
+
+def _whole(entry: Entry) -> bool:
+    """Whether an entry holds what every reader of its kind takes from it."""
+    return all(
+        isinstance(entry.get(name), kind) for name, kind in NEEDED.get(entry["kind"], {}).items()
+    )
 
 
 def _checked(line: bytes) -> bytes | None:
@@ -43,9 +59,9 @@ def _checked(line: bytes) -> bytes | None:
 def _decoded(body: bytes) -> Entry | None:
     try:
         entry = json.loads(body + b"}")
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    return entry if isinstance(entry, dict) else None
+    return entry if isinstance(entry, dict) and isinstance(entry.get("kind"), str) else None
 
 
 def heads(data: bytes) -> list[Entry]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import ended
 from emmc_rig.session.journal import heads
 from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete, is_session
@@ -30,7 +30,7 @@ def summary(folder: Path) -> Summary:
     """Return a session's summary; raises AppError when it cannot be read."""
     try:
         entries = heads((folder / JOURNAL).read_bytes())
-        header = json.loads((folder / HEADER).read_bytes())
+        header = parse_json((folder / HEADER).read_bytes(), str(folder / HEADER), AppError)
         title, created = str(header["title"]), str(header["created"])
     except OSError as fault:
         raise AppError(f"{folder}: no session, or not readable ({fault.strerror})") from fault
@@ -46,7 +46,8 @@ def summary(folder: Path) -> Summary:
     size = sum(entry["bytes"] for entry in stored.values())
     name = folder.resolve().name
     last = ended(entries)
-    planned = entries[0]["frames"] - (0 if last is None else last["spared_frames"])
+    begun = next(e for e in reversed(entries) if e["kind"] in ("created", "amended"))
+    planned = begun["frames"] - (0 if last is None else last["spared_frames"])
     return Summary(name, title, created, state, len(stored), planned, size)
 
 

@@ -5,7 +5,7 @@ Frames are decoded one at a time and averaged or fused as they come.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -153,9 +153,17 @@ def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
     first = session.stored.get(frames[0].id)
     if first is None:
         raise AppError(f"{session.folder}: frame {frames[0].id} was not captured yet; resume it")
-    mosaics = (frame.mosaic for frame, _ in decoded(session, frames))
-    return average(mosaics, first["exposure_s"], first["white_level_dn"], frames[0].id,
-                   lit=frames[0].kind != "dark")  # fmt: skip
+    # After an amendment of the plan repeats may differ in exposure: the most that are alike count.
+    entries = [session.stored.get(frame.id, first) for frame in frames]
+    (exposure_s, _), *_ = Counter(entry["exposure_s"] for entry in entries).most_common()
+    alike = [
+        frame
+        for frame, entry in zip(frames, entries, strict=True)
+        if frame.id not in session.stored or entry["exposure_s"] == exposure_s
+    ]
+    lit = frames[0].kind != "dark"
+    mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
+    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id, lit=lit)
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:

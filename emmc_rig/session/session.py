@@ -8,11 +8,16 @@
         frames.json    every frame to be taken, in the order of the capture
         frames/        00012-shot-02.dng: the camera's own bytes, named by place and frame
         journal.jsonl  what happened
+        amended-1-plan.yaml, ...camera.json, ...rig.json, ...frames.json
+                       the plan as edited meanwhile, and what follows from it: these hold now
+        session.lock   while a program writes the session: which one (see `lock`)
 
 Where a capture ends when the scene needs no more shots, the journal says which are spared: these
 count as not planned (see `decisions`).
 
-The first journal line holds the SHA-256 of the frozen files. A frame counts when its journal line
+The first journal line holds the SHA-256 of the frozen files, an `amended` line that of the files
+of an amendment: a frame that is taken stays what it was planned to be, and its line says by which
+plan it was taken. A frame counts when its journal line
 is readable and its file has the bytes that the line tells of; a frame that was taken twice counts
 by its last line. A file without a line is what a crash left between the two: it is taken again,
 under the same name. So nothing is lost that was counted, and nothing is there twice.
@@ -25,8 +30,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -34,15 +40,17 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.storage import (
     SYSTEM_DISK,
     Disk,
+    is_abandoned,
     is_part,
-    locked,
     make_folder_whole,
+    part_of,
     read_whole,
     write_whole,
 )
@@ -55,8 +63,10 @@ HEADER, PLAN, CAMERA, RIG, ORDER = (
     "frames.json",
 )
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
+AMENDED = (PLAN, CAMERA, RIG, ORDER)
 JOURNAL, FRAMES, REPORT, METRICS = "journal.jsonl", "frames", "report.html", "metrics.json"
-KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS}
+LOCK = "session.lock"
+KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK}
 FORMAT = 1
 
 
@@ -71,7 +81,7 @@ class Frozen:
 
 
 class Session:
-    """An open session. One program at a time may add to it: see `storage.locked`."""
+    """An open session. One program at a time may add to it: see `lock.held`."""
 
     def __init__(self, folder: Path, disk: Disk = SYSTEM_DISK) -> None:
         """Open a folder; raises AppError with one line when it is no session, or damaged."""
@@ -84,7 +94,11 @@ class Session:
                 f"{folder}: no session, it holds no {JOURNAL}; `emmc-rig session list` shows them"
             ) from fault
         except OSError as fault:
-            raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
+            raise AppError(f"{folder}: cannot be read ({fault.strerror}); mend that") from fault
+
+    def __repr__(self) -> str:
+        taken, needed = len(self.stored), len(self.needed)
+        return f"Session({str(self.folder)!r}, {taken} of {needed} frames)"
 
     @classmethod
     def create(
@@ -99,13 +113,7 @@ class Session:
         about: what else the header says. Raises AppError where the folder cannot be made.
         """
         folder = Path(os.path.abspath(folder))
-        files = {
-            HEADER: _json({"format": FORMAT, **about}),
-            PLAN: frozen.plan_yaml.encode(),
-            CAMERA: _json(frozen.camera),
-            RIG: _json(frozen.rig),
-            ORDER: _json_lines([frame.as_dict() for frame in frozen.frames]),
-        }
+        files = {HEADER: _json({"format": FORMAT, **about}), **_planned_files(frozen)}
         begun = {
             "kind": "created",
             "format": FORMAT,
@@ -117,8 +125,42 @@ class Session:
                 disk, folder, {**files, JOURNAL: encode_line(begun), f"{FRAMES}/": b""}
             )
         except OSError as fault:
-            raise AppError(f"{folder}: cannot be made ({fault.strerror})") from fault
+            raise AppError(
+                f"{folder}: cannot be made ({fault.strerror}); mend that, or name another folder"
+            ) from fault
         return cls(folder, disk)
+
+    def amend(self, frozen: Frozen, changes: Sequence[str]) -> Session:
+        """Let another plan hold from now on, and return the session opened again.
+
+        frozen: all that follows from it, frames that are taken as they are. changes: to the plan,
+        for people. Raises `OSError`; the earlier plan holds then.
+        """
+        number = self.amendments + 1
+        files = {amended_name(name, number): data for name, data in _planned_files(frozen).items()}
+        for name, data in files.items():
+            write_whole(self.disk, self.folder / name, data)
+        self.note(
+            "amended",
+            plan=number,
+            sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
+            frames=len(frozen.frames),
+            kept=len(self.stored),
+            changes=list(changes),
+            wall=wall_time(),
+        )
+        return Session(self.folder, self.disk)
+
+    def forget(self) -> None:
+        """Remove a session in which no frame was ever stored, unless it holds somebody's files."""
+        if any(entry["kind"] == "frame" for entry in self.journal.entries) or self.strangers()[1]:
+            return
+        with suppress(OSError):
+            # Whole or not at all: what a crash leaves of it is cleared like one never made.
+            part = part_of(self.folder)
+            self.disk.replace(self.folder, part)
+            self.disk.remove_folder(part)
+            self.disk.sync_folder(part.parent)
 
     @cached_property
     def created(self) -> Entry:
@@ -132,44 +174,74 @@ class Session:
             raise AppError(f"{self.folder}: made by a later emmc-rig; update this one")
         return first
 
+    @property
+    def amendments(self) -> int:
+        """How often the plan was amended: the number of the plan that holds, from 0."""
+        return sum(entry["kind"] == "amended" for entry in self.journal.entries)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """The SHA-256 of every frozen file, those of amendments too; raises AppError."""
+        found = dict(self.created["sha256"])
+        for entry in self.journal.entries:
+            if entry["kind"] == "amended":
+                found |= entry["sha256"]
+        return found
+
     def frozen_file(self, name: str) -> bytes:
         """Return a frozen file's bytes; raises AppError when it is not what it was."""
         path = self.folder / name
         try:
             data = read_whole(self.disk, path)
         except OSError as fault:
-            raise AppError(f"{path}: cannot be read ({fault.strerror})") from fault
-        if hashlib.sha256(data).hexdigest() != self.created["sha256"].get(name):
             raise AppError(
-                f"{path}: was changed after the session began; restore it, or begin another "
-                "session with the changed plan"
+                f"{path}: cannot be read ({fault.strerror}); restore it from a copy"
+            ) from fault
+        if hashlib.sha256(data).hexdigest() != self.digests.get(name):
+            raise AppError(
+                f"{path}: was changed after the session began; restore it from a copy, and to "
+                "change the plan edit another copy and name this session as its --out"
             )
         return data
+
+    def holding(self, name: str) -> bytes:
+        """Return plan, camera, rig or frames as they hold now: see `frozen_file`."""
+        return self.frozen_file(amended_name(name, self.amendments))
+
+    def _data(self, name: str) -> Any:
+        """Return what a file of JSON says, as it was frozen; raises AppError."""
+        return parse_json(self.frozen_file(name), str(self.folder / name), AppError)
 
     @cached_property
     def header(self) -> dict[str, Any]:
         """What session.json says."""
-        return json.loads(self.frozen_file(HEADER))
+        return self._data(HEADER)
 
     @cached_property
     def plan_yaml(self) -> str:
-        """The plan as the user wrote it."""
-        return self.frozen_file(PLAN).decode()
+        """The plan as the user wrote it, the last time."""
+        return self.holding(PLAN).decode()
 
     @cached_property
     def camera(self) -> dict[str, Any]:
         """The camera as planned, plain data of an `emmc_rig.model.camera.Camera`."""
-        return json.loads(self.frozen_file(CAMERA))
+        return self._data(amended_name(CAMERA, self.amendments))
 
     @cached_property
     def rig(self) -> dict[str, Any]:
         """What devices were asked for."""
-        return json.loads(self.frozen_file(RIG))
+        return self._data(amended_name(RIG, self.amendments))
 
     @cached_property
     def frames(self) -> tuple[PlannedFrame, ...]:
         """Every frame to be taken, in the order of the capture."""
-        return tuple(PlannedFrame.from_dict(one) for one in json.loads(self.frozen_file(ORDER)))
+        name = amended_name(ORDER, self.amendments)
+        try:
+            return tuple(PlannedFrame.from_dict(one) for one in self._data(name))
+        except (KeyError, TypeError, IndexError) as fault:
+            raise AppError(
+                f"{self.folder / name}: is no list of frames; restore it from a copy"
+            ) from fault
 
     @cached_property
     def stored(self) -> dict[str, Entry]:
@@ -252,38 +324,64 @@ class Session:
         _count(self.stored, entry)
 
     def make_ready(self) -> None:
-        """Make what a capture needs and somebody may have removed; raises `OSError`."""
+        """Make what a capture needs and somebody may have removed; raises `OSError`.
+
+        Parts that a killed program left go.
+        """
         self.disk.make_folder(self.folder / FRAMES)
         self.disk.sync_folder(self.folder)
+        for name in self.parts():
+            self.disk.remove(self.folder / name)
 
     def discard(self, frame_id: str, reason: str) -> None:
         """Count a frame as not taken; its file stays until it is taken again."""
         self.note("discarded", id=frame_id, reason=reason)
 
+    def parts(self) -> list[str]:
+        """Return the files that a killed program was writing, relative to the folder."""
+        found = [
+            name
+            for name, size in self.disk.sizes(self.folder).items()
+            if size >= 0 and is_abandoned(name)
+        ]
+        with suppress(FileNotFoundError):
+            # Frames are only written by whoever holds the session.
+            sizes = self.disk.sizes(self.folder / FRAMES)
+            found += [f"{FRAMES}/{name}" for name in sizes if is_part(name) and sizes[name] >= 0]
+        return found
+
     def strangers(self) -> tuple[list[str], list[str]]:
         """Return (leftovers of a crash, files of somebody else), relative to the folder."""
         ours = {entry["file"] for entry in self.stored.values()}
-        planned = {f"{place:05d}-{name}" for name, place in self._places.items()}
-        leftovers, foreign = [], []
+        known = {*KNOWN, *self.digests}
+        unfinished = {amended_name(name, self.amendments + 1) for name in AMENDED}
+        leftovers, foreign = self.parts(), []
         for name in self.disk.sizes(self.folder):
-            if is_part(name):
+            if name in unfinished:
                 leftovers.append(name)
-            elif name not in KNOWN:
+            elif name not in known and not is_part(name):
                 foreign.append(name)
         try:
             names = self.disk.sizes(self.folder / FRAMES)
         except FileNotFoundError:
             names = {}
         for name in names:
-            if is_part(name) or (name not in ours and Path(name).stem in planned):
-                leftovers.append(f"{FRAMES}/{name}")
-            elif name not in ours:
-                foreign.append(f"{FRAMES}/{name}")
+            if name in ours or is_part(name):
+                continue
+            taken = re.fullmatch(r"\d{5}-(.+)", Path(name).stem)
+            which = leftovers if taken and taken[1] in self._ids else foreign
+            which.append(f"{FRAMES}/{name}")
         return sorted(leftovers), sorted(foreign)
 
     @cached_property
     def _places(self) -> dict[str, int]:
         return {frame.id: place for place, frame in enumerate(self.frames)}
+
+    @cached_property
+    def _ids(self) -> set[str]:
+        """The names of all frames ever planned."""
+        earlier = [amended_name(ORDER, number) for number in range(self.amendments)]
+        return {one["id"] for name in earlier for one in self._data(name)}.union(self._places)
 
 
 def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
@@ -304,18 +402,14 @@ def _count(found: dict[str, Entry], entry: Entry) -> None:
 def found_complete(entries: Sequence[Entry]) -> bool:
     """Return whether every frame was found good after the last one was stored."""
     for entry in reversed(entries):
-        if entry["kind"] in ("complete", "frame", "discarded"):
+        if entry["kind"] in ("complete", "frame", "discarded", "amended"):
             return entry["kind"] == "complete"
     return False
 
 
-@contextmanager
-def only_program(session: Session) -> Iterator[None]:
-    """Hold the session; raises AppError where another program holds it."""
-    with locked(session.folder / JOURNAL) as held:
-        if not held:
-            raise AppError(f"{session.folder}: another program works on it; wait, or stop that one")
-        yield
+def amended_name(name: str, number: int) -> str:
+    """Return the file name of a frozen file by the amendment of that number; 0: as begun with."""
+    return f"amended-{number}-{name}" if number else name
 
 
 def is_session(folder: Path) -> bool:
@@ -326,6 +420,15 @@ def is_session(folder: Path) -> bool:
 def wall_time() -> str:
     """Return the time of day for people; nothing is reckoned with it."""
     return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
+
+
+def _planned_files(frozen: Frozen) -> dict[str, bytes]:
+    return {
+        PLAN: frozen.plan_yaml.encode(),
+        CAMERA: _json(frozen.camera),
+        RIG: _json(frozen.rig),
+        ORDER: _json_lines([frame.as_dict() for frame in frozen.frames]),
+    }
 
 
 def _json(data: Mapping[str, Any]) -> bytes:

@@ -8,9 +8,11 @@ its power between any two operations.
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -168,13 +170,32 @@ def _sync(descriptor: int) -> None:
 
 
 def part_of(path: Path) -> Path:
-    """Return the name under which a file is written before it takes its own."""
-    return path.with_name(f".{path.name}{PART}")
+    """Return the name under which a file is written before it takes its own, another each time."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PART}")
 
 
 def is_part(name: str) -> bool:
     """Return whether a name is one that `part_of` gives."""
     return name.startswith(".") and name.endswith(PART)
+
+
+def is_abandoned(name: str) -> bool:
+    """Return whether nobody on this computer writes a part any more."""
+    writer = re.search(rf"\.(\d+)-[0-9a-f]+{re.escape(PART)}$", name)
+    return is_part(name) and (writer is None or not _is_running(int(writer[1])))
+
+
+def _is_running(process: int) -> bool:
+    """Return whether another process of that number runs; Windows is not asked."""
+    if process == os.getpid() or os.name == "nt":
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_whole(disk: Disk, path: Path, data: bytes | memoryview) -> None:
@@ -217,8 +238,6 @@ def make_folder_whole(disk: Disk, folder: Path, files: Mapping[str, bytes]) -> N
     part = part_of(folder)
     try:
         _make_synced(disk, folder.parent)
-        if part.name in disk.sizes(folder.parent):
-            disk.remove_folder(part)
         disk.make_folder(part)
         for name, data in files.items():
             if name.endswith("/"):
@@ -242,33 +261,3 @@ def _make_synced(disk: Disk, folder: Path) -> None:
         _make_synced(disk, folder.parent)
         disk.make_folder(folder)
         disk.sync_folder(folder.parent)
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[bool]:
-    """Hold a file for this program; yields False where another one holds it.
-
-    The lock goes with the program that holds it, however that ends. Where files cannot be locked
-    (Windows, some network disks) nothing is held.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        yield True
-        return
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
-        yield True
-        return
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-        except OSError:
-            yield True
-        else:
-            yield True
-    finally:
-        os.close(descriptor)

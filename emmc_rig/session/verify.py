@@ -16,7 +16,7 @@ from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Entry
-from emmc_rig.session.session import FROZEN, Session
+from emmc_rig.session.session import Session
 from emmc_rig.session.storage import Disk
 
 PIECE_BYTES = 1 << 20
@@ -133,7 +133,7 @@ def verify(
 ) -> Verdict:
     """Return what became of a session; raises AppError when its plan cannot be read at all."""
     frozen = []
-    for name in FROZEN:
+    for name in session.digests:
         try:
             session.frozen_file(name)
         except AppError as fault:

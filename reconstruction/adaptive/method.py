@@ -48,7 +48,7 @@ from reconstruction.adaptive.uncertainty import deviation, held_out
 from reconstruction.choices import darkness, smooth_guess
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import checked_inputs, checked_noise
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.tv import TVSettings, reconstruct_tv
 from reconstruction.verdict.shadow import Shadow, relief, shadow
 
@@ -222,7 +222,7 @@ def reconstruct_adaptive(
     return Reconstruction(
         method="adaptive",
         light_field=light_field,
-        status="doubtful" if judged else "converged",
+        status=Status.DOUBTFUL if judged else Status.CONVERGED,
         advice="; ".join(judged),
         steps=total,
         objective=(),

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from reconstruction.method import Sensitivity
+from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
 
 Level = Literal["trust", "doubt", "do not use"]
@@ -41,8 +43,6 @@ OFF = Limits(0.0215, 0.05)
 """Fine soil and leaves leave up to 2 % of a clean frame's readings far off all around them."""
 BAD = Limits(0.02, 0.1)
 """Of the pixels, found bad by screening: where there are so many, others were not found."""
-BAD_FOR_TV = 2.0
-"""Times that limit, as total variation evens out single wrong readings."""
 SATURATED = Limits(0.14, 0.35)
 BLIND = Limits(0.05, 0.25)
 NOISE_SHARE = Limits(0.5, 0.9)
@@ -54,12 +54,9 @@ UNEXPLAINED = Limits(0.75, 1.1)
 """Beyond 1: the smooth picture alone foretells the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
-OTHERS = 0.7
-"""Of the limits on Psi's errors, for all methods but tv: they lose 3 dB sooner."""
 LEFT_OUT = Limits(0.4, 1.0)
-LEFT_OUT_FOR_SURFACES = Limits(0.7, 1.0)
-"""One shot nearly does for a method that carries one picture to all views."""
-SURFACES = ("adaptive", "adaptive-fast")
+LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
+"""For methods to which one shot nearly does."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
@@ -115,12 +112,16 @@ def judged(evidence: Evidence) -> Verdict:
     return Verdict(found[0].level if found else "trust", tuple(found), evidence)
 
 
+def _sensitivity(e: Evidence) -> Sensitivity:
+    return METHODS[e.method].sensitivity if e.method in METHODS else Sensitivity()
+
+
 def _shots(e: Evidence) -> Iterator[Reason]:
     if len(e.brightness) < 2:
         return
     if e.left_out:
         share = len(e.left_out) / len(e.brightness)
-        limits = LEFT_OUT_FOR_SURFACES if e.method in SURFACES else LEFT_OUT
+        limits = LEFT_OUT_OF_ONE if _sensitivity(e).one_shot else LEFT_OUT
         shots = ", ".join(str(shot + 1) for shot in e.left_out)
         yield Reason(
             f"{len(e.left_out)} of {len(e.brightness)} shots were left out, dark or the same as "
@@ -190,7 +191,7 @@ def _patience(e: Evidence, power: float) -> float:
     They set several shots against one another, and mislead methods that assume more than tv.
     """
     shots = sum(one is not None for one in e.strengths)
-    return shots**-power * (1 if e.method == "tv" else OTHERS)
+    return shots**-power * _sensitivity(e).psi
 
 
 def _masks(e: Evidence) -> Iterator[Reason]:
@@ -249,7 +250,7 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
             OFF.level(e.off),
         )
     shots = len(e.strengths)
-    bad = BAD.times(shots**0.75 * (BAD_FOR_TV if e.method == "tv" else 1))
+    bad = BAD.times(shots**0.75 * _sensitivity(e).bad_pixels)
     yield Reason(
         f"{e.bad:.1%} of the pixels are bad and not listed",
         e.bad,

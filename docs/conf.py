@@ -1,0 +1,56 @@
+"""Sphinx: the pages of docs/, the reference from docstrings, examples whose pictures it makes."""
+
+from pathlib import Path
+
+import typer
+from typer.cli import get_docs_for_click
+
+import emmc_rig
+from emmc_rig.cli import app as command_line
+
+project = "emmc-rig"
+author = "the developers of emmc-rig"
+copyright = "2026, the developers of emmc-rig"
+version = release = emmc_rig.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
+]
+html_theme = "furo"
+html_title = f"emmc-rig {release}"
+exclude_patterns = ["_build", "examples", "gallery/index.md"]
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+suppress_warnings = ["config.cache"]  # the gallery's settings hold classes
+
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+python_use_unqualified_type_names = True
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/plot_",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "remove_config_comments": True,
+}
+
+
+def write_commands(_: object) -> None:
+    """Write commands.md: every command with its options, from the command line itself."""
+    command = typer.main.get_command(command_line)
+    context = typer.Context(command, info_name="emmc-rig")
+    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Commands")
+    Path(__file__).with_name("commands.md").write_text(text, encoding="utf-8")
+
+
+def setup(app: object) -> None:
+    """Register what happens before pages are read."""
+    app.connect("builder-inited", write_commands)  # type: ignore[attr-defined]

@@ -1,0 +1,1 @@
+"""Which method and settings to take, from a chart of earlier measurements."""

@@ -1,0 +1,167 @@
+"""The command `emmc-rig calibrate`: whiteboards to Psi, their plan, and checks of both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.errors import AppError
+
+DEFAULT_CAMERA = "rgbw-bayer-1shot"
+
+
+def calibrate(
+    session: Annotated[
+        Path | None,
+        typer.Argument(help="a session of `capture`; without one, a simulated bench"),
+    ] = None,
+    camera: Annotated[
+        str, typer.Option("--camera", help="a shipped camera or a YAML file")
+    ] = DEFAULT_CAMERA,
+    size: Annotated[str, typer.Option("--size", help="ROWSxCOLUMNS of samples")] = "192x256",
+    route: Annotated[
+        str, typer.Option("--route", help="auto (the surest), parametric, mixed or free")
+    ] = "auto",
+    plan: Annotated[
+        bool, typer.Option("--plan", help="write how many whiteboards, of which kind, it takes")
+    ] = False,
+    check: Annotated[
+        str | None,
+        typer.Option(
+            "--check",
+            help="measure what calibration reaches on the simulated bench: psi, bound, plan, "
+            "sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, lamp, ...); "
+            "commas between, or all; exit code 1 where a target is missed",
+        ),
+    ] = None,
+    drift: Annotated[
+        Path | None,
+        typer.Option(
+            "--drift",
+            help="a folder of frames.h5: does the Psi of --known still fit? Writes one that does",
+        ),
+    ] = None,
+    known: Annotated[
+        Path, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
+    ] = Path("emmc-calibration"),
+    target: Annotated[
+        float, typer.Option("--target", help="relative error of Psi to plan for")
+    ] = 0.005,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="with --plan: at most so many")
+    ] = None,
+    rays: Annotated[
+        int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
+    ] = 512,
+    stage: Annotated[
+        bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
+    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
+) -> None:
+    """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
+    from emmc_rig.calibrate.bench import BenchTruth
+    from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
+    from emmc_rig.commands.bars import shown_bars
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.files.results import parse_size, result_folder
+
+    if drift is not None:
+        _judge_drift(known, drift, out)
+        return
+    if session is not None:
+        if plan or check is not None or stage:
+            raise typer.BadParameter("--plan, --check and --stage are for the simulated bench")
+        _calibrate_session(session, route, out)
+        return
+    if not 0 < target < 1:
+        raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
+    shape = parse_size(size)
+    assert shape is not None
+    settings = CalibrateSettings(
+        camera,
+        find_camera(camera),
+        shape,
+        route,
+        target,
+        seed,
+        BenchTruth(rays_per_view=rays),
+        map_stage=stage,
+        most_frames=frames,
+    )
+    if check is not None:
+        from rich.console import Console
+        from rich.table import Table
+
+        from emmc_rig.study.checks.command import run_checks
+
+        with result_folder(out) as folder:
+            metrics = run_checks(settings, check, folder)
+        table = Table("target", "measured", "asked", "")
+        for row in metrics["rows"]:
+            table.add_row(row["what"], row["measured"], row["asked"], row["verdict"])
+        Console().print(table)
+        typer.echo(f"read {out / 'metrics.json'}")
+        missed = [row["what"] for row in metrics["rows"] if row["verdict"] == "missed"]
+        if missed:
+            raise AppError(f"{len(missed)} of {len(metrics['rows'])} missed: {'; '.join(missed)}")
+        return
+    if plan:
+        with result_folder(out) as folder:
+            metrics = write_plan(settings, folder)
+        typer.echo(
+            f"{metrics['frames']} frames for a relative error of Psi of "
+            f"{metrics['expected_relative_error']:.2%}, the model's own included"
+        )
+        typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
+        return
+    with result_folder(out) as folder, shown_bars() as bars:
+        metrics = run_calibrate(settings, folder, bars)
+    chosen = metrics["chosen"]
+    typer.echo(
+        f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
+        f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
+        f"(the design is off by {metrics['design_relative_error']:.0%})"
+    )
+    for line in metrics["findings"]:
+        typer.echo(f"found: {line}")
+    for line in metrics["advice"]:
+        typer.echo(f"measure again: {line}")
+    typer.echo(f"open {out / 'report.html'}")
+
+
+def _calibrate_session(path: Path, route: str, out: Path) -> None:
+    import emmc_rig as emmc
+    from emmc_rig.commands.bars import shown_bars
+    from emmc_rig.files.results import result_folder
+
+    captured = emmc.Session(path)
+    with result_folder(out) as folder, shown_bars() as bars:
+        calibration = emmc.calibrate(captured, route, watcher=bars)
+        calibration.write(folder)
+    metrics = calibration.metrics
+    chosen = metrics["chosen"]
+    judged = metrics["held_out"][chosen]
+    typer.echo(
+        f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
+        f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
+    )
+    for line in metrics["findings"]:
+        typer.echo(f"found: {line}")
+    for line in metrics["advice"]:
+        typer.echo(f"measure again: {line}")
+    typer.echo(f"open {out / 'report.html'}")
+
+
+def _judge_drift(known: Path, frames: Path, out: Path) -> None:
+    from emmc_rig.calibrate.drift import run_drift
+    from emmc_rig.files.results import result_folder
+
+    with result_folder(out) as folder:
+        metrics = run_drift(known, frames, folder)
+    typer.echo(metrics["words"])
+    for kind, value in metrics["values"].items():
+        typer.echo(f"    {kind} {value:+.4g} +- {metrics['deviations'][kind]:.2g}")
+    typer.echo(f"use {out / 'psi.h5'}")

@@ -1,0 +1,64 @@
+"""The command `emmc-rig cameras`: the cameras known, and a drawing of one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def _shown(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def cameras(
+    name: Annotated[
+        str | None, typer.Argument(help="a shipped camera or a YAML file; none: list all")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder for the drawing and its metrics")
+    ] = None,
+) -> None:
+    """List the cameras known, or draw one: masks, weights, sampling, condition."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    import emmc_rig as emmc
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.pages.camera_sheet import (
+        camera_figures,
+        camera_rows,
+        draw_camera,
+    )
+
+    if name is None:
+        table = Table("camera", "sensor", "shots", "masks", "sampling", "light", box=SIMPLE)
+        for row in camera_rows():
+            table.add_row(
+                f"[bold]{row.name}[/]\n{row.title}",
+                row.sensor,
+                str(row.shots),
+                str(row.masks),
+                row.sampling_rate,
+                f"{row.light_percent:.0f} %",
+            )
+        Console().print(table)
+        return
+    camera = emmc.camera(name)
+    figures = camera_figures(camera)
+    folder_name = out or Path(f"camera-{Path(name).stem}")
+    with result_folder(folder_name) as folder:
+        draw_camera(camera, folder / "camera.png")
+        write_metrics(folder, {**figures, "command": command_line(), "versions": versions()})
+    table = Table("figure", "value", title=camera.title)
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            for mask, measured in value.items():
+                for what, figure in measured.items():
+                    table.add_row(f"{mask}: {what}", _shown(figure))
+        else:
+            table.add_row(key, _shown(value))
+    Console().print(table)
+    typer.echo(f"open {folder_name / 'camera.png'}")

@@ -1,0 +1,136 @@
+"""The command `emmc-rig capture`: options in, a session on the disk."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from emmc_rig.rig.rig_config import ImagedRig
+
+OptionalPath = Path | None
+
+
+def capture(
+    plan: Annotated[
+        OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
+    ] = None,
+    new: Annotated[
+        str | None, typer.Option("--new", help="write a commented plan for this camera, and end")
+    ] = None,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="print the JSON schema of a plan, for editors, and end")
+    ] = False,
+    rig: RigOption = None,
+    scene: RigSceneOption = "deep-occlusions",
+    size: RigSizeOption = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
+    rays: Annotated[
+        int | None, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
+    ] = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
+    ] = False,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            help="PSNR, as 30dB: choose among the plan's shots, stop when no more are needed",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
+    ] = False,
+    out: Annotated[
+        OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
+    ] = None,
+) -> None:
+    """Run a plan on the rig; run it again to go on where it stopped. Ctrl-C: after this frame."""
+    from emmc_rig.capture.plan import schema_text
+
+    if schema:
+        typer.echo(schema_text(), nl=False)
+        return
+    if new is not None:
+        _write_plan(new, out or Path("plan.yaml"))
+        return
+    if plan is None:
+        raise typer.BadParameter("name a plan, or write one with --new CAMERA")
+    from emmc_rig.files.results import parse_psnr, parse_size
+    from emmc_rig.rig.rig_config import ImagedRig
+
+    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
+    imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time, **traced)
+    until_db = None if until is None else parse_psnr(until, "--until")
+    _run(plan, rig, imaged, until_db, dry_run, out)
+
+
+def _write_plan(name: str, path: Path) -> None:
+    from emmc_rig.capture.command import write_new
+    from emmc_rig.capture.new_plan import new_plan
+    from emmc_rig.files.cameras import find_camera
+
+    write_new(path, new_plan(name, find_camera(name)))
+    typer.echo(f"wrote {path}; edit it, then: emmc-rig capture {path} --rig simulated")
+
+
+def _run(
+    plan: Path,
+    rig: str | None,
+    imaged: ImagedRig,
+    until_db: float | None,
+    dry_run: bool,
+    out: Path | None,
+) -> None:
+    from emmc_rig.capture.command import capture_session
+    from emmc_rig.capture.control import Control
+    from emmc_rig.capture.display import CaptureDisplay
+    from emmc_rig.capture.estimate import Estimate
+    from emmc_rig.files.results import shown_bytes, shown_seconds
+    from emmc_rig.rig.rig_config import rig_description
+    from emmc_rig.session.decisions import decided_words, ended
+    from emmc_rig.session.session import REPORT
+
+    chosen = None if rig is None else rig_description(rig, imaged)
+    console, control = Console(stderr=True), Control()
+    display = CaptureDisplay(console, control)
+
+    def ask(what: str) -> None:
+        if not sys.stdin.isatty():
+            raise AppError(
+                f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
+            )
+        with display.aside():
+            input(f"please {what}, then press Enter ")
+
+    def agreed(expected: Estimate) -> bool:
+        if expected.frames:
+            most = "" if until_db is None else "at most "
+            hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
+            display.tell(
+                f"{most}{expected.frames} frames to take, about "
+                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}"
+            )
+        return not dry_run
+
+    with display.shown():
+        captured = capture_session(plan, chosen, out, until_db, display, ask, agreed, control)
+    if captured is None:
+        return
+    session, outcome = captured
+    retried = f", {outcome.retries} retries" if outcome.retries else ""
+    typer.echo(
+        f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "
+        f"{shown_seconds(outcome.seconds)}{retried}; in {session.folder}"
+    )
+    last = ended(session.journal.entries)
+    if last is not None:
+        typer.echo(decided_words(last))
+    typer.echo(f"open {session.folder / REPORT}")

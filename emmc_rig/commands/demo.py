@@ -1,0 +1,75 @@
+"""The command `emmc-rig demo`: the whole loop on the simulated rig, and its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.commands.options import (
+    DEFAULT_CAMERA,
+    DEFAULT_SCENE,
+    CameraOption,
+    DictionaryOption,
+    MethodOption,
+    OutOption,
+    SceneOption,
+    SeedOption,
+    ShotsOption,
+    SizeOption,
+)
+from emmc_rig.commands.verdict import end_with_verdict
+from emmc_rig.errors import AppError
+
+
+def demo(
+    scene: SceneOption = DEFAULT_SCENE,
+    camera: CameraOption = DEFAULT_CAMERA,
+    shots: ShotsOption = None,
+    seed: SeedOption = 0,
+    size: SizeOption = None,
+    mu: Annotated[
+        float | None, typer.Option("--mu", help="weight of the regulariser (default: from noise)")
+    ] = None,
+    chroma_weight: Annotated[
+        float, typer.Option("--chroma-weight", help="of chrominance differences; 1: DV_1")
+    ] = 2.0,
+    method: MethodOption = "tv",
+    dictionary: DictionaryOption = None,
+    out: OutOption = Path("emmc-demo"),
+) -> None:
+    """Run the whole loop on the simulated rig, and write a report."""
+    import emmc_rig as emmc
+    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.demo import DemoSettings, run_demo
+    from emmc_rig.files.results import parse_size, result_folder
+    from emmc_rig.model.settings import validated
+    from reconstruction.methods import MethodSettings
+
+    described = emmc.camera(camera, shots)
+    chosen = {"tv": {"mu": mu, "chroma_weight": chroma_weight}}
+    solver = validated(MethodSettings, chosen, "solver settings", AppError)
+    settings = DemoSettings(
+        scene,
+        camera,
+        described,
+        parse_size(size),
+        seed,
+        method=method,
+        dictionary=dictionary,
+        solver=solver,
+    )
+    for warning in described.warnings():
+        say("warning", warning)
+    with result_folder(out) as folder, shown_bars() as bars:
+        metrics = run_demo(settings, folder, bars)
+    gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
+    typer.echo(
+        f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
+        f"copied centre view; SSIM {metrics['ssim']:.3f}; Psi to "
+        f"{metrics['psi_relative_error']:.2%}; {metrics['status']}"
+        + (f" ({metrics['advice']})" if metrics["advice"] else "")
+    )
+    typer.echo(f"open {out / 'report.html'}")
+    end_with_verdict(metrics["verdict"], strict=False)

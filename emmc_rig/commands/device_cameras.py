@@ -1,0 +1,247 @@
+"""`emmc-rig devices` for cameras: info, snap and live, on whatever `open_camera` opens."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
+from rich.table import Table
+from rich.text import Text
+
+from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from drivers.camera import Camera
+    from drivers.raw import RawFrame
+    from emmc_rig.pages.frame_view import FrameFigures
+
+SAVE_KEY, END_KEYS = "s", "q\x1b"
+
+CameraSpec = Annotated[
+    str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+]
+RigOption = Annotated[
+    str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
+]
+ExposureOption = Annotated[
+    float | None, typer.Option("--exposure", help="in seconds (default: as the camera is set)")
+]
+GainOption = Annotated[
+    float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
+]
+OutFolder = Annotated[Path, typer.Option("--out", help="folder to save frames in")]
+
+
+def open_camera(spec: str) -> Camera:
+    """Open a camera by name; `emmc_rig.rig.hardware` takes a second to load."""
+    from emmc_rig.rig.hardware import open_camera as opened
+
+    return opened(spec)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program's `devices`."""
+    app.command("camera")(camera_info)
+    app.command("snap")(snap)
+    app.command("live")(live)
+
+
+def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
+    """Tell what a camera is, and what it can be set to."""
+    camera = _chosen(camera, rig)
+    table = Table("camera", camera, box=SIMPLE)
+    with closing(open_camera(camera)) as device:
+        for name, value in camera_rows(device):
+            table.add_row(name, value)
+    Console().print(table)
+
+
+def snap(
+    camera: CameraSpec = "ptp:",
+    rig: RigOption = None,
+    exposure: ExposureOption = None,
+    gain: GainOption = None,
+    count: Annotated[int, typer.Option("--count", min=1, help="number of frames")] = 1,
+    out: OutFolder = Path("emmc-snaps"),
+) -> None:
+    """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
+    from emmc_rig.pages.frame_view import frame_figures
+
+    with closing(open_camera(_chosen(camera, rig))) as device:
+        folder = frames_folder(out)
+        choose(device, exposure, gain)
+        for _ in range(count):
+            with _progress(device):
+                frame = device.snap()
+            saved = save_frame(folder, frame)
+            typer.echo(f"{saved}: {frame_line(frame, frame_figures(frame))}")
+
+
+def live(
+    camera: CameraSpec = "ptp:",
+    rig: RigOption = None,
+    exposure: ExposureOption = None,
+    gain: GainOption = None,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="stop after so many (default: Ctrl-C)")
+    ] = None,
+    save_every: Annotated[
+        int | None, typer.Option("--save-every", min=1, help="save every so many frames")
+    ] = None,
+    out: OutFolder = Path("emmc-snaps"),
+) -> None:
+    """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
+    from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text
+
+    folder = frames_folder(out) if save_every else None
+    console = Console()
+    device = open_camera(_chosen(camera, rig))
+    with closing(device), pressed_keys() as pressed, suppress(KeyboardInterrupt):
+        choose(device, exposure, gain)
+        showing = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        with showing or nullcontext(), closing(_frames(device)) as stream:
+            for number, frame in enumerate(itertools.islice(stream, frames), start=1):
+                figures = frame_figures(frame)
+                line = f"{number}: {frame_line(frame, figures)}"
+                key = pressed()
+                if key == SAVE_KEY or (save_every and number % save_every == 0):
+                    folder = folder or frames_folder(out)
+                    line += f"; saved {save_frame(folder, frame)}"
+                if showing is None:
+                    typer.echo(line)
+                else:
+                    drawn = Group(histogram_text(histogram(frame)), Text(line))
+                    showing.update(drawn, refresh=True)
+                if key and key in END_KEYS:
+                    break
+
+
+def simulated_protocol(rig: str) -> str:
+    """Return the stages' protocol of `--rig simulated[:PROTOCOL]`; typer's error for any other."""
+    kind, _, protocol = rig.partition(":")
+    if kind != "simulated":
+        raise typer.BadParameter(
+            f"--rig {rig}: only simulated rigs are known; name real devices by --stage or --camera"
+        )
+    return protocol or "zaber"
+
+
+def _chosen(camera: str, rig: str | None) -> str:
+    if rig is None:
+        return camera
+    simulated_protocol(rig)
+    return "simulated"
+
+
+def camera_rows(device: Camera) -> Iterator[tuple[str, str]]:
+    """Yield name and value of what a camera says of itself, without exposing a frame."""
+    identity = device.identity
+    for name in ("maker", "model", "serial", "firmware"):
+        yield name, getattr(identity, name) or "not told"
+    low_s, high_s = device.exposure_limits_s
+    yield "exposure", f"{device.exposure_s:g} s, from {low_s:g} to {high_s:g} s"
+    low, high = device.gain_limits
+    yield "gain", f"{device.gain:g}, from {low:g} to {high:g}"
+    details = getattr(device, "details", None)
+    yield from details().items() if details is not None else ()
+
+
+def choose(device: Camera, exposure_s: float | None, gain: float | None) -> None:
+    """Set what was asked for; raises AppError for what is not positive."""
+    try:
+        if exposure_s is not None:
+            device.set_exposure_s(exposure_s)
+        if gain is not None:
+            device.set_gain(gain)
+    except ValueError as fault:
+        raise AppError(str(fault)) from fault
+
+
+def frame_line(frame: RawFrame, figures: FrameFigures) -> str:
+    """Return a frame's figures in one line."""
+    rows, columns = frame.mosaic.shape
+    exposed = "" if frame.exposure_s is None else f", {frame.exposure_s:g} s"
+    brightest = ", ".join(f"{name} {level:.0%}" for name, level in figures.brightest.items())
+    return (
+        f"{rows}x{columns} {frame.cfa}{exposed}; brightest {brightest}; "
+        f"saturated {figures.saturated:.2%}; focus {figures.focus:.4f}"
+    )
+
+
+def frames_folder(out: Path) -> Path:
+    """Return the folder, made if need be; raises AppError where it cannot be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be made ({fault.strerror})") from fault
+    return out
+
+
+def save_frame(folder: Path, frame: RawFrame) -> Path:
+    """Save a frame under the next free number and return the path of the camera's own bytes.
+
+    Beside it a preview (PNG) and the facts (JSON). Every file appears whole or not at all, the
+    camera's bytes last; no name comes from the camera. Raises AppError.
+    """
+    import cv2
+
+    from emmc_rig.pages.frame_view import preview
+    from emmc_rig.session.frame_file import frame_facts, suffix_of
+    from emmc_rig.session.storage import SYSTEM_DISK, write_whole
+
+    number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
+    stem = folder / f"frame-{number:04d}"
+    original = stem.with_suffix(suffix_of(frame))
+    ok, png = cv2.imencode(".png", preview(frame))
+    if not ok:
+        raise AppError(f"{stem}: its preview cannot be made")
+    facts = {
+        "camera_bytes": original.name,
+        "sha256": frame.sha256,
+        **frame_facts(frame),
+    }
+    try:
+        told = (json.dumps(facts, indent=2) + "\n").encode()
+        write_whole(SYSTEM_DISK, stem.with_suffix(".png"), png.tobytes())
+        write_whole(SYSTEM_DISK, stem.with_suffix(".json"), told)
+        write_whole(SYSTEM_DISK, original, frame.original)
+    except OSError as fault:
+        raise AppError(f"{original}: cannot be written ({fault.strerror})") from fault
+    return original
+
+
+def _frames(device: Camera) -> Generator[RawFrame, None, None]:
+    """Yield frames as fast as the camera gives them."""
+    stream = getattr(device, "stream", None)
+    if stream is not None:
+        yield from stream()
+        return
+    while True:
+        yield device.snap()
+
+
+@contextmanager
+def _progress(device: Any) -> Iterator[None]:
+    """Show how a picture comes over the wire, where the camera tells and somebody looks."""
+    console = Console(stderr=True)
+    if not console.is_terminal or not hasattr(device, "on_progress"):
+        yield
+        return
+    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("picture")
+        device.on_progress = lambda done, size: progress.update(task, completed=done, total=size)
+        try:
+            yield
+        finally:
+            device.on_progress = lambda done, size: None

@@ -1,0 +1,300 @@
+"""`emmc-rig devices`: what is connected, and single steps with it by hand.
+
+Every command works alike on a real stage (`--stage`) and on a simulated one (`--rig simulated`).
+Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and leaves it stopped.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from emmc_rig.capture.signals import ENDING, handled
+from emmc_rig.commands.device_cameras import register, simulated_protocol
+from emmc_rig.errors import AppError
+
+if TYPE_CHECKING:
+    from drivers.stage import HostStage
+
+app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
+_told = Console(stderr=True)
+
+StageOption = Annotated[
+    str | None,
+    typer.Option(
+        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file that wires names to axes"
+    ),
+]
+RigOption = Annotated[
+    str | None,
+    typer.Option("--rig", help="simulated: of Zaber devices; or simulated:grbl, simulated:apt"),
+]
+AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (default: all)")]
+
+
+register(app)
+
+
+@app.command("list")
+def list_devices(rig: RigOption = None) -> None:
+    """List serial ports (adapter, what usually answers there, who holds them) and USB cameras."""
+    from drivers.clock import SYSTEM_CLOCK
+    from drivers.ports import holder_of, list_serial_ports
+
+    if rig is not None:
+        from emmc_rig.rig.hardware import simulated_bus
+        from emmc_rig.rig.stage_config import PROTOCOLS
+
+        simulated_protocol(rig)
+        _list_cameras(simulated_bus(SYSTEM_CLOCK))
+        table = Table("stage", box=SIMPLE)
+        for protocol in PROTOCOLS:
+            table.add_row(f"--rig simulated:{protocol}")
+        Console().print(table)
+        return
+    _list_cameras()
+    ports = list_serial_ports()
+    if not ports:
+        typer.echo("no serial port: plug a stage in, or try --rig simulated")
+        return
+    table = Table("port", "USB id", "serial number", "description", "guess", "held by", box=SIMPLE)
+    for port in ports:
+        known = port.vendor_id is not None and port.product_id is not None
+        usb_id = f"{port.vendor_id:04x}:{port.product_id:04x}" if known else ""
+        table.add_row(
+            port.device,
+            usb_id,
+            port.serial_number,
+            port.description,
+            port.guess,
+            holder_of(port.device),
+        )
+    Console().print(table)
+
+
+def _list_cameras(backend: Any = None) -> None:
+    """Print the PTP and USB3 Vision cameras that are plugged in; `backend`: of pyusb."""
+    from drivers.errors import DriverError
+    from drivers.ptp_usb import PTP_INTERFACE
+    from drivers.u3v_codec import CONTROL
+    from drivers.usb import list_devices as list_usb
+
+    found = []
+    for kind, interface in (("ptp", PTP_INTERFACE), ("u3v", CONTROL)):
+        try:
+            found += [(kind, one) for one in list_usb(interface, backend)]
+        except DriverError as fault:
+            typer.echo(f"USB cameras cannot be listed: {fault}")
+            return
+    if not found:
+        typer.echo("no USB camera: plug one in and switch it on, or try --camera simulated")
+        return
+    table = Table("camera", "maker", "model", "may be opened", box=SIMPLE)
+    for kind, one in found:
+        allowed = "yes" if one.accessible else "no: see `emmc-rig devices udev-rule`"
+        table.add_row(f"{kind}:{one.serial}", one.maker, one.model, allowed)
+    Console().print(table)
+
+
+@app.command()
+def probe(
+    ports: Annotated[
+        list[str] | None, typer.Argument(help="ports to ask (default: those of a known adapter)")
+    ] = None,
+    rig: RigOption = None,
+) -> None:
+    """Ask ports what answers there; nothing moves."""
+    from drivers.ports import list_serial_ports
+    from emmc_rig.rig.hardware import probe_port, probe_simulated
+
+    # Silence in all protocols but one is what a probe expects.
+    logging.getLogger("drivers").setLevel(logging.ERROR)
+    if rig is not None:
+        protocol = simulated_protocol(rig)
+        typer.echo(f"simulated:{protocol}: {probe_simulated(protocol)}")
+        return
+    chosen = ports or [port.device for port in list_serial_ports() if port.guess]
+    if not chosen:
+        raise AppError("no port with a known adapter: name the ports to ask")
+    for port in chosen:
+        typer.echo(f"{port}: {probe_port(port) or 'nobody answers in Zaber ASCII, Grbl or APT'}")
+
+
+@app.command()
+def info(stage: StageOption = None, rig: RigOption = None) -> None:
+    """Show every axis of a stage: homed, position, limits, speed."""
+    with _opened(stage, rig) as opened:
+        _show(opened)
+
+
+@app.command()
+def home(axes: AxesArgument = None, stage: StageOption = None, rig: RigOption = None) -> None:
+    """Find the reference of the axes, and show where they are."""
+    with _opened(stage, rig) as opened:
+        opened.home(axes or None)
+        _show(opened)
+
+
+@app.command()
+def jog(
+    axis: Annotated[str, typer.Argument(help="name of the axis")],
+    distance_um: Annotated[float, typer.Argument(help="distance in um, or a place with --to")],
+    to: Annotated[bool, typer.Option("--to", help="move to this place, not by it")] = False,
+    home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
+    speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
+    stage: StageOption = None,
+    rig: RigOption = None,
+) -> None:
+    """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
+    with _opened(stage, rig) as opened:
+        if speed_um_s is not None:
+            opened.set_speed_um_s(axis, speed_um_s)
+        if home_first:
+            opened.home([axis])
+        move = opened.move_to_um if to else opened.move_by_um
+        typer.echo(f"{axis} at {move({axis: distance_um})[axis]:.3f} um")
+
+
+@app.command()
+def serve(
+    protocol: Annotated[str, typer.Argument(help="zaber, grbl or apt")] = "zaber",
+    tcp: Annotated[
+        str | None, typer.Option("--tcp", help="HOST:PORT to listen on, instead of a terminal")
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option("--link", help="a path that always leads to the terminal")
+    ] = None,
+) -> None:
+    """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
+    from drivers.clock import SYSTEM_CLOCK
+    from emmc_rig.rig.hardware import simulated_firmware
+    from simulators.wire import PtyServer, TcpServer
+
+    firmware = simulated_firmware(protocol, SYSTEM_CLOCK)
+    if tcp is None:
+        server = PtyServer(firmware, link)
+    else:
+        host, _, number = tcp.rpartition(":")
+        if not (host and number.isdecimal() and int(number) < 2**16):
+            raise AppError(f"--tcp {tcp}: write HOST:PORT, for instance 127.0.0.1:5000")
+        server = TcpServer(firmware, host, int(number))
+    try:
+        with _signals_interrupt(), server:
+            typer.echo(f"{protocol}:{server.port}")
+            while True:
+                time.sleep(1.0)
+    except OSError as fault:
+        raise AppError(f"cannot serve on {tcp or 'a terminal'}: {fault}") from fault
+
+
+@app.command("udev-rule")
+def udev_rule() -> None:
+    """Print the udev rule that lets a user open the devices (Linux)."""
+    from drivers.ports import udev_rule_path
+
+    typer.echo(udev_rule_path().read_text(encoding="utf-8"), nl=False)
+
+
+@app.command()
+def bench(
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 300,
+    out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
+) -> None:
+    """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.benchmarks.ptp import picture_timing
+    from emmc_rig.study.benchmarks.stages import stage_timings
+    from emmc_rig.study.benchmarks.u3v import u3v_timings
+
+    timings = stage_timings(repeats)
+    table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
+    for one in timings:
+        table.add_row(
+            one.protocol,
+            one.command,
+            f"{one.exchanges:g}",
+            f"{one.milliseconds:.3f}",
+            f"{one.milliseconds / one.exchanges:.3f}",
+        )
+    Console().print(table)
+    picture = picture_timing()
+    typer.echo(
+        f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
+        f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times rawpy "
+        "alone"
+    )
+    streams = list(u3v_timings())
+    for one in streams:
+        typer.echo(
+            f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, {one.gigabytes_per_s:.2f} GB/s"
+        )
+    if out is not None:
+        metrics = {
+            "stage_commands": [one.as_dict() for one in timings],
+            "picture": picture.as_dict(),
+            "usb3_vision": [one.as_dict() for one in streams],
+            "command": command_line(),
+            "versions": versions(),
+        }
+        with result_folder(out) as folder:
+            write_metrics(folder, metrics)
+
+
+@contextmanager
+def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
+    """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
+    from drivers.errors import DriverError
+    from emmc_rig.rig.hardware import open_stage
+
+    if (stage is None) == (rig is None):
+        raise typer.BadParameter("say which stage: either --stage or --rig simulated")
+    if rig is not None:
+        simulated_protocol(rig)
+    logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)
+    with _signals_interrupt(), open_stage(rig or stage or "") as opened:
+        try:
+            yield opened
+        except KeyboardInterrupt as stop:
+            notes = getattr(stop, "__notes__", ["the stage was told to stop"])
+            _told.print("; ".join(notes), highlight=False, soft_wrap=True)
+            raise
+        except DriverError as fault:
+            notes = getattr(fault, "__notes__", [])
+            raise AppError("; ".join([str(fault), *notes])) from fault
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let a request to end, or a closed terminal, act as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    with handled(interrupt, ENDING):
+        yield
+
+
+def _show(stage: HostStage) -> None:
+    from drivers.errors import NotHomedError
+
+    table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)
+    for axis in stage.axes:
+        low_um, high_um = stage.limits_um(axis)
+        try:
+            homed, position = "yes", f"{stage.position_um(axis):.3f}"
+        except NotHomedError:
+            homed, position = "no", "unknown"
+        table.add_row(
+            axis, homed, position, f"{low_um:g} to {high_um:g}", f"{stage.speed_um_s(axis):g}"
+        )
+    Console().print(table)

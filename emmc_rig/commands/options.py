@@ -1,0 +1,47 @@
+"""Options that several commands share, as typer reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+DEFAULT_SCENE = "deep-occlusions"
+DEFAULT_CAMERA = "rgbw-bayer-3shots"
+SceneOption = Annotated[
+    str,
+    typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),
+]
+CameraOption = Annotated[
+    str, typer.Option("--camera", help="a shipped camera (see `emmc-rig cameras`) or a YAML file")
+]
+ShotsOption = Annotated[
+    int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
+]
+SizeOption = Annotated[
+    str | None, typer.Option("--size", help="ROWSxCOLUMNS: the middle of a scene, or its size")
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
+OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+MethodOption = Annotated[str, typer.Option("--method", help="see `emmc-rig reconstruct --list`")]
+DictionaryOption = Annotated[
+    str | None,
+    typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
+]
+ScenesOption = Annotated[
+    list[str] | None,
+    typer.Option("--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"),
+]
+MethodsOption = Annotated[
+    list[str] | None, typer.Option("--method", help="only this one; may repeat")
+]
+RigOption = Annotated[
+    str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
+]
+RigSceneOption = Annotated[
+    str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
+]
+RigSizeOption = Annotated[
+    str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
+]

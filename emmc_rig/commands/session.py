@@ -1,0 +1,202 @@
+"""The commands `emmc-rig session`: list, show, verify, export, prune, sheet, bench."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Sessions of `emmc-rig capture`: look, check, export.")
+
+Folder = Annotated[Path, typer.Argument(help="a session folder")]
+
+
+@app.command("list")
+def list_sessions(
+    folder: Annotated[Path, typer.Argument(help="the folder that holds sessions")] = Path(),
+) -> None:
+    """List the sessions in a folder: state, frames, size."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    from emmc_rig.errors import AppError
+    from emmc_rig.files.results import shown_bytes
+    from emmc_rig.session.listing import sessions_in
+
+    table = Table("session", "state", "frames", "size", "begun", "title", box=SIMPLE)
+    count = 0
+    for one in sessions_in(folder):
+        count += 1
+        size = shown_bytes(one.bytes)
+        table.add_row(
+            one.name, one.state, f"{one.stored}/{one.planned}", size, one.created, one.title
+        )
+    if not count:
+        raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
+    Console().print(table)
+
+
+@app.command()
+def show(session: Folder) -> None:
+    """Show what a session holds, without reading its frames."""
+    from emmc_rig.files.results import shown_bytes
+    from emmc_rig.pages.session_sheet import events
+    from emmc_rig.session.listing import summary
+    from emmc_rig.session.session import PLAN, Session, amended_name
+    from emmc_rig.session.verify import counts
+
+    told, opened = summary(session), Session(session)
+    typer.echo(f"{told.name}: {told.title}")
+    typer.echo(f"  {'state':<12} {told.state} after {opened.runs} run(s)")
+    typer.echo(f"  {'begun':<12} {told.created}")
+    typer.echo(f"  {'size':<12} {shown_bytes(told.bytes)}")
+    typer.echo(f"  {'frames':<12} {told.stored} of {told.planned}")
+    for kind, (done, planned) in counts(opened).items():
+        typer.echo(f"  {kind:<12} {done} of {planned}")
+    if opened.amendments:
+        plans = Counter(entry.get("plan", 0) for entry in opened.stored.values())
+        for number in range(opened.amendments + 1):
+            name = amended_name(PLAN, number)
+            typer.echo(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
+    leftovers, foreign = opened.strangers()
+    if leftovers:
+        typer.echo(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
+    for name in foreign:
+        typer.echo(f"  {name}: not of this session")
+    for kind, line in events(opened):
+        typer.echo(f"  {kind:<12} {line}")
+
+
+@app.command()
+def verify(session: Folder) -> None:
+    """Hash every frame and compare with the journal; exit code 1 unless complete and good."""
+    from emmc_rig.errors import AppError
+    from emmc_rig.session.session import Session
+    from emmc_rig.session.verify import verify as verified
+
+    opened = Session(session)
+    with _bar("verify", len(opened.stored)) as step:
+        verdict = verified(opened, lambda frame_id: step())
+    for line in verdict.lines():
+        typer.echo(line)
+    if not verdict.is_complete:
+        raise AppError(
+            f"{session}: {verdict.good} of {verdict.planned} frames are good; "
+            f"go on with: emmc-rig capture {session}"
+        )
+    typer.echo(f"complete: {verdict.good} frames, every one as the journal says")
+
+
+@app.command()
+def export(
+    session: Folder,
+    out: Annotated[Path, typer.Option("--out", help="the file to write, FILE.h5")],
+    compress: Annotated[
+        bool, typer.Option("--compress", help="gzip: smaller, and slower by far")
+    ] = False,
+) -> None:
+    """Write a complete session as one HDF5 file with NeXus names; brackets are fused too."""
+    from emmc_rig.files.results import shown_bytes
+    from emmc_rig.session.export import export_hdf5
+    from emmc_rig.session.session import Session
+
+    opened = Session(session)
+    with _bar("export", len(opened.needed)) as step:
+        export_hdf5(opened, out, compress, lambda frame_id: step())
+    typer.echo(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
+
+
+@app.command()
+def prune(
+    session: Folder,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would go")] = False,
+) -> None:
+    """Remove what a crash left in a session; frames that count and other files stay."""
+    from emmc_rig.files.results import shown_bytes
+    from emmc_rig.session.lock import held
+    from emmc_rig.session.prune import prune as pruned
+    from emmc_rig.session.session import Session
+
+    Session(session)  # no lock for what is none
+    with held(session):
+        removed, size = pruned(Session(session), dry_run)
+    verb = "would remove" if dry_run else "removed"
+    for name in removed:
+        typer.echo(f"{verb} {name}")
+    typer.echo(f"{verb} {len(removed)} leftover(s), {shown_bytes(size)}")
+
+
+@app.command()
+def sheet(
+    session: Folder,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="page to write (default: report.html in it)")
+    ] = None,
+    pictures: Annotated[int, typer.Option("--pictures", min=0, help="most to show")] = 200,
+) -> None:
+    """Write the contact sheet: frames, timeline, events, as one HTML page."""
+    from emmc_rig.pages.session_sheet import write_sheet
+    from emmc_rig.session.session import REPORT, Session
+
+    opened = Session(session)
+    path = out or opened.folder / REPORT
+    write_sheet(opened, path.absolute(), pictures)
+    typer.echo(f"open {path}")
+
+
+@app.command()
+def bench(
+    folder: Annotated[
+        Path, typer.Option("--folder", help="where the frames are written: names the disk")
+    ] = Path(),
+    shots: Annotated[int, typer.Option("--shots", min=2, help="24 MP frames to verify")] = 20,
+    listed: Annotated[int, typer.Option("--listed", min=2, help="shots to list")] = 10_000,
+    out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
+) -> None:
+    """Time what capturing costs beside the devices, and verifying and listing sessions."""
+    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
+
+    measured = []
+    for one in overheads(folder, 300):
+        measured.append(one)
+        typer.echo(
+            f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of {one.move_s:g} s: "
+            f"{one.sequencing_ms:.2f} ms each beside the devices, {one.handing_over_ms:.2f} ms "
+            f"handing over; {one.hidden_share:.0%} of hashing and writing behind the bench's work"
+        )
+    rates = verification(folder, shots)
+    typer.echo(
+        f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
+        f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
+        f"threads: {rates.share:.0%} of the slower"
+    )
+    listing_s = listing_seconds(folder, listed)
+    typer.echo(f"listing a session of {listed} shots: {listing_s:.3f} s")
+    if out is not None:
+        metrics = {
+            "overhead": [one.as_dict() for one in measured],
+            "verification": rates.as_dict(),
+            "listing": {"shots": listed, "seconds": listing_s},
+            "command": command_line(),
+            "versions": versions(),
+        }
+        with result_folder(out) as results:
+            write_metrics(results, metrics)
+
+
+@contextmanager
+def _bar(name: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show a bar on a terminal; yields what advances it, from any thread."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(name, total=total)
+        yield lambda: progress.advance(task)

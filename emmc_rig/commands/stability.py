@@ -1,0 +1,115 @@
+"""The command `emmc-rig stability`: where methods fail, by sweeps of faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.commands.options import (
+    DictionaryOption,
+    MethodsOption,
+    ScenesOption,
+    SeedOption,
+    SizeOption,
+)
+from emmc_rig.commands.stability_verdicts import stability_verdicts
+
+
+def stability(
+    scene: ScenesOption = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera", help="a shipped camera or a YAML file (default: rgbw-bayer-3shots)"
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option("--fault", help="only this one; may repeat")
+    ] = None,
+    method: MethodsOption = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
+    ] = False,
+    screening: Annotated[
+        bool | None,
+        typer.Option(
+            "--screening/--no-screening",
+            help="screen the frames for bad pixels and shots (default: both, where it matters)",
+        ),
+    ] = None,
+    theory: Annotated[
+        bool, typer.Option("--theory", help="beside it: what Psi alone predicts, and its bounds")
+    ] = False,
+    numerics: Annotated[
+        bool, typer.Option("--numerics", help="beside it: rounding, scale, repeated runs")
+    ] = False,
+    mismatch: Annotated[
+        bool,
+        typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
+    ] = False,
+    verdicts: Annotated[
+        bool, typer.Option("--verdicts", help="instead: how well verdicts tell broken results")
+    ] = False,
+    faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
+    dictionary: DictionaryOption = None,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
+) -> None:
+    """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.files.results import parse_size
+    from emmc_rig.study.stability.beside import measure_beside
+    from emmc_rig.study.stability.command import run_stability
+    from emmc_rig.study.stability.plan import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.rows import breaking_rows
+
+    if faults:
+        _list_faults()
+        return
+    if verdicts:
+        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, out)
+        return
+    settings = stability_settings(
+        fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
+        methods=tuple(method or []), dictionary=dictionary, seed=seed,
+        screening={None: "both", True: "on", False: "off"}[screening],
+    )  # fmt: skip
+    with shown_bars() as bars:
+        planned(settings)  # raises for wrong names before anything is measured
+        switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
+        wanted = [name for name, on in switches.items() if on]
+        beside = measure_beside(settings, wanted, out, bars)
+        outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
+    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
+    table = Table(
+        "fault", *methods, box=SIMPLE,
+        title=f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view",
+    )  # fmt: skip
+    for row in rows:
+        table.add_row(f"{row.title}, {row.unit}", *row.cells)
+    Console().print(table)
+    for line in beside.told:
+        typer.echo(line)
+    for line in outcome.left_out:
+        say("left out", line)
+    typer.echo(f"open {outcome.page}")
+
+
+def _list_faults() -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    from emmc_rig.study.stability.faults import FAULTS
+
+    table = Table(Column("fault", no_wrap=True), "unit", "strengths", "what happens", box=SIMPLE)
+    for one in FAULTS.values():
+        table.add_row(one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained)
+    Console().print(table)

@@ -1,0 +1,156 @@
+"""Folders of results: written beside their final place, and renamed when they are whole."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError, WrongUsageError
+from emmc_rig.version import __version__
+
+METRICS = "metrics.json"
+VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
+
+
+@contextmanager
+def result_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder to write into; it takes the name `out` only when the block succeeds.
+
+    An earlier result (a folder with a metrics.json) is replaced; anything else that is in the
+    way raises AppError, as does a place that cannot be written. After a failure nothing is left.
+    """
+    out = Path(os.path.abspath(out))
+    if out.is_file():
+        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / METRICS).is_file():
+        raise AppError(
+            f"--out {out}: the folder holds something else than an earlier result; "
+            "choose another folder or empty it"
+        )
+    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+    try:
+        yield partial
+        _take_place(partial, out)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _take_place(partial: Path, out: Path) -> None:
+    """Rename `partial` to `out`, the folder of that name set aside until it is done."""
+    old = out.with_name(f".{out.name}.{os.getpid()}.old")
+    if out.exists():
+        os.replace(out, old)
+    try:
+        os.replace(partial, out)
+    except OSError:
+        if old.exists():
+            os.replace(old, out)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def parse_size(
+    text: str | None, option: str = "--size", example: str = "192x256"
+) -> tuple[int, int] | None:
+    """Return rows and columns from ROWSxCOLUMNS; raises AppError."""
+    if text is None:
+        return None
+    rows, cross, columns = text.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise WrongUsageError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
+    return int(rows), int(columns)
+
+
+def parse_psnr(text: str, option: str) -> float:
+    """Return the dB of "28dB" or "28"; raises AppError for anything else."""
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
+    if found is None or not float(found[1]) > 0:
+        raise WrongUsageError(f"{option} {text}: write a PSNR, for instance 28dB")
+    return float(found[1])
+
+
+def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
+    """Write metrics.json."""
+    (folder / METRICS).write_text(metrics_text(metrics), encoding="utf-8")
+
+
+def metrics_text(metrics: Mapping[str, object]) -> str:
+    """Return metrics as JSON; values that are not finite become null, as JSON has none."""
+    return json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value
+
+
+def save_frames(
+    path: Path,
+    frames_dn: NDArray[np.uint16],
+    readings: NDArray[np.floating],
+    exposures_s: NDArray[np.floating],
+    **more: NDArray,
+) -> None:
+    """Write frames (shot, y, x) as HDF5: frames_dn, readings, exposures_s (shot,), and more."""
+    arrays = {"frames_dn": frames_dn, "readings": readings, "exposures_s": exposures_s, **more}
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {"emmc-rig": __version__, "python": platform.python_version(), **_library_versions()}
+
+
+@cache
+def _library_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in VERSIONED}
+
+
+def shown_seconds(seconds: float) -> str:
+    """Return a duration for people."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def shown_bytes(count: float) -> str:
+    """Return a size for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def command_line() -> str:
+    """Return the command as it was typed."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -1,0 +1,1 @@
+"""The pages and pictures of every report: templates, drawings, figures of a frame."""

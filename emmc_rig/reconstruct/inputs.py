@@ -1,0 +1,55 @@
+"""What a reconstruction starts from: a session or a folder of frames, Psi, and settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.frames import PSI, read_frames
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import validated
+from emmc_rig.session.readings import session_readings
+from emmc_rig.session.session import Session, is_session
+from reconstruction.methods import MethodSettings
+
+
+def session_frames(folder: Path) -> tuple[ImagingMatrix, Frames]:
+    """Return a session's shots, and the Psi of its whiteboards that they were normalised by.
+
+    Raises AppError or CalibrationError.
+    """
+    taken = session_readings(Session(folder))
+    return taken.psi, Frames(taken.readings, np.sqrt(taken.variance), taken.usable)
+
+
+def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[ImagingMatrix, Frames]:
+    """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
+
+    psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, what
+    its whiteboards measure). Raises AppError, SensingError or CalibrationError.
+    """
+    folder = Path(folder)
+    if is_session(folder):
+        measured, frames = session_frames(folder)
+        return measured if psi is None else ImagingMatrix.load(Path(psi)), frames
+    return ImagingMatrix.load(Path(psi or folder / PSI)), read_frames(folder)
+
+
+def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frames, Path]:
+    """Return the frames of a folder, and the file of their Psi: a session's is written to `out`."""
+    if is_session(folder):
+        measured, frames = session_frames(folder)
+        measured.save(out / PSI)
+        return frames, psi_path or out / PSI
+    return read_frames(folder), psi_path or folder / PSI
+
+
+def load_settings(path: Path | None) -> MethodSettings:
+    """Read method settings from YAML; misspelt keys name the nearest valid one."""
+    if path is None:
+        return MethodSettings()
+    return validated(MethodSettings, read_yaml(path, AppError), str(path), AppError)

@@ -1,0 +1,183 @@
+"""A reconstruction with its verdict: arrays, one line, a picture, and the files of a folder."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.lightfield import (
+    export_pictures,
+    focus_disparities,
+    psnr_db,
+    replicate_centre,
+    save_hdf5,
+    ssim,
+)
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.result import Reconstruction
+from reconstruction.verdict.rules import Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """What `emmc_rig.reconstruct` returns.
+
+    solved: what the method returned. verdict: whether to trust it, with reasons and remedies.
+    psi, frames: what it was given. dictionary: the kind of dictionary used; None without one.
+    """
+
+    solved: Reconstruction
+    verdict: Verdict
+    psi: ImagingMatrix
+    frames: Frames
+    dictionary: str | None = None
+
+    @property
+    def light_field(self) -> NDArray[np.float32]:
+        """The estimate, (v, u, y, x, c) float32 in [0, 1]."""
+        return self.solved.light_field
+
+    @property
+    def maps(self) -> Mapping[str, NDArray]:
+        """What the method estimated beside the light field, by name; none for most methods."""
+        return self.solved.maps
+
+    @property
+    def sigma(self) -> NDArray[np.floating] | None:
+        """Standard deviation of the light field, (v, u, y, x); None where the method has none."""
+        return self.maps.get("sigma")
+
+    @property
+    def disparity(self) -> NDArray[np.floating] | None:
+        """Disparity (y, x) of the centre view, pixels per view step; None without an estimate."""
+        return self.maps.get("disparity")
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.solved.method
+
+    @property
+    def status(self) -> str:
+        """How the solver ended; "converged", or what `advice` has a remedy for."""
+        return self.solved.status
+
+    @property
+    def advice(self) -> str:
+        """What to do where the solver did not converge; empty where it did."""
+        return self.solved.advice
+
+    @property
+    def seconds(self) -> float:
+        """How long the method took."""
+        return self.solved.seconds
+
+    def compare(self, truth: ArrayLike) -> dict[str, float]:
+        """Return how near the estimate is to the true light field (v, u, y, x, c).
+
+        psnr_db, ssim: of all views and colours, peak 1. replicate_psnr_db: that of the true centre
+        view copied to all views, which a light field has to beat.
+        """
+        true = np.asarray(truth)
+        return {
+            "psnr_db": psnr_db(self.light_field, true),
+            "ssim": ssim(self.light_field, true),
+            "replicate_psnr_db": psnr_db(replicate_centre(true), true),
+        }
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the figures of the reconstruction, as metrics.json has them."""
+        return {
+            "method": self.method,
+            "status": self.status,
+            "advice": self.advice,
+            "left_out": list(self.solved.left_out),
+            "screening": list(self.solved.screening),
+            "verdict": self.verdict.as_dict(),
+            "steps": self.solved.steps,
+            "seconds": self.seconds,
+            "parameters": self.solved.parameters,
+            "noise_sigma": self.frames.noise_sigma,
+            "usable_share": float(self.frames.usable.mean()),
+            "shots": self.psi.shots,
+            "size": list(self.psi.size),
+            "psi_sha256": self.psi.checksum(),
+            "dictionary": self.dictionary,
+            "command": command_line(),
+            "versions": versions(),
+        }
+
+    def save(self, out: str | Path) -> None:
+        """Write the result as a folder: light field, pictures, maps and metrics.
+
+        An earlier result of that name is replaced; raises AppError where something else is there.
+        """
+        with result_folder(Path(out)) as folder:
+            self.write(folder, self.metrics())
+
+    def write(self, folder: Path, metrics: Mapping[str, Any]) -> None:
+        """Write light_field.h5, pictures/, maps.h5 and metrics.json into an existing folder."""
+        save_hdf5(folder / LIGHT_FIELD, self.light_field, {"method": self.method})
+        export_pictures(folder / "pictures", self.light_field, focus_disparities(self.light_field))
+        if self.maps:
+            with h5py.File(folder / MAPS, "w") as file:
+                for name, values in self.maps.items():
+                    file.create_dataset(name, data=values, compression="lzf")
+        write_metrics(folder, metrics)
+
+    def show(self) -> Figure:
+        """Draw centre view, epipolar image, disparity and deviation; return the figure.
+
+        Opens a window where matplotlib has one; notebooks show the figure themselves.
+        """
+        from matplotlib import pyplot
+
+        from emmc_rig.pages.result_figure import draw_result
+
+        figure = pyplot.figure(layout="constrained")
+        draw_result(figure, self.light_field, self.disparity, self.sigma)
+        if getattr(type(figure.canvas), "required_interactive_framework", None):
+            pyplot.show()
+        return figure
+
+    def __repr__(self) -> str:
+        (v, u, rows, columns, _), level = self.light_field.shape, self.verdict.level
+        return (
+            f"Result({self.method}, {v}x{u} views of {rows}x{columns}, {self.status} in "
+            f"{self.seconds:.1f} s, verdict: {level})"
+        )
+
+    @cached_property
+    def _picture(self) -> str:
+        from matplotlib.figure import Figure
+
+        from emmc_rig.pages.result_figure import draw_result
+
+        figure, png = Figure(layout="constrained"), io.BytesIO()
+        draw_result(figure, self.light_field, self.disparity, self.sigma)
+        figure.savefig(png, format="png", dpi=100)
+        return base64.b64encode(png.getvalue()).decode("ascii")
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<figure><img alt="centre view, epipolar image and maps" '
+            f'src="data:image/png;base64,{self._picture}"><figcaption>{html.escape(repr(self))}'
+            f"<br>{html.escape(self.verdict.words)}</figcaption></figure>"
+        )

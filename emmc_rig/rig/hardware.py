@@ -1,0 +1,424 @@
+"""The only place that chooses devices: real ones by name, or simulated ones on the same bytes.
+
+The stage chain: device 1 carries the coded mask (axes x, y), device 2 the aperture plate (axes
+x, y), which has a pinhole of one aperture cell and, beside it, a window that leaves the whole
+aperture open.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.apt import ACTUATORS, AptAxis, AptStage
+from drivers.apt import identify as identify_apt
+from drivers.camera import Camera as CameraDevice
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import DriverError, TransportTimeoutError
+from drivers.folder import FolderCamera
+from drivers.grbl import GrblStage
+from drivers.grbl import identify as identify_grbl
+from drivers.ports import find_port, list_serial_ports
+from drivers.ptp import PtpCamera, PtpSession
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.stage import HostStage, Stage, StageSettings
+from drivers.transport import SerialTransport, Transport
+from drivers.u3v import open_u3v
+from drivers.usb import open_device
+from drivers.zaber import ZaberStage, find_devices
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.camera import Camera, Sensor
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.rig.stage_config import (
+    USUAL_MICROSTEP_UM,
+    AptConfig,
+    GrblConfig,
+    StageConfig,
+    ZaberConfig,
+    parse_stage,
+)
+from simulators.apt import AptController
+from simulators.bench import RAYS_PER_VIEW, Bench
+from simulators.clock import ManualClock
+from simulators.firmware import SimulatedController
+from simulators.grbl import GrblController
+from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
+from simulators.usb import SimulatedUsb
+from simulators.wire import PtyServer
+from simulators.zaber import AxisSpec, ZaberChain
+
+_log = logging.getLogger(__name__)
+
+STAGE_AXES = {
+    "mask_x": (1, 1),
+    "mask_y": (1, 2),
+    "aperture_x": (2, 1),
+    "aperture_y": (2, 2),
+}
+MASK_TRAVEL_UM = 25_400.0
+POSITION_TOLERANCE_UM = 0.5
+SIMULATED = "simulated"
+PROBE_TIMEOUT_S = 0.2
+
+
+class Attendant(Protocol):
+    """What somebody, or a relay, does at the bench between exposures."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Light the scene or the board: off, white, red, green or blue."""
+        ...
+
+    def place(self, target: str) -> None:
+        """Put the "scene" or the "whiteboard" before the camera."""
+        ...
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
+        ...
+
+
+def _unheard(name: str) -> None:
+    """Take no notice: real noise needs no name."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The devices of one bench.
+
+    zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
+    window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
+    clock: the devices' own. reopen_camera: opens the camera again after it went away.
+    about_to_expose: told the name of each frame before its exposure.
+    """
+
+    stage: Stage
+    camera: CameraDevice
+    attendant: Attendant
+    zero_um: Mapping[str, float]
+    window_um: float
+    clock: Clock = SYSTEM_CLOCK
+    reopen_camera: Callable[[], CameraDevice] | None = None
+    about_to_expose: Callable[[str], None] = _unheard
+
+
+@dataclass(frozen=True)
+class SimulatedRig(Rig):
+    """A rig, and the firmware behind its devices, whose faults can be armed."""
+
+    chain: ZaberChain = field(kw_only=True)
+    still: PtpCameraSimulator = field(kw_only=True)
+
+
+class SimulatedAttendant:
+    """An `Attendant` that acts on the simulated bench."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+
+    def set_lamp(self, colour: str) -> None:
+        """Switch the bench's lamp."""
+        self._bench.lamp = colour
+
+    def place(self, target: str) -> None:
+        """Change what the camera looks at."""
+        self._bench.target = target
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Change what is in the beam."""
+        self._bench.shot = shot
+        self._bench.masks_in = fitted
+
+
+def simulated_rig(
+    camera: Camera,
+    fine_scene: NDArray[np.float32],
+    size: tuple[int, int],
+    seed: int,
+    clock: Clock | None = None,
+    rays_per_view: int = RAYS_PER_VIEW,
+) -> tuple[SimulatedRig, Bench]:
+    """Return a rig of simulated devices, and the bench that they look at (for its truth).
+
+    fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
+    real one lets moves and exposures take their time; by default they take none. A frame that is
+    announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
+    pixel; few are quick, and grainy beside a good sensor's noise.
+    """
+    clock = clock or ManualClock()
+    aperture_um = max(camera.views) * camera.lens.aperture_cell_um
+    travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um}
+    chain = ZaberChain(
+        clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in STAGE_AXES.values()}
+    )
+    zero_um = {
+        name: (MASK_TRAVEL_UM / 2 if device == 1 else aperture_um)
+        for name, (device, _) in STAGE_AXES.items()
+    }
+
+    def positions_um() -> dict[str, float]:
+        return {
+            name: chain.position_um(*address) - zero_um[name]
+            for name, address in STAGE_AXES.items()
+        }
+
+    window_um = 2 * aperture_um
+    rng = np.random.default_rng(seed)
+    bench = Bench(
+        camera, fine_scene, size, positions_um, window_um, rng, rays_per_view=rays_per_view
+    )
+    stage = ZaberStage(
+        chain.transport(),
+        STAGE_AXES,
+        microstep_um=AxisSpec().microstep_um,
+        clock=clock,
+        settings=StageSettings(tolerance_um=POSITION_TOLERANCE_UM),
+    )
+    noise = camera.sensor.noise
+    cfa = camera.sensor.cfa_name
+    simulator = PtpCameraSimulator(
+        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
+    )
+    k = camera.sensor.binning
+    function = PtpUsbFunction(simulator)
+    bus = SimulatedUsb(clock, function)
+
+    def opened() -> CameraDevice:
+        """Open the camera; one whose cable is out is plugged in first."""
+        if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
+            bus.plug(function)
+        # The card lies in this computer's memory, hence from_card.
+        return _ptp_camera(clock, bus, shape=(size[0] // k, size[1] // k), cfa=cfa, from_card=True)
+
+    def announced(name: str) -> None:
+        digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
+        bench.rng = np.random.default_rng(int.from_bytes(digest))
+
+    rig = SimulatedRig(
+        stage,
+        opened(),
+        SimulatedAttendant(bench),
+        zero_um,
+        window_um,
+        clock,
+        opened,
+        announced,
+        chain=chain,
+        still=simulator,
+    )
+    return rig, bench
+
+
+def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStage:
+    """Return the stage that `spec` names, connected; it must be closed.
+
+    spec: `PROTOCOL:PORT` (zaber, grbl, apt) or a YAML file, see `emmc_rig.rig.stage_config`;
+    `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
+    once. settings: single settings that replace those of the file. Raises AppError or a
+    `DriverError`.
+    """
+    name, _, protocol = spec.partition(":")
+    if name == SIMULATED:
+        return open_simulated(protocol or "zaber", settings)[0]
+    config = parse_stage(spec, settings)
+    transports: dict[str, Transport] = {}
+    with ExitStack() as opened:
+
+        def transport(port: str) -> Transport:
+            if port not in transports:
+                flow_control = isinstance(config, AptConfig)
+                transports[port] = SerialTransport(port, flow_control=flow_control)
+                opened.callback(transports[port].close)
+            return transports[port]
+
+        stage = _stage(config, transport, SYSTEM_CLOCK)
+        opened.pop_all()
+    return stage
+
+
+def open_simulated(
+    protocol: str, settings: Mapping[str, Any] | None = None
+) -> tuple[HostStage, SimulatedController]:
+    """Return a stage over simulated firmware in memory, and that firmware."""
+    clock = ManualClock()
+    firmware = simulated_firmware(protocol, clock)
+    wire = firmware.transport()
+    config = parse_stage(f"{protocol}:{SIMULATED}", settings)
+    return _stage(config, lambda port: wire, clock), firmware
+
+
+def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
+    """Return a simulated controller: of the rig's four axes, or the protocol's usual ones."""
+    makers = {"zaber": ZaberChain, "grbl": GrblController, "apt": AptController}
+    if protocol not in makers:
+        raise AppError(f"no simulated stage {protocol!r}: use one of {', '.join(makers)}")
+    return makers[protocol](clock)
+
+
+def probe_port(port: str) -> str:
+    """Return what answers on a port, in words, "" when nothing does; nothing moves.
+
+    A port whose USB adapter tells what it is is asked in that protocol alone: bytes of another
+    may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
+    """
+    device = find_port(port)
+    guesses = {one.device: one.guess for one in list_serial_ports()}
+    guess = guesses.get(device, "")
+    transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
+    with closing(transport):
+        for protocol, ask in _PROBES.items():
+            if guess in ("", protocol):
+                try:
+                    answer = ask(transport)
+                    if answer:
+                        return f"{protocol}: {answer}"
+                except DriverError as error:
+                    _log.debug("%s is no %s: %s", port, protocol, error)
+    return ""
+
+
+def probe_simulated(protocol: str) -> str:
+    """Return what simulated firmware answers, asked through a pseudo-terminal as a port is."""
+    with PtyServer(simulated_firmware(protocol, SYSTEM_CLOCK)) as server:
+        return probe_port(server.port)
+
+
+def _probe_zaber(transport: Transport) -> str:
+    return ", ".join(
+        f"device {one.address} (id {one.device_id}, serial number {one.serial_number}, firmware "
+        f"{one.firmware}, axes {one.axis_count})"
+        for one in find_devices(transport)
+    )
+
+
+def _probe_apt(transport: Transport) -> str:
+    info = identify_apt(transport)
+    return f"{info.model}, serial number {info.serial_number}, firmware {info.firmware}"
+
+
+_PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
+"""In this order: half a line of text would leave an APT controller in the middle of a message."""
+
+
+def _stage(config: StageConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
+    """Return the stage of a configuration over transports opened by port."""
+    try:
+        settings = config.stage_settings()
+        if isinstance(config, ZaberConfig):
+            wire = transport(config.port)
+            axes = config.axes or _found_axes(wire, clock)
+            if config.microstep_um == USUAL_MICROSTEP_UM and config.port != SIMULATED:
+                _log.warning(
+                    "assuming %g um for a microstep: set microstep_um in a YAML file if the "
+                    "stage's data sheet says otherwise",
+                    USUAL_MICROSTEP_UM,
+                )
+            return ZaberStage(wire, axes, config.microstep_um, clock, settings)
+        if isinstance(config, GrblConfig):
+            return GrblStage(transport(config.port), config.axes, clock, settings)
+        channels = {
+            name: AptAxis(
+                transport(one.port), ACTUATORS[one.actuator], one.destination, one.channel
+            )
+            for name, one in config.axes.items()
+        }
+        return AptStage(channels, clock, settings)
+    except ValueError as error:
+        raise AppError(f"stage {config.protocol}: {error}") from error
+
+
+def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]]:
+    """Return every axis on a chain: by the rig's names where it is the rig, else by number."""
+    found = [
+        (device.address, axis)
+        for device in find_devices(transport, clock)
+        for axis in range(1, device.axis_count + 1)
+    ]
+    if not found:
+        raise TransportTimeoutError(transport.port, 0.5)
+    if set(found) == set(STAGE_AXES.values()):
+        return dict(STAGE_AXES)
+    return {f"{device}.{axis}": (device, axis) for device, axis in found}
+
+
+def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
+    """Open the camera that `spec` names: a kind, a colon and what tells it from others.
+
+    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `folder:DIR`, `simulated`. `backend`: of
+    pyusb, for a simulated bus.
+    Raises AppError for any other kind, or an error of the driver.
+    """
+    kind, _, rest = spec.partition(":")
+    if kind not in CAMERAS:
+        raise AppError(f"--camera {spec}: no such kind of camera; use {CAMERA_KINDS}")
+    return CAMERAS[kind](rest, clock, backend)
+
+
+def _ptp_camera(
+    clock: Clock,
+    backend: Any,
+    serial: str = "",
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    device = open_device(PTP_INTERFACE, serial=serial, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+
+
+def _open_ptp(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return _ptp_camera(clock, backend, serial)
+
+
+def _open_u3v(serial: str, clock: Clock, backend: Any) -> CameraDevice:
+    return open_u3v(serial, backend=backend, clock=clock)
+
+
+def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
+    return FolderCamera(folder or ".", clock)
+
+
+def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
+    """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
+    return _ptp_camera(clock, simulated_bus(clock), from_card=True)
+
+
+def simulated_bus(clock: Clock) -> SimulatedUsb:
+    """Return a USB bus, for pyusb, with one simulated still camera."""
+    return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
+
+
+CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {
+    "ptp": _open_ptp,
+    "u3v": _open_u3v,
+    "folder": _open_folder,
+    "simulated": _open_simulated,
+}
+CAMERA_KINDS = "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, folder:DIR or simulated"
+SCENE_SIZE = (240, 320)
+
+
+def scene_simulator(clock: Clock, seed: int = 0) -> PtpCameraSimulator:
+    """Return a simulated camera with a plain lens before a built-in scene."""
+    sensor = Sensor(cfa="rggb")
+    noise, rng = sensor.noise, np.random.default_rng(seed)
+    view = open_scene("deep-occlusions", SCENE_SIZE, (1, 1)).light_field[0, 0]
+    tile = cfa_tile(sensor.cfa)
+    repeats = (-(-SCENE_SIZE[0] // tile.shape[0]), -(-SCENE_SIZE[1] // tile.shape[1]), 1)
+    colours = np.tile(tile, repeats)[: SCENE_SIZE[0], : SCENE_SIZE[1]]
+    readings = (view * colours).sum(axis=2)
+    return PtpCameraSimulator(
+        lambda exposure_s: noise.expose_dn(readings, exposure_s, 1.0, rng),
+        clock,
+        sensor.cfa_name,
+        noise.black_level_dn,
+        noise.white_level_dn,
+        exposures=THIRD_STOPS,
+    )

@@ -1,0 +1,190 @@
+"""Which rig is meant: a simulated one before a scene, or real devices named in a YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from drivers.clock import SYSTEM_CLOCK
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
+from emmc_rig.rig.hardware import Rig, open_camera, open_stage, simulated_rig
+from simulators.bench import RAYS_PER_VIEW
+
+SIMULATED = "simulated"
+Ask = Callable[[str], None]
+
+
+class RealRig(Settings):
+    """Real devices.
+
+    stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
+    far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
+    the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
+    plate's open window. by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
+    not, nothing of that changes, as in a recording that is replayed.
+    """
+
+    stage: str
+    camera: str
+    zero_um: dict[str, float] = Field(default_factory=dict)
+    window_um: float = 0.0
+    by_hand: bool = True
+
+
+class ImagedRig(Settings):
+    """The simulated rig before a scene; size: rows and columns of the light field.
+
+    rays: per view and pixel; calibration to a per cent needs 1024 or more.
+    """
+
+    scene: str
+    size: tuple[int, int] | None = None
+    seed: int = Field(default=0, ge=0)
+    real_time: bool = False
+    rays: int = Field(default=RAYS_PER_VIEW, ge=16)
+
+
+class AskingAttendant:
+    """An `Attendant` who is a person: asked, and asked again only when something changes."""
+
+    def __init__(self, camera: Camera, ask: Ask) -> None:
+        self._camera, self._ask = camera, ask
+        self._done: dict[str, str] = {}
+
+    def set_lamp(self, colour: str) -> None:
+        """Ask for the lamp."""
+        off = "switch the lamp off"
+        self._want("lamp", off if colour == "off" else f"switch the {colour} lamp on")
+
+    def place(self, target: str) -> None:
+        """Ask for the scene or the board."""
+        self._want("target", f"put the {target} before the camera")
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Ask for masks and filter."""
+        names = ", ".join(self._camera.shot_masks(shot)) if fitted else ""
+        chosen = self._camera.shots[shot].filter
+        masks = f"put in the masks {names}" if names else "take all masks out"
+        colour = "take any filter out" if chosen == "none" else f"put in the {chosen} filter"
+        self._want("masks", masks)
+        if any(one.filter != "none" for one in self._camera.shots):
+            self._want("filter", colour)
+
+    def _want(self, what: str, wish: str) -> None:
+        if self._done.get(what) != wish:
+            self._ask(wish)
+            self._done[what] = wish
+
+
+class NoAttendant:
+    """An `Attendant` of a bench on which nothing ever changes."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Leave the lamp as it is."""
+
+    def place(self, target: str) -> None:
+        """Leave the board or scene where it is."""
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Leave the masks in or out."""
+
+
+def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
+    """Return what a session freezes of a rig: `simulated`, or a YAML file of real devices.
+
+    Raises AppError with one line.
+    """
+    if spec == SIMULATED:
+        return {"kind": SIMULATED, **imaged.model_dump(mode="json")}
+    if not spec.endswith((".yaml", ".yml")):
+        raise AppError(f"--rig {spec}: write simulated, or the name of a YAML file of devices")
+    config = validated(RealRig, read_yaml(Path(spec), AppError), spec, AppError)
+    described = config.model_dump(mode="json")
+    beside = Path(spec).parent / config.stage
+    if beside.is_file():
+        described["stage"] = str(beside.resolve())
+    return {"kind": "real", **described}
+
+
+@dataclass(frozen=True)
+class RigChoice:
+    """Which devices a capture is to use; they are opened by `emmc_rig.capture`, not before."""
+
+    name: str
+    description: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        settings = ", ".join(
+            f"{key}={value!r}" for key, value in self.description.items() if key != "kind"
+        )
+        return f"RigChoice({self.name!r}, {settings})"
+
+
+def rig(
+    name: str,
+    *,
+    scene: str = "deep-occlusions",
+    size: tuple[int, int] | None = None,
+    seed: int = 0,
+    rays: int | None = None,
+    real_time: bool = False,
+) -> RigChoice:
+    """Return a rig: "simulated", or the YAML file that names real devices.
+
+    The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
+    of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
+    cent needs 1024. real_time: moves and exposures take their time. Raises AppError.
+
+    >>> import emmc_rig as emmc
+    >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
+    'simulated'
+    """
+    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
+    imaged = ImagedRig(scene=scene, size=size, seed=seed, real_time=real_time, **traced)
+    return RigChoice(name, rig_description(name, imaged))
+
+
+@contextmanager
+def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iterator[Rig]:
+    """Yield the rig that a description names, its devices open; camera: as planned.
+
+    ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
+    device raises.
+    """
+    settings = {key: value for key, value in description.items() if key != "kind"}
+    if description["kind"] == SIMULATED:
+        imaged = validated(ImagedRig, settings, "the simulated rig", AppError)
+        fine = fine_scene(
+            imaged.scene,
+            APERTURE_FACTOR,
+            PIXEL_FACTOR,
+            size=imaged.size,
+            views=camera.views,
+            seed=imaged.seed,
+        )
+        height, width = fine.scene.light_field.shape[2:4]
+        clock = SYSTEM_CLOCK if imaged.real_time else None
+        rig, _ = simulated_rig(
+            camera, fine.samples, (height, width), imaged.seed, clock, imaged.rays
+        )
+        yield rig
+        return
+    real = validated(RealRig, settings, "the rig", AppError)
+    with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:
+        yield Rig(
+            stage,
+            device,
+            AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
+            real.zero_um,
+            real.window_um,
+            reopen_camera=lambda: open_camera(real.camera),
+        )

@@ -1,0 +1,122 @@
+"""Which stage is meant: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from drivers.apt import ACTUATORS, DEFAULT_ACTUATOR
+from drivers.stage import StageSettings
+from emmc_rig.errors import AppError
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, explain
+
+Positive = Annotated[float, Field(gt=0)]
+USUAL_MICROSTEP_UM = 0.047625
+
+
+class _Common(Settings):
+    """What every stage can be told; see `drivers.stage.StageSettings`."""
+
+    approach_um: Annotated[float, Field(ge=0)] = 10.0
+    tolerance_um: Positive = 1.0
+    settle_s: Annotated[float, Field(ge=0)] = 0.05
+    soft_limits_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    speeds_um_s: dict[str, Positive] = Field(default_factory=dict)
+
+    def stage_settings(self) -> StageSettings:
+        """Return the part that concerns how carefully the stage moves."""
+        return StageSettings(
+            approach_um=self.approach_um,
+            tolerance_um=self.tolerance_um,
+            settle_s=self.settle_s,
+            soft_limits_um=self.soft_limits_um,
+            speeds_um_s=self.speeds_um_s,
+        )
+
+
+class ZaberConfig(_Common):
+    """A chain of Zaber devices; without `axes` every axis found is used."""
+
+    protocol: Literal["zaber"] = "zaber"
+    port: str
+    axes: dict[str, tuple[int, int]] | None = None
+    microstep_um: Positive | dict[str, Positive] = USUAL_MICROSTEP_UM
+
+
+class GrblConfig(_Common):
+    """A Grbl controller, axes by letter."""
+
+    protocol: Literal["grbl"] = "grbl"
+    port: str
+    axes: dict[str, Literal["X", "Y", "Z", "A", "B", "C"]] = Field(
+        default_factory=lambda: {"x": "X", "y": "Y"}
+    )
+    tolerance_um: Positive = 5.0
+
+
+class AptAxisConfig(Settings):
+    """One channel of a Thorlabs controller."""
+
+    port: str
+    actuator: str = DEFAULT_ACTUATOR
+    destination: int = 0x50
+    channel: int = 1
+
+
+class AptConfig(_Common):
+    """Thorlabs controllers, each axis with its own port or channel."""
+
+    protocol: Literal["apt"] = "apt"
+    axes: dict[str, AptAxisConfig]
+
+
+StageConfig = ZaberConfig | GrblConfig | AptConfig
+PROTOCOLS: Mapping[str, type[ZaberConfig | GrblConfig | AptConfig]] = {
+    "zaber": ZaberConfig,
+    "grbl": GrblConfig,
+    "apt": AptConfig,
+}
+
+
+def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:
+    """Return the stage that `PROTOCOL:PORT` or the name of a YAML file describes.
+
+    `overrides` replace single settings. Raises AppError with one line.
+    """
+    protocol, colon, port = spec.partition(":")
+    if colon and protocol in PROTOCOLS and port:
+        data: dict[str, Any] = {"protocol": protocol, "port": port}
+        if protocol == "apt":
+            data = {"protocol": protocol, "axes": {"x": {"port": port}}}
+    elif spec.endswith((".yaml", ".yml")):
+        read = read_yaml(Path(spec), AppError)
+        if not isinstance(read, dict):
+            raise AppError(f"{spec}: expected a mapping of settings")
+        data = dict(read)
+    else:
+        raise AppError(
+            f"--stage {spec}: write PROTOCOL:PORT with one of {', '.join(PROTOCOLS)}, such as "
+            "zaber:/dev/ttyUSB0, or the name of a YAML file"
+        )
+    return _validated(data | dict(overrides or {}), spec)
+
+
+def _validated(data: dict[str, Any], source: str) -> StageConfig:
+    protocol = str(data.get("protocol", ""))
+    if protocol not in PROTOCOLS:
+        raise AppError(f"{source}: protocol must be one of {', '.join(PROTOCOLS)}")
+    cls = PROTOCOLS[protocol]
+    try:
+        config: StageConfig = TypeAdapter(cls).validate_python(data)
+    except ValidationError as fault:
+        raise AppError(f"{source}: {explain(fault, cls)}") from fault
+    if isinstance(config, AptConfig):
+        for axis, one in config.axes.items():
+            if one.actuator not in ACTUATORS:
+                known = ", ".join(ACTUATORS)
+                raise AppError(f"{source}: axes.{axis}.actuator: use one of {known}")
+    return config

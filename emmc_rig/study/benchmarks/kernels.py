@@ -1,0 +1,141 @@
+"""Kernel timings as ratios to a memory triad measured in the same run.
+
+Bytes are counted as in STREAM (McCalpin 1995): every array read or written once, no write
+allocation. The bound of a kernel is its bytes over the triad's bandwidth.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numba import get_num_threads, njit, prange
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model import kernels
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.sensing import rows_of_colours
+from emmc_rig.study.benchmarks.timing import median_s
+from reconstruction import kernels as tv_kernels
+from reconstruction.problem import colour_metric
+from reconstruction.tv import reconstruct_tv, row_bands
+
+TRIAD_VALUES = 40_000_000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One kernel: the bytes counted, median seconds, and the ratio to its bound."""
+
+    name: str
+    gigabytes: float
+    seconds: float
+    bound_s: float
+
+    @property
+    def ratio(self) -> float:
+        """Seconds over bound; 1 is as fast as memory allows."""
+        return self.seconds / self.bound_s
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the row with its ratio."""
+        return {**asdict(self), "ratio": self.ratio}
+
+
+@njit(parallel=True, cache=True)
+def triad(a, b, c, scale):
+    """Set a = b + scale c."""
+    for i in prange(a.size):
+        a[i] = b[i] + scale * c[i]
+
+
+def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Iterator[Timing]:
+    """Yield the triad, then every kernel on a light field of `size` (rows, columns).
+
+    The triad is measured again before every kernel, so that both see the same machine.
+    """
+    a, b, c = (np.ones(TRIAD_VALUES, dtype=np.float32) for _ in range(3))
+    triad_bytes = a.nbytes + b.nbytes + c.nbytes
+
+    def bandwidth() -> float:
+        return triad_bytes / median_s(lambda: triad(a, b, c, np.float32(2)), repeats)
+
+    rate = bandwidth()
+    yield Timing("triad", triad_bytes / 1e9, triad_bytes / rate, triad_bytes / rate)
+    psi = build_imaging_matrix(camera, size)
+    light_field = np.random.default_rng(0).random(psi.light_field_shape, dtype=np.float32)
+    frames = psi.forward(light_field)
+    inverse = psi.solver(0.01).inverse
+    planar = np.ascontiguousarray(rows_of_colours(light_field))
+    dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
+    moved = np.zeros((psi.frames_shape[1], 2))
+    bands = row_bands(psi.frames_shape[1], get_num_threads())
+    pool = ThreadPoolExecutor(len(bands))
+    one = np.float32(1)
+    metric = colour_metric(2.0).astype(np.float32)
+    operator = (psi.weights, psi.colour_map)
+
+    data = tv_kernels.Data(*operator, inverse, frames, psi.binning)
+    steps = tv_kernels.Steps(one, one / 64, one, one, metric)
+
+    cases: list[tuple[str, Callable[[], object], int]] = [
+        (
+            "forward",
+            lambda: kernels.project(*operator, light_field, psi.binning, frames.copy()),
+            psi.weights.nbytes + light_field.nbytes,
+        ),
+        (
+            "adjoint",
+            lambda: kernels.back_project(*operator, frames, psi.binning, light_field),
+            psi.weights.nbytes + light_field.nbytes,
+        ),
+        (
+            "data step",
+            lambda: kernels.data_step(*operator, inverse, frames, psi.binning, planar),
+            psi.weights.nbytes + 2 * light_field.nbytes,
+        ),
+        (
+            "TV step",
+            lambda: tv_kernels.sweep(data, steps, planar, dual, bands, moved, pool.map),
+            psi.weights.nbytes + 2 * light_field.nbytes + 2 * dual.nbytes,
+        ),
+    ]
+    with pool:
+        for name, call, counted in cases:
+            rate = bandwidth()
+            yield Timing(name, counted / 1e9, median_s(call, repeats), counted / rate)
+
+
+def reconstruction_memory(camera_name: str, size: tuple[int, int]) -> tuple[float, float]:
+    """Return seconds and peak memory (GiB) of a TV reconstruction in a process of its own."""
+    code = (
+        "from emmc_rig.study.benchmarks.kernels import _reconstruct_once;"
+        f"_reconstruct_once({camera_name!r}, {size!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        raise AppError(f"the reconstruction to be measured failed: {lines[-1]}")
+    seconds, peak_gib = done.stdout.split()
+    return float(seconds), float(peak_gib)
+
+
+def _reconstruct_once(camera_name: str, size: tuple[int, int]) -> None:
+    """Print the seconds of a converged reconstruction and this process's peak memory in GiB."""
+    camera = find_camera(camera_name)
+    psi = build_imaging_matrix(camera, size)
+    light_field = open_scene("deep-occlusions", size=size, views=camera.views).light_field
+    frames = psi.forward(light_field)
+    del light_field
+    started = time.perf_counter()
+    reconstruct_tv(psi, frames, 0.005)
+    seconds = time.perf_counter() - started
+    print(seconds, peak_memory_mib() / 2**10)

@@ -1,0 +1,143 @@
+"""How time and memory grow with the size of the problem: the exponents found and expected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emmc_rig.study.chart.plan import Point, Sweep
+
+PATCH_VALUES = 81 * 3
+NOISE_MIB = 8
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A sweep measured. seconds, peak_mib: at each value of `at`.
+
+    Seconds are those of all cores together, the work, as this is what methods count; against cores
+    by the clock. Memory is that of the whole process; its exponent is fitted to what the runs
+    added to what was there before, where that is enough to be told from noise.
+    exponent: of seconds ~ at^exponent, by least squares of logarithms; expected_exponent: of the
+    operations or bytes that the method counts, between the ends; None where nobody counted them.
+    """
+
+    axis: str
+    label: str
+    at: tuple[float, ...]
+    seconds: tuple[float, ...]
+    peak_mib: tuple[float, ...]
+    exponent: float
+    expected: float | None
+    memory_exponent: float | None
+    expected_memory: float | None
+
+    def as_dict(self) -> dict[str, object]:
+        """Return it as plain data."""
+        return dict(vars(self))
+
+
+def growths(sweeps: Sequence[Sweep], results: Mapping[Point, dict]) -> list[Growth]:
+    """Return the sweeps of which two points or more were measured."""
+    found = []
+    for sweep in sweeps:
+        done = [
+            (at, results[point])
+            for at, point in zip(sweep.at, sweep.points, strict=True)
+            if point in results and "failed" not in results[point]
+        ]
+        if len(done) < 2:
+            continue
+        at = tuple(at for at, _ in done)
+        rows = [row for _, row in done]
+        clock = "seconds" if sweep.axis == "cores" else "cpu_seconds"
+        seconds = tuple(row[clock] for row in rows)
+        found.append(
+            Growth(
+                sweep.axis,
+                sweep.configuration.label,
+                at,
+                seconds,
+                tuple(row["peak_mib"] for row in rows),
+                fitted_exponent(at, seconds),
+                expected_exponent(sweep, at, rows),
+                _memory_exponent(at, rows),
+                expected_memory_exponent(sweep, at, rows),
+            )
+        )
+    return found
+
+
+def fitted_exponent(at: Sequence[float], values: Sequence[float]) -> float:
+    """Return the slope of log values against log at."""
+    return float(np.polyfit(np.log(at), np.log(values), 1)[0])
+
+
+def _memory_exponent(at: Sequence[float], rows: Sequence[dict]) -> float | None:
+    added = [(x, row["peak_mib"] - row["base_mib"]) for x, row in zip(at, rows, strict=True)]
+    told = [(x, mib) for x, mib in added if mib > NOISE_MIB]
+    return fitted_exponent(*zip(*told, strict=True)) if len(told) > 1 else None
+
+
+def expected_exponent(sweep: Sweep, at: Sequence[float], rows: Sequence[dict]) -> float | None:
+    """Return the exponent of what is counted; -1 for cores, of which all work may be shared."""
+    if sweep.axis == "cores":
+        return -1.0
+    counted = COUNTED.get(sweep.configuration.method)
+    return None if counted is None else _between(at, [counted(row) for row in rows])
+
+
+def expected_memory_exponent(
+    sweep: Sweep, at: Sequence[float], rows: Sequence[dict]
+) -> float | None:
+    """Return the exponent of the bytes that total variation holds; None for other methods."""
+    if sweep.configuration.method != "tv":
+        return None
+    return 0.0 if sweep.axis == "cores" else _between(at, [_tv_memory(row) for row in rows])
+
+
+def _between(at: Sequence[float], counts: Sequence[float]) -> float:
+    return float(np.log(counts[-1] / counts[0]) / np.log(at[-1] / at[0]))
+
+
+def _values(row: dict) -> float:
+    """Return the values of the light field."""
+    return float(np.prod(row["views"]) * np.prod(row["size"]) * 3)
+
+
+def _tv_bytes(row: dict) -> float:
+    """Return the bytes that the steps of total variation move, see `reconstruction.tv`."""
+    weights = row["shots"] * 4 / 3 * row["colours_stored"]
+    return row["steps"] * _values(row) * (2 * 4 + 2 * 16 + weights)
+
+
+def _tv_memory(row: dict) -> float:
+    """Return the bytes that total variation adds to Psi: light fields and the dual variable."""
+    return _values(row) * (2 * 4 + 16)
+
+
+def _building(row: dict) -> float:
+    """Return the operations of Psi D for all patches; see `reconstruction.methods.COSTS`."""
+    values = np.prod(row["views"]) * PATCH_VALUES
+    each = 2 / 3 if row["colours_stored"] == 1 else 2
+    return each * row["patches"] * row["dictionary_atoms"] * values * row["shots"]
+
+
+def _readings(row: dict) -> float:
+    return row["shots"] * 81 / row["binning"] ** 2
+
+
+def _omp(row: dict) -> float:
+    atoms, length = row["dictionary_atoms"], _readings(row)
+    return _building(row) + row["patches"] * 2 * atoms * length * row["steps"]
+
+
+def _admm(row: dict) -> float:
+    atoms, length = row["dictionary_atoms"], _readings(row)
+    passes = atoms * length**2 + 4 * atoms * length * row["steps"]
+    return _building(row) + row["patches"] * passes
+
+
+COUNTED = {"tv": _tv_bytes, "dict-omp": _omp, "dict-admm": _admm}

@@ -1,0 +1,133 @@
+"""Psi, sensor and stage on the simulated bench that is wrong in ways nobody is told of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.boards import as_readings
+from calibration.sensor import Pair, characterise
+from calibration.stage_map import locate
+from emmc_rig.calibrate.bench import (
+    Setting,
+    StageFaults,
+    WhiteboardBench,
+)
+from emmc_rig.calibrate.run import (
+    CalibrateSettings,
+    measured_stage,
+    run_calibration,
+    true_parameters,
+)
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.progress import Silent
+from emmc_rig.study.checks.rows import Row, judged
+
+Array = NDArray[np.floating]
+FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
+
+
+def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
+    """All routes on the harsh bench: error of Psi, of the geometry, frames."""
+    run = run_calibration(replace(settings, route="auto"))
+    metrics = run.metrics
+    errors = metrics["psi_relative_error"]
+    parametric = run.outcome.parametric
+    assert parametric is not None
+    at, truth = parametric.fit.placement, true_parameters(settings.truth)
+    pitch_um = settings.camera.sensor.sample_pitch_um
+    shift_px = np.hypot(
+        at.offset_x_um - truth["offset_x_um"], at.offset_y_um - truth["offset_y_um"]
+    )
+    distance = (1 + at.distance_share) / (1 + truth["distance_share"]) - 1
+    turn = abs(np.degrees(at.rotation_rad - truth["rotation_rad"]))
+    rows = [
+        judged("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
+        judged("Psi, mixed", errors["mixed"], 0.01, ".3%"),
+        judged("Psi, free", errors["free"], 0.02, ".3%"),
+        judged("Psi, combined", errors["combined"], 0.005, ".3%"),
+        judged("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
+        judged("distance d", abs(float(distance)), 0.005, ".4%"),
+        judged("shift, px", float(shift_px) / pitch_um, 0.02, ".5f"),
+        judged("rotation, degrees", float(turn), 0.005, ".6f"),
+    ]
+    return rows, metrics
+
+
+def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
+    """EMVA 1288 figures of the simulated sensor against what it was made with."""
+    noise, flaws = settings.camera.sensor.noise, settings.truth.sensor
+    size, rng = settings.size, np.random.default_rng(settings.seed)
+    well = flaws.full_well_electrons or noise.white_level_dn / noise.gain_dn_per_electron
+    brightest_s = 1.3 * well / noise.electrons_per_s
+
+    def pairs(reading: float, times: Array) -> list[Pair]:
+        plane = np.full(size, reading)
+        return [
+            Pair(
+                float(t),
+                *(flaws.expose_dn(noise, plane, float(t), 1.0, rng) for _ in range(2)),
+            )
+            for t in times
+        ]
+
+    sheet = characterise(
+        pairs(0.0, np.array([0.01, 1.0, 4.0])),
+        pairs(
+            1.0, brightest_s * np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1])
+        ),
+        noise.white_level_dn,
+    )
+    known = {
+        "gain_dn_per_electron": noise.gain_dn_per_electron,
+        "read_noise_electrons": noise.read_noise_electrons,
+        "dark_current_electrons_per_s": flaws.dark_electrons_per_s,
+        "full_well_electrons": well,
+        "prnu_percent": 100 * flaws.response_spread,
+        "dsnu_electrons": flaws.offset_spread_dn / noise.gain_dn_per_electron,
+    }
+    rows = [
+        Row(name, f"{getattr(sheet, name):.5g} +- {sheet.deviations[name]:.2g}", f"{truth:.5g}")
+        for name, truth in known.items()
+    ]
+    hot, dead = flaws.bad(size)
+    rows.append(
+        Row(
+            "hot, dead pixels", f"{sheet.hot_pixels}, {sheet.dead_pixels}",
+            f"{int(hot.sum())}, {int(dead.sum())}",
+        )
+    )  # fmt: skip
+    return rows, {name: [getattr(sheet, name), truth] for name, truth in known.items()}
+
+
+def check_stage(settings: CalibrateSettings) -> tuple[list[Row], dict]:
+    """A stage of known faults, mapped from one whiteboard per position on the harsh bench."""
+    camera, faults = settings.camera, StageFaults(1.0015, 0.3, (2.0, 1.2), 0.1)
+    truth = replace(settings.truth, stage=faults)
+    still = run_calibration(replace(settings, route="parametric"))
+    assert still.outcome.parametric is not None
+    bench = WhiteboardBench(camera, settings.size, truth, settings.seed)
+    design = build_imaging_matrix(camera, settings.size)
+    found = measured_stage(bench, design, still.outcome.parametric, Silent())
+    setting = Setting(stage_um=(151.0, -83.0), repeats=1, came_from=(-1, 1))
+    (board,) = as_readings(bench.capture([setting]), design.layout)
+    parametric = still.outcome.parametric
+    place = locate(board, parametric.mask, parametric.fit.placement)
+    real = faults.real_um(setting.stage_um, setting.came_from)
+    off_um = float(np.hypot(place.x_um - real[0], place.y_um - real[1]))
+    pitch_um = camera.sensor.sample_pitch_um
+    rows = [
+        judged("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
+        Row("scale of the stage", f"{found.scale[0]:.5f}", f"{faults.scale:.5f}"),
+        Row(
+            "rotation of the stage, degrees",
+            f"{found.rotation_deg:.4f}",
+            f"{faults.rotation_deg:.4f}",
+        ),
+        Row("orthogonality, degrees", f"{found.orthogonality_deg:+.4f}", "0.0000"),
+        Row("backlash x, y, um", "{:.2f}, {:.2f}".format(*found.backlash_um), "2.00, 1.20"),
+        Row("repeatability x, y, um", "{:.2f}, {:.2f}".format(*found.repeatability_um), "0.10"),
+    ]
+    return rows, {name: [value, deviation] for name, value, deviation, _ in found.rows()}

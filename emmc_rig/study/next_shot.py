@@ -1,0 +1,263 @@
+"""How many shots scenes need, and what choosing them saves: sessions judged after every shot.
+
+A session with every planned shot of a scene is captured on the simulated rig, which traces rays.
+The whiteboards of the first give Psi to all: the bench is the same. Shots are then chosen from it
+as `emmc-rig capture --until` chooses them, and beside that taken in the plan's order; both are
+compared with the truth after each shot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from calibration.shadow import shadow_mask
+from emmc_rig.calibrate.bench import WhiteboardBench
+from emmc_rig.calibrate.run import CalibrateSettings, capture_plan, parametric_plan, plan_light
+from emmc_rig.capture.command import Wish, run_capture
+from emmc_rig.capture.enough import METHOD, Judgement, judged
+from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
+from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
+from emmc_rig.session.lock import held
+from emmc_rig.session.readings import Scale, scaled_readings, session_scale
+from emmc_rig.session.session import Session
+from emmc_rig.study.points import Journal, digest_of
+from emmc_rig.version import __version__
+from reconstruction.methods import reconstruct
+from reconstruction.result import Reconstruction
+
+ROWS, SESSIONS = "next_shots.jsonl", "sessions"
+PLANNED, MOST = 6, 5
+"""Shots to choose from, and to take at most."""
+RAYS = 512
+REVISION = 1
+
+
+@dataclass(frozen=True)
+class ShotRow:
+    """After some shots: the PSNR that the deviation states, and that against the truth.
+
+    foretold_db: what the shot that is chosen next is expected to gain; None where none is chosen.
+    """
+
+    shots: tuple[int, ...]
+    stated_db: float
+    psnr_db: float
+    foretold_db: float | None = None
+
+    @property
+    def count(self) -> int:
+        """How many shots."""
+        return len(self.shots)
+
+
+@dataclass(frozen=True)
+class SceneRows:
+    """A scene's rows by the shots chosen, and by shots in the plan's order, one shot more each."""
+
+    scene: str
+    chosen: tuple[ShotRow, ...]
+    in_order: tuple[ShotRow, ...]
+    copied_db: float
+    """Of the true centre view, copied."""
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> SceneRows:
+        """Return what `asdict` described."""
+        chosen, in_order = (
+            tuple(ShotRow(**{**row, "shots": tuple(row["shots"])}) for row in rows)
+            for rows in (data["chosen"], data["in_order"])
+        )
+        return cls(data["scene"], chosen, in_order, data["copied_db"])
+
+
+@dataclass(frozen=True)
+class Saving:
+    """For a scene and a target: where `--until` stops, and how many shots in order reach it.
+
+    stopped: the last row taken; reached: whether it states the target. fixed: shots in order until
+    the truth is met to the target, None where `MOST` do not.
+    """
+
+    scene: str
+    target_db: float
+    stopped: ShotRow
+    reached: bool
+    fixed: int | None
+
+    def as_dict(self) -> dict[str, object]:
+        """Return plain data."""
+        return asdict(self)
+
+
+def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> Plan:
+    """Return a plan of PLANNED shots and the whiteboards that tell Psi of all of them.
+
+    Every shot is exposed as the camera's first. Raises CameraError where the camera does not say
+    how masks move on, CalibrationError where its mask cannot be fitted.
+    """
+    several = camera.with_shots(PLANNED)
+    settings = CalibrateSettings(camera_name, several, size)
+    mask = shadow_mask(several, size)
+    light = plan_light(WhiteboardBench(several, size, settings.truth), mask)
+    plan = capture_plan(settings, parametric_plan(several, mask, light, settings.target), light)
+    exposure_s = (float(camera.exposures_s()[0]),)
+    shots = tuple(PlannedShot(exposure_s=exposure_s) for _ in several.shots)
+    return plan.model_copy(update={"shots": shots})
+
+
+def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
+    """Return a session with every planned shot, begun or gone on with in a folder.
+
+    Raises KeyboardInterrupt where Ctrl-C stopped it; it goes on the next time.
+    """
+    text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+    described = rig_description(SIMULATED, rig)
+    wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
+    with held(folder):
+        taken = run_capture(wish, Unwatched(), _nobody)
+    assert taken is not None
+    session, outcome = taken
+    if not outcome.complete:
+        raise KeyboardInterrupt
+    return session
+
+
+def _nobody(what: str) -> None:
+    raise AppError(f"nobody is there to {what}")
+
+
+def after(session: Session, scale: Scale, shots: Sequence[int]) -> tuple[Reconstruction, float]:
+    """Return the light field that some of a session's shots give, and their readings' deviation."""
+    taken = scaled_readings(session, scale, shots)
+    sigma = taken.noise_sigma
+    return reconstruct(METHOD, taken.psi, taken.readings, sigma, usable=taken.usable), sigma
+
+
+def rows_of(
+    session: Session,
+    scale: Scale,
+    truth: np.ndarray,
+    scene: str,
+    most: int,
+    on_row: Callable[[str], None],
+) -> SceneRows:
+    """Return what a session's shots give, chosen and in order, up to `most` of them."""
+    known: dict[tuple[int, ...], tuple[ShotRow, Judgement]] = {}
+
+    def row(shots: tuple[int, ...]) -> tuple[ShotRow, Judgement]:
+        if shots not in known:
+            result, sigma = after(session, scale, shots)
+            target_db = math.inf if len(shots) < most else 0.0
+            found = judged(scale.psi, result, shots, sigma, target_db)
+            gain = None if found.next is None else found.expected_db[found.next] - found.stated_db
+            achieved_db = psnr_db(result.light_field, truth)
+            known[shots] = ShotRow(shots, found.stated_db, achieved_db, gain), found
+            on_row(f"{scene}, {len(shots)} shots")
+        return known[shots]
+
+    def chosen() -> Iterator[ShotRow]:
+        shots: tuple[int, ...] = (0,)
+        while True:
+            taken, found = row(shots)
+            yield taken
+            if found.next is None:
+                return
+            shots = (*shots, found.next)
+
+    rows = tuple(chosen())
+    in_order = tuple(row(tuple(range(count)))[0] for count in range(1, most + 1))
+    return SceneRows(scene, rows, in_order, psnr_db(replicate_centre(truth), truth))
+
+
+def next_shots(
+    scenes: Sequence[str],
+    camera_name: str,
+    camera: Camera,
+    size: tuple[int, int],
+    seed: int,
+    folder: Path,
+    on_row: Callable[[str], None] = lambda told: None,
+    rays: int = RAYS,
+    most: int = MOST,
+) -> Iterator[SceneRows]:
+    """Yield each scene's rows; those that the folder holds are not measured again.
+
+    folder: see `emmc_rig.study.points.open_folder`. Raises what the layers below do.
+    """
+    journal = Journal(folder / ROWS)
+    plan = candidate_plan(camera_name, camera, size)
+    scale: Scale | None = None
+    for spec in scenes:
+        imaged = ImagedRig(scene=spec, size=size, seed=seed, rays=rays)
+        fine = fine_scene(
+            spec, APERTURE_FACTOR, PIXEL_FACTOR, size=size, views=camera.views, seed=seed
+        )
+        truth = fine.scene.light_field
+        inputs: dict[str, object] = {
+            "version": __version__,
+            "revision": REVISION,
+            "plan": plan.model_dump(mode="json"),
+            "camera": camera.model_dump(mode="json"),
+            "rig": imaged.model_dump(mode="json"),
+            "most": most,
+            "method": METHOD,
+            "sum": float(np.sum(truth, dtype=np.float64)),
+        }
+        digest = digest_of(inputs)
+        result = journal.get(digest)
+        if result is None:
+            (folder / SESSIONS).mkdir(exist_ok=True)
+            place = folder / SESSIONS / f"{fine.scene.name}-{digest[:8]}"
+            if scale is None:
+                session = captured(plan, imaged, place)
+                scale = session_scale(session)
+            else:
+                shots_alone = plan.model_copy(update={"whiteboards": None})
+                session = captured(shots_alone, imaged, place.with_name(f"{place.name}-shots"))
+            on_row(f"{fine.scene.name}, captured")
+            result = asdict(rows_of(session, scale, truth, fine.scene.name, most, on_row))
+            journal.add(digest, inputs, result)
+        yield SceneRows.from_dict(result)
+
+
+def savings(rows: SceneRows, targets_db: Sequence[float]) -> list[Saving]:
+    """Return what choosing saves on a scene, for every target."""
+    found = []
+    for target_db in targets_db:
+        stopped = next((row for row in rows.chosen if row.stated_db >= target_db), rows.chosen[-1])
+        fixed = next((row.count for row in rows.in_order if row.psnr_db >= target_db), None)
+        reached = stopped.stated_db >= target_db
+        found.append(Saving(rows.scene, target_db, stopped, reached, fixed))
+    return found
+
+
+def total_savings(rows: Sequence[Saving]) -> Iterator[str]:
+    """Yield, for every target, the shots that choosing saves against one number for all scenes."""
+    for target_db in dict.fromkeys(row.target_db for row in rows):
+        served = [
+            (row, row.fixed)
+            for row in rows
+            if row.target_db == target_db and row.reached and row.fixed is not None
+        ]
+        if not served:
+            yield f"{target_db:g} dB: no scene reaches it with the shots there are"
+            continue
+        taken = sum(row.stopped.count for row, _ in served)
+        fixed = max(count for _, count in served)
+        met = sum(row.stopped.psnr_db >= target_db for row, _ in served)
+        yield (
+            f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it "
+            f"in truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
+        )

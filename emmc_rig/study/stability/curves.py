@@ -1,0 +1,98 @@
+"""Measured points as curves: one per fault, method and screening, of a scene or of all together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emmc_rig.study.stability.breaking import Span, below_best, below_view
+from emmc_rig.study.stability.faults import FAULTS, Fault
+from emmc_rig.study.stability.plan import Point
+
+POOLED = "all scenes"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """PSNR by strength. scene: a scene's name, or POOLED: the mean over those with the fault.
+
+    levels: dB, None where the method failed. views: the copied centre view of the truth; None
+    where it is exact. points: those of each strength, one a scene.
+    """
+
+    scene: str
+    fault: Fault
+    method: str
+    screened: bool
+    strengths: tuple[float, ...]
+    levels: tuple[float | None, ...]
+    views: tuple[float | None, ...]
+    points: tuple[tuple[Point, ...], ...]
+
+    @property
+    def label(self) -> str:
+        """The method, and whether it got the frames as they were."""
+        return self.method if self.screened else f"{self.method}, not screened"
+
+    @property
+    def key(self) -> str:
+        """Unique among the curves of one scene."""
+        return f"{self.fault.name}-{self.method}{'' if self.screened else '-bare'}"
+
+    def below_best(self) -> Span | None:
+        """Return where it breaks by the first measure: 3 dB below its best."""
+        return below_best(self.levels, self.fault.whole)
+
+    def below_view(self) -> Span | None:
+        """Return where it breaks by the second: below the copied centre view."""
+        return below_view(self.levels, self.views, self.fault.whole)
+
+
+def curves(results: Mapping[Point, dict]) -> list[Curve]:
+    """Return the curves of every scene, those of all scenes first where there are several."""
+    scenes = list(dict.fromkeys(point.scene for point in results))
+    kinds = list(dict.fromkeys((p.fault, p.method, p.screened) for p in results))
+    found = []
+    if len(scenes) > 1:
+        found += [_curve(POOLED, scenes, kind, results) for kind in kinds]
+    for scene in scenes:
+        found += [_curve(Path(scene).stem, [scene], kind, results) for kind in kinds]
+    return [curve for curve in found if curve is not None]
+
+
+def _curve(
+    name: str,
+    scenes: Sequence[str],
+    kind: tuple[str, str, bool],
+    results: Mapping[Point, dict],
+) -> Curve | None:
+    """Return one curve; of several scenes those that have every strength that any has."""
+    by_scene = {
+        scene: {
+            point.strength: point
+            for point in results
+            if point.scene == scene and (point.fault, point.method, point.screened) == kind
+        }
+        for scene in scenes
+    }
+    most = max(len(found) for found in by_scene.values())
+    whole = [found for found in by_scene.values() if len(found) == most]
+    if most < 2:
+        return None
+    fault, method, screened = kind
+    points = tuple(tuple(found[s] for found in whole) for s in whole[0])
+
+    def mean(key: str) -> tuple[float | None, ...]:
+        means = []
+        for some in points:
+            known = [v for v in (results[point].get(key) for point in some) if v is not None]
+            means.append(float(np.mean(known)) if len(known) == len(some) else None)
+        return tuple(means)
+
+    return Curve(
+        name, FAULTS[fault], method, screened, tuple(whole[0]), mean("psnr_db"), mean("view_db"),
+        points,
+    )  # fmt: skip

@@ -1,0 +1,363 @@
+"""How well verdicts tell broken results from good ones: captures with every fault, each judged.
+
+A result is broken when it lost more than 3 dB against that of the same capture without the fault,
+good when it lost 1 dB or less. It is poor when it lost 3 dB or less but had little to lose: without
+the fault it was within 5 dB of a picture of one even colour, or another method of those measured
+was 2 dB better. What is poor or between may be flagged or not. Rows keep the evidence, from which
+verdicts are made anew: changed rules need no new measurement.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.model.errors import ModelError
+from emmc_rig.model.files import write_text
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.settings import Settings
+from emmc_rig.progress import Watcher
+from emmc_rig.study.points import Journal, digest_of, open_folder
+from emmc_rig.study.stability.faults import FAULTS, MASK, SENSOR, SHOTS, Fault, find_fault, trial
+from emmc_rig.study.stability.trial import NotApplicableError, Trial
+from emmc_rig.version import __version__
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import METHODS, find_method
+from reconstruction.verdict.evidence import Evidence
+from reconstruction.verdict.rules import Verdict, judged
+from reconstruction.verdict.run import reconstruct_judged
+from simulators.scenes import SCENES
+
+ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
+NONE, ALL = "none", "all"
+REVISION = 3
+BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
+KINDS = (SENSOR, MASK, SHOTS)
+"""Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
+
+
+class DetectorSettings(Settings):
+    """What to judge. faults: names; empty takes those that befall a capture."""
+
+    scenes: tuple[str, ...]
+    cameras: tuple[str, ...] = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
+    methods: tuple[str, ...] = ("tv", "adaptive-fast")
+    seeds: tuple[int, ...] = (1,)
+    faults: tuple[str, ...] = ()
+    fast: bool = False
+    size: tuple[int, int] = (64, 80)
+    zoom: int = Field(default=3, ge=1)
+
+
+def detector_settings(
+    fast: bool,
+    scenes: Sequence[str],
+    camera: str | None,
+    faults: Sequence[str],
+    methods: Sequence[str],
+    size: tuple[int, int] | None,
+    seed: int,
+) -> DetectorSettings:
+    """Return the settings; what is not given is the default. fast: fewer strengths.
+
+    Raises AppError and ReconstructionError naming the nearest for names that are not known.
+    """
+    for name in faults:
+        find_fault(name)
+    for name in methods:
+        find_method(name)
+    given = {
+        "cameras": (camera,) if camera else (),
+        "faults": tuple(faults),
+        "methods": tuple(methods),
+        "size": size,
+    }
+    chosen = {key: value for key, value in given.items() if value}
+    return DetectorSettings.model_validate(
+        {"fast": fast, "scenes": tuple(scenes) or tuple(SCENES), "seeds": (seed,), **chosen}
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """One result to judge. fault None: nothing is wrong."""
+
+    scene: str
+    camera: str
+    seed: int
+    method: str
+    fault: str | None
+    strength: float
+
+    @property
+    def harmless(self) -> Case:
+        """The same capture without its fault."""
+        if self.fault is None:
+            return self
+        return replace(self, **_named(FAULTS[self.fault], FAULTS[self.fault].strengths[0]))
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        told = "nothing wrong"
+        if self.fault is not None:
+            fault = FAULTS[self.fault]
+            told = f"{fault.title} {self.strength:g} {fault.unit}"
+        return f"{Path(self.scene).stem}, {Path(self.camera).stem}, {told}, {self.method}"
+
+
+def _named(fault: Fault, strength: float) -> dict:
+    return {"fault": None if fault.is_clean(strength) else fault.name, "strength": strength}
+
+
+def cases(settings: DetectorSettings) -> list[Case]:
+    """Return what to judge; those of one trial together."""
+    names = settings.faults or tuple(f.name for f in FAULTS.values() if f.kind in KINDS)
+    found = []
+    for scene in settings.scenes:
+        for camera in settings.cameras:
+            shots = len(find_camera(camera).shots)
+            for seed in settings.seeds:
+                for fault in (FAULTS[name] for name in names):
+                    if fault.shots > shots:
+                        continue
+                    for strength in fault.quick if settings.fast else fault.strengths:
+                        for method in settings.methods:
+                            case = Case(scene, camera, seed, method, **_named(fault, strength))
+                            found += [case.harmless, case]
+    return list(dict.fromkeys(found))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A case with its PSNR, what it lost against its harmless end, and its verdict.
+
+    little_to_lose: whether the harmless end is poor already.
+    """
+
+    case: Case
+    psnr_db: float
+    lost_db: float
+    little_to_lose: bool
+    verdict: Verdict
+
+    @property
+    def kind(self) -> Literal["broken", "good", "between", "poor"]:
+        """What it is, whatever the verdict."""
+        if self.lost_db > BROKEN_DB:
+            return "broken"
+        if self.little_to_lose:
+            return "poor"
+        return "good" if self.lost_db <= GOOD_DB else "between"
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is broken and trusted, or good and not."""
+        return self.kind in ("broken", "good") and self.flagged != (self.kind == "broken")
+
+    @property
+    def flagged(self) -> bool:
+        """Whether the verdict is not trust."""
+        return self.verdict.level != "trust"
+
+
+def measure(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
+    """Judge all cases into a folder that outlives interruptions.
+
+    Raises AppError for a folder that cannot be written, and what the layers below do.
+    """
+    folder = open_folder(out, ROWS, "earlier verdicts")
+    journal, rows = Journal(folder / ROWS), {}
+    wanted = cases(settings)
+    watcher.begin("judge", len(wanted))
+    made: tuple[object, Trial] | None = None
+    for case in wanted:
+        inputs = {"version": __version__, "revision": REVISION, **_inputs(case, settings)}
+        digest = digest_of(inputs)
+        row = journal.get(digest)
+        if row is None:
+            same = replace(case, method="")
+            try:
+                if made is None or made[0] != same:
+                    made = (same, _trial(case, settings))
+                row = _row(case.method, made[1])
+            except NotApplicableError:
+                watcher.step(f"left out: {case.label}")
+                continue
+            try:
+                journal.add(digest, inputs, row)
+            except OSError as fault:
+                raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+        rows[case] = row
+        watcher.step(case.label)
+    return judged_rows(rows)
+
+
+def _inputs(case: Case, settings: DetectorSettings) -> dict[str, object]:
+    return {
+        **asdict(case),
+        "camera": find_camera(case.camera).model_dump(mode="json"),
+        "size": settings.size,
+        "zoom": settings.zoom,
+    }
+
+
+def _trial(case: Case, settings: DetectorSettings) -> Trial:
+    camera = find_camera(case.camera)
+    # Without a fault, any that can be absent will do.
+    fault = FAULTS[case.fault or "mask-shift"]
+    return trial(fault, case.strength, case.scene, camera, settings.size, case.seed, settings.zoom)
+
+
+def _row(method: str, given: Trial) -> dict:
+    dictionary = None
+    if METHODS[method].needs_dictionary:
+        dictionary = _dictionary(given.psi.light_field_shape[:2], given.psi.binning)
+    try:
+        found, verdict = reconstruct_judged(
+            method, given.psi, given.readings, given.noise_sigma, dictionary, None, given.usable
+        )
+    except (ReconstructionError, ModelError) as fault:
+        return {"refused": str(fault)}
+    level = psnr_db(found.light_field, given.truth) + 20 * math.log10(given.peak)
+    even = np.broadcast_to(given.truth.mean(axis=(0, 1, 2, 3)), given.truth.shape)
+    even_db = psnr_db(even, given.truth) + 20 * math.log10(given.peak)
+    return {"psnr_db": level, "even_db": even_db, "evidence": verdict.evidence.as_dict()}
+
+
+@lru_cache(maxsize=4)
+def _dictionary(views: tuple[int, int], binning: int) -> Dictionary:
+    return open_dictionary(None, views, binning)
+
+
+def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
+    """Return the rows judged by today's rules; those that a method refused are left out."""
+    best: dict[Case, float] = {}
+    for case, row in rows.items():
+        if "psnr_db" in row:
+            any_method = replace(case, method="")
+            best[any_method] = max(best.get(any_method, -math.inf), row["psnr_db"])
+    found = []
+    for case, row in rows.items():
+        harmless = rows.get(case.harmless, {})
+        if "evidence" not in row or "psnr_db" not in harmless:
+            continue
+        level = harmless["psnr_db"]
+        rival = best[replace(case.harmless, method="")]
+        little = level < max(rival - POOR_DB, harmless["even_db"] + EVEN_DB)
+        verdict = judged(Evidence.from_dict(row["evidence"]))
+        found.append(Judged(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
+    return found
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many results were of each kind, and how many of those were flagged."""
+
+    broken: int = 0
+    broken_flagged: int = 0
+    between: int = 0
+    between_flagged: int = 0
+    good: int = 0
+    good_flagged: int = 0
+    poor: int = 0
+    poor_flagged: int = 0
+
+    @property
+    def found(self) -> float | None:
+        """Share of the broken ones that were flagged; None without any."""
+        return self.broken_flagged / self.broken if self.broken else None
+
+    @property
+    def false_alarms(self) -> float | None:
+        """Share of the good ones that were flagged; None without any."""
+        return self.good_flagged / self.good if self.good else None
+
+
+def tallied(results: Iterable[Judged]) -> Tally:
+    """Return the counts."""
+    counts = dict.fromkeys(Tally.__dataclass_fields__, 0)
+    for one in results:
+        counts[one.kind] += 1
+        counts[f"{one.kind}_flagged"] += one.flagged
+    return Tally(**counts)
+
+
+def tables(results: Sequence[Judged]) -> dict[tuple[str, str], Tally]:
+    """Return the counts by fault and method, then by method, then of all; ALL names the sums."""
+    faults = list(dict.fromkeys(one.case.fault or NONE for one in results))
+    methods = list(dict.fromkeys(one.case.method for one in results))
+    keys = [(fault, method) for fault in faults for method in methods]
+    keys += [*((ALL, method) for method in methods), (ALL, ALL)]
+    return {
+        (fault, method): tallied(
+            one
+            for one in results
+            if fault in (ALL, one.case.fault or NONE) and method in (ALL, one.case.method)
+        )
+        for fault, method in keys
+    }
+
+
+def wrong(results: Iterable[Judged]) -> list[Judged]:
+    """Return the broken results that were trusted and the good ones that were not."""
+    return [one for one in results if one.wrong]
+
+
+def told(one: Judged) -> str:
+    """Return a judged result in words."""
+    reasons = "; ".join(reason.what for reason in one.verdict.reasons) or "nothing against it"
+    return f"{one.case.label}: lost {one.lost_db:.1f} dB, {one.verdict.level} ({reasons})"
+
+
+def csv_text(results: Iterable[Judged]) -> str:
+    """Return one line for each result."""
+    lines = ["scene,camera,seed,method,fault,strength,psnr_db,lost_db,kind,verdict,reasons"]
+    for one in results:
+        case = one.case
+        reasons = " | ".join(reason.what for reason in one.verdict.reasons).replace('"', "'")
+        lines.append(
+            f"{Path(case.scene).stem},{Path(case.camera).stem},{case.seed},{case.method},"
+            f"{case.fault or NONE},{case.strength:g},{one.psnr_db:.3f},{one.lost_db:.3f},"
+            f'{one.kind},{one.verdict.level},"{reasons}"'
+        )
+    return "\n".join(lines) + "\n"
+
+
+def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
+    """Judge all cases; write verdicts.csv and metrics.json beside the rows.
+
+    Raises what `measure` does.
+    """
+    results = measure(settings, out, watcher)
+    if not results:
+        raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
+    write_text(out / CSV, csv_text(results))
+    found = {
+        f"{fault}, {method}": {**asdict(tally), "found": tally.found, "alarms": tally.false_alarms}
+        for (fault, method), tally in tables(results).items()
+    }
+    write_metrics(
+        out,
+        {
+            "results": len(results),
+            "tallies": found,
+            "wrong": [told(one) for one in wrong(results)],
+            "settings": settings.model_dump(mode="json"),
+            "command": command_line(),
+            "versions": versions(),
+        },
+    )
+    return results

@@ -1,0 +1,108 @@
+"""Faults of mask and lens that Psi does not know of: misplaced, soft edges, vignetting.
+
+The true Psi is that of the calibration's placement model; the method assumes the design's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from calibration.errors import CalibrationError
+from calibration.parametric import psi_at, shot_stages
+from calibration.placement import Placement, designed_placement
+from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.stability.trial import NotApplicableError, Setup, Trial, taken
+from simulators.flaws import OpticsFlaws
+
+
+def misplaced_psi(camera: Camera, size: tuple[int, int], placement: Placement) -> ImagingMatrix:
+    """Return Psi of a camera whose mask sits otherwise than designed.
+
+    Raises NotApplicableError unless the camera has one mask, between lens and sensor.
+    """
+    design = build_imaging_matrix(camera, size)
+    try:
+        mask = shadow_mask(_roomy(camera, size, placement), size)
+    except CalibrationError as fault:
+        raise NotApplicableError(
+            "needs a camera with one mask between lens and sensor, in every shot"
+        ) from fault
+    return psi_at(Shadow(mask, placement), design.layout, shot_stages(camera))
+
+
+def _roomy(camera: Camera, size: tuple[int, int], placement: Placement) -> Camera:
+    """Return the camera with a mask so large that a misplaced one still covers the beam."""
+    corner_um = math.hypot(*size) / 2 * camera.sensor.sample_pitch_um
+    turned = abs(math.sin(placement.rotation_rad)) + abs(1 / placement.scale - 1)
+    shift_um = math.hypot(placement.offset_x_um, placement.offset_y_um)
+    view_um = max(camera.views) / 2 * camera.lens.aperture_cell_um
+    masks = {}
+    for name, mask in camera.masks.items():
+        ratio = mask.distance_mm / camera.lens.distance_mm
+        away_um = shift_um + corner_um * turned + view_um * ratio * abs(placement.distance_share)
+        away_um += 5 * placement.blur_um
+        spare = mask.spare_cells + math.ceil(away_um / mask.cell_um)
+        masks[name] = mask.model_copy(update={"spare_cells": spare})
+    return camera.model_copy(update={"masks": masks})
+
+
+def _misplaced(setup: Setup, **changed: float) -> Trial:
+    if "scale" in changed:
+        changed["scale"] += 1
+    truth = setup.scene_seen().light_field
+    placement = replace(designed_placement(setup.camera), **changed)
+    size = (truth.shape[2], truth.shape[3])
+    return taken(setup, true_psi=misplaced_psi(setup.camera, size, placement))
+
+
+def _diagonal(px: float, setup: Setup) -> dict[str, float]:
+    """Return a shift by so many samples, at 30 degrees to the rows."""
+    um = px * setup.camera.sensor.sample_pitch_um
+    return {
+        "offset_x_um": um * math.cos(math.pi / 6),
+        "offset_y_um": -um * math.sin(math.pi / 6),
+    }
+
+
+def shift(setup: Setup, px: float) -> Trial:
+    """The mask sits so many samples off, in a slanted direction."""
+    return _misplaced(setup, **_diagonal(px, setup))
+
+
+def rotation(setup: Setup, degrees: float) -> Trial:
+    """The mask is turned about the axis."""
+    return _misplaced(setup, rotation_rad=math.radians(degrees))
+
+
+def scale(setup: Setup, percent: float) -> Trial:
+    """The mask's cells are so many percent too large."""
+    return _misplaced(setup, scale=percent / 100)
+
+
+def distance(setup: Setup, percent: float) -> Trial:
+    """The mask stands so many percent further from the sensor."""
+    return _misplaced(setup, distance_share=percent / 100)
+
+
+def edge_blur(setup: Setup, px: float) -> Trial:
+    """The mask's shadow is blurred, as by diffraction: deviation of a Gaussian in samples."""
+    return _misplaced(setup, blur_um=px * setup.camera.sensor.sample_pitch_um)
+
+
+def vignetting(setup: Setup, percent: float) -> Trial:
+    """The outermost ray loses so many percent, the others less, by a power of the cos^4 law."""
+    truth = setup.scene_seen().light_field
+    psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
+    lens = setup.camera.lens
+    lengths = (
+        lens.distance_mm * 1e3,
+        setup.camera.sensor.sample_pitch_um,
+        lens.aperture_cell_um,
+    )
+    natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, setup.camera.views, lengths)
+    power = math.log(1 - percent / 100) / math.log(float(natural.min()))
+    passed = (natural**power).astype(psi.weights.dtype)
+    return taken(setup, true_psi=replace(psi, weights=psi.weights * passed[None, :, :, :, None, :]))

@@ -1,0 +1,49 @@
+"""What makes a scene hard: depth, occlusions, mirrors, little contrast."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from emmc_rig.study.stability.trial import Setup, Trial, taken
+from simulators import changes
+from simulators.scenes import SCENES
+
+
+def disparity_range(setup: Setup, px: float) -> Trial:
+    """The scene's disparities span so many samples per view step."""
+    setup.need_built_in()
+    known = setup.scene_seen().disparity_px
+    assert known is not None
+    factor = px / float(np.ptp(known))
+    changed = setup.scene_seen(change=lambda world: changes.deepened(world, factor))
+    return taken(setup, scene=changed)
+
+
+def occlusion(setup: Setup, percent: float) -> Trial:
+    """Leaves nearer than everything hide so many percent of every view."""
+    setup.need_built_in()
+    nearest = SCENES[setup.scene].disparity_px[1]
+    rng = np.random.default_rng([setup.seed, 7])
+    changed = setup.scene_seen(
+        change=lambda world: changes.overgrown(world, percent / 100, nearest, rng)
+    )
+    return taken(setup, scene=changed)
+
+
+def specularity(setup: Setup, percent: float) -> Trial:
+    """Every surface mirrors a lively room, which makes so many percent of its light."""
+    setup.need_built_in()
+    rng = np.random.default_rng([setup.seed, 8])
+    changed = setup.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
+    return taken(setup, scene=changed)
+
+
+def contrast(setup: Setup, percent: float) -> Trial:
+    """The scene has so many percent of its contrast; its PSNR is that of the stretched picture."""
+    seen, share = setup.scene_seen(), percent / 100
+    mean = seen.light_field.mean(axis=(0, 1, 2, 3), keepdims=True, dtype=np.float64)
+    faded = np.asarray(mean + share * (seen.light_field - mean), dtype=np.float32)
+    trial = taken(setup, scene=replace(seen, light_field=faded))
+    return replace(trial, peak=share)

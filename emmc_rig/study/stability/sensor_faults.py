@@ -1,0 +1,89 @@
+"""Faults of sensor and light: photons, read noise, saturation, bad pixels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.camera import build_imaging_matrix, pixel_light
+from emmc_rig.model.noise import SensorNoise
+from emmc_rig.study.stability.trial import Array, Setup, Trial, taken
+from simulators.flaws import SensorFlaws
+
+DEAD_RESPONSE = 0.02
+BLACK_DEVIATIONS = 6
+
+
+def exposure(setup: Setup, electrons: float) -> Trial:
+    """A white reading is worth `electrons`, all shots together."""
+    camera = setup.camera
+    now = camera.sensor.noise.electrons_per_s * float(camera.exposures_s().sum())
+    factor = electrons / now
+    shots = tuple(
+        shot
+        if shot.exposure_s is None
+        else shot.model_copy(update={"exposure_s": shot.exposure_s * factor})
+        for shot in camera.shots
+    )
+    return taken(setup.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots))
+
+
+def read_noise(setup: Setup, electrons: float) -> Trial:
+    """Read noise of so many electrons, at least the camera's own."""
+    own = setup.camera.sensor.noise
+    electrons = max(electrons, own.read_noise_electrons)
+    # The black level lies clear of the noise, as on any sensor: clipped noise would be a bias.
+    black = math.ceil(BLACK_DEVIATIONS * electrons * own.gain_dn_per_electron)
+    black = min(max(black, own.black_level_dn), own.white_level_dn - 1)
+    return taken(_with_noise(setup, {"read_noise_electrons": electrons, "black_level_dn": black}))
+
+
+def saturation(setup: Setup, percent: float) -> Trial:
+    """The white level lies so low that so many percent of the readings reach it."""
+    camera, noise = setup.camera, setup.camera.sensor.noise
+    truth = setup.scene_seen().light_field
+    size = (truth.shape[2], truth.shape[3])
+    clean = build_imaging_matrix(camera, size).forward(truth)
+    electrons = noise.electrons(
+        clean, camera.exposures_s()[:, None, None], pixel_light(camera, size)
+    )
+    level = float(np.quantile(electrons, 1 - percent / 100)) * noise.gain_dn_per_electron
+    white = max(noise.black_level_dn + 1, round(noise.black_level_dn + level))
+    return taken(_with_noise(setup, {"white_level_dn": min(white, noise.white_level_dn)}))
+
+
+def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
+    sensor = setup.camera.sensor
+    noise = SensorNoise.model_validate({**sensor.noise.model_dump(), **changed})
+    return setup.with_camera(sensor=sensor.model_copy(update={"noise": noise}))
+
+
+def bad_pixels(setup: Setup, percent: float) -> Trial:
+    """So many percent of the pixels are dead or hot, half of each, and nobody is told."""
+    return _bad(setup, percent, told=False)
+
+
+def masked_pixels(setup: Setup, percent: float) -> Trial:
+    """The same pixels, and the method is told which."""
+    return _bad(setup, percent, told=True)
+
+
+def _bad(setup: Setup, percent: float, told: bool) -> Trial:
+    camera = setup.camera
+    truth = setup.scene_seen().light_field
+    k = camera.sensor.binning
+    pixels = (truth.shape[2] // k, truth.shape[3] // k)
+    flaws = SensorFlaws(bad_share=percent / 100, seed=setup.seed + 1)
+    hot, dead = flaws.bad(pixels)
+    # Hot pixels differ: the brightest saturates no sensor, the faintest hardly shows.
+    rng = np.random.default_rng([setup.seed, 5])
+    glow = rng.random(pixels) * flaws.hot_electrons_per_s / camera.sensor.noise.electrons_per_s
+    light = np.maximum(pixel_light(camera, (truth.shape[2], truth.shape[3])), 1)
+
+    def spoilt(clean: Array) -> Array:
+        return np.where(dead, DEAD_RESPONSE * clean, clean) + np.where(hot, glow / light, 0)
+
+    bad: NDArray[np.bool_] = np.broadcast_to(hot | dead, (len(camera.shots), *pixels))
+    return taken(setup, change_clean=spoilt, unusable=bad if told else None)

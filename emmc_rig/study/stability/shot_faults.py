@@ -1,0 +1,113 @@
+"""Faults between shots: a lamp that flickers, things that move, frames missing or doubled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.errors import SceneError
+from emmc_rig.model.lightfield import shifted
+from emmc_rig.study.stability.trial import Array, NotApplicableError, Setup, Trial, taken
+from simulators import changes
+from simulators.raycaster import World
+
+FLICKER_SEED = 6
+
+
+def flicker_gains(shots: int, percent: float, seed: int) -> Array:
+    """Return the lamp's brightness in every shot, mean 1, its logarithm deviating by `percent`."""
+    drawn = np.random.default_rng([seed, FLICKER_SEED]).standard_normal(shots)
+    drawn = (drawn - drawn.mean()) / drawn.std()
+    gains = np.exp(percent / 100 * drawn)
+    return gains / gains.mean()
+
+
+def flicker(setup: Setup, percent: float) -> Trial:
+    """The lamp's brightness differs from shot to shot."""
+    gains = flicker_gains(len(setup.camera.shots), percent, setup.seed)
+    return taken(setup, change_clean=lambda clean: clean * gains[:, None, None])
+
+
+def scene_motion(setup: Setup, px: float) -> Trial:
+    """Things move to the right before a background that stands, so many samples a shot."""
+    setup.need_built_in()
+    return _moving(setup, px, background=False)
+
+
+def camera_motion(setup: Setup, px: float) -> Trial:
+    """The camera turns: the picture moves aslant, so many samples from shot to shot.
+
+    A measured scene is interpolated, and needs to be larger than what is reconstructed.
+    """
+    if setup.is_built_in:
+        return _moving(setup, px, background=True)
+    truth = setup.scene_seen()
+    rows, columns = truth.light_field.shape[2:4]
+    shots = len(setup.camera.shots)
+    margin = int(np.ceil(px * (shots - 1))) + 2
+    size = (rows + 2 * margin, columns + 2 * margin)
+    try:
+        wide = open_scene(setup.scene, size, setup.camera.views).light_field
+    except SceneError as fault:
+        raise NotApplicableError(
+            f"needs {margin} samples of the scene around what is reconstructed: choose a smaller "
+            "--size"
+        ) from fault
+    across, down = px * np.array(DIRECTION)
+    inside = np.s_[:, :, margin:-margin, margin:-margin]
+    seen = [
+        np.stack([[shifted(one, -down * i, -across * i) for one in row] for row in wide])[inside]
+        for i in range(shots)
+    ]
+    return taken(setup, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
+
+
+DIRECTION = (np.cos(np.pi / 6), np.sin(np.pi / 6))
+"""Of the camera's motion: across, down."""
+
+
+def _moving(setup: Setup, px: float, background: bool) -> Trial:
+    truth = setup.scene_seen()
+    width = truth.light_field.shape[3] * (setup.zoom if setup.size is not None else 1)
+    across, down = DIRECTION if background else (1.0, 0.0)
+    seen = [truth.light_field]
+    for shot in range(1, len(setup.camera.shots)):
+        s, t = across * px * shot / width, down * px * shot / width
+
+        def moved(world: World, s: float = s, t: float = t) -> World:
+            return changes.moved(world, s, t, background)
+
+        seen.append(setup.scene_seen(change=moved).light_field)
+    return taken(setup, shot_scenes=seen)
+
+
+def missing_shot(setup: Setup, count: float) -> Trial:
+    """So many of the last shots stay dark: no light came through."""
+    dark = len(setup.camera.shots) - _count(setup, count)
+
+    def lost(clean: Array) -> Array:
+        kept = clean.copy()
+        kept[dark:] = 0
+        return kept
+
+    return taken(setup, change_clean=lost)
+
+
+def repeated_shot(setup: Setup, count: float) -> Trial:
+    """The mask stage stays where it is before so many of the last shots."""
+    truth = setup.scene_seen().light_field
+    psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
+    weights = psi.weights.copy()
+    last = len(setup.camera.shots) - _count(setup, count) - 1
+    weights[last + 1 :] = weights[last]
+    return taken(setup, true_psi=replace(psi, weights=weights))
+
+
+def _count(setup: Setup, count: float) -> int:
+    shots = len(setup.camera.shots)
+    if count >= shots:
+        raise NotApplicableError(f"{count:g} of {shots} shots: one at least must be whole")
+    return round(count)

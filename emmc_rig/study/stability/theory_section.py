@@ -1,0 +1,302 @@
+"""Theory beside measurement as charts, tables and words: where it predicts the break, where not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from scipy.stats import spearmanr
+
+from emmc_rig.pages.drawing import FAINT, INK, save_svg, sheet, titled
+from emmc_rig.pages.page import Section, embedded, table_head, text
+from emmc_rig.study.chart.draw import COLOURS
+from emmc_rig.study.stability.breaking import Span, below_best, strength_at, told
+from emmc_rig.study.stability.draw import PNG_DPI, shown
+from emmc_rig.study.stability.faults import FAULTS, Fault
+from emmc_rig.study.stability.theory import TheoryPoint
+
+BOUND, FOUND, ORACLE = "bound_db", "found_db", "oracle_db"
+DRAWN_AS = {
+    BOUND: ("bound, disparity known", INK, (0, (4, 2))),
+    FOUND: ("bound, disparity to be found", FAINT, (0, (1.5, 1.5))),
+    ORACLE: ("oracle, measured", INK, "-"),
+}
+FIGURES = {
+    "ray_coherence": ("coherence of neighbouring rays", False),
+    "spot_coherence": ("coherence of spots 1 px of disparity apart", False),
+    "condition": ("condition number at one disparity", False),
+    "condition_of_two": ("condition number of two disparities", False),
+    "unexplained": ("share of one disparity that another does not explain", True),
+    "least_squares_gain": ("noise gain, least squares", False),
+    "gain": ("noise gain, posterior", False),
+    "told": ("degrees of freedom told", True),
+    "crb_px": ("Cramer-Rao bound of disparity, px", False),
+    "zzb_px": ("Ziv-Zakai bound of disparity, px", False),
+    FOUND: ("bound of PSNR, disparity to be found", True),
+    BOUND: ("bound of PSNR, disparity known", True),
+}
+"""What theory says of a camera, and whether more is better."""
+NEAR = 2.0
+"""Factor between a predicted and a measured breaking point that counts as predicted."""
+CLOSE_PLACES = 0.5
+"""Likewise where strengths are no ratios: of a step between two of them."""
+LEAST_SPREAD_DB = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One fault on one scene. levels: by the name of a curve, dB, None where there is none."""
+
+    scene: str
+    fault: Fault
+    strengths: tuple[float, ...]
+    levels: Mapping[str, tuple[float | None, ...]]
+    methods: tuple[str, ...]
+
+
+def compared(points: Sequence[TheoryPoint], methods: Sequence[str]) -> list[Compared]:
+    """Return the points fault by fault."""
+    found = []
+    for scene, name in dict.fromkeys((point.scene, point.fault) for point in points):
+        some = [point for point in points if (point.scene, point.fault) == (scene, name)]
+        keys = (*FIGURES, ORACLE, *(f"{method}_db" for method in methods))
+        levels = {key: tuple(point.figures.get(key) for point in some) for key in keys}
+        strengths = tuple(point.strength for point in some)
+        found.append(Compared(scene, FAULTS[name], strengths, levels, tuple(methods)))
+    return found
+
+
+def rank_correlation(one: Sequence[float | None], other: Sequence[float | None]) -> float | None:
+    """Return Spearman's correlation; infinite values count as larger than all (None: infinite).
+
+    None where fewer than three pairs are known, or one of the two does not vary.
+    """
+    pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
+    first, second = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
+    if len(pairs) < 3 or min(len(set(first)), len(set(second))) < 2:
+        return None
+    return float(spearmanr(first, second)[0])  # pyright: ignore[reportArgumentType]
+
+
+def _place(span: Span | None) -> tuple[float | None, float | None]:
+    return (0.0, 0.0) if span is None else (span.low, span.high)
+
+
+def judged(one: Compared, method: str) -> str:
+    """Return whether the bound breaks where a method does, in words."""
+    measured, expected = (
+        below_best(one.levels[key], one.fault.whole) for key in (f"{method}_db", BOUND)
+    )
+    if measured is None:
+        return "not measured"
+    words = []
+    for end, found, wanted in zip(("low", "high"), _place(measured), _place(expected), strict=True):
+        if found is None and wanted is None:
+            continue
+        if found is None or wanted is None:
+            words.append("method only" if wanted is None else "theory only")
+        else:
+            words.append(_apart(one, found, wanted, end))
+    return "; ".join(words) or "neither breaks"
+
+
+def _apart(one: Compared, found: float, wanted: float, end: str) -> str:
+    """Return how a method's breaking place compares with the predicted one."""
+    here, there = (strength_at(one.strengths, place) for place in (found, wanted))
+    if one.fault.whole or min(here, there) <= 0:
+        near, factor = abs(found - wanted) <= CLOSE_PLACES, ""
+    else:
+        ratio = max(here, there) / min(here, there)
+        near, factor = ratio <= NEAR, f" (factor {ratio:.1f})"
+    if near:
+        return f"predicted{factor}"
+    earlier = found < wanted if end == "high" else found > wanted
+    return f"method {'sooner' if earlier else 'later'}{factor}"
+
+
+def draw_theory(some: Sequence[Compared], path: Path) -> Path:
+    """Write a panel a fault as SVG and PNG; return the SVG's path."""
+    figure, axes = sheet(len(some), 3.9, 2.75, columns=min(3, len(some)))
+    colours = dict(zip(some[0].methods, COLOURS, strict=False))
+    for panel, one in zip(axes, some, strict=True):
+        _panel(panel, one, colours)
+    lines = [
+        Line2D([], [], color=colour, linestyle=style) for _, colour, style in DRAWN_AS.values()
+    ]
+    lines += [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in colours]
+    names = [*(name for name, _, _ in DRAWN_AS.values()), *colours]
+    figure.legend(
+        lines, names, loc="outside lower center", ncols=5, fontsize=8.5, frameon=False,
+        labelcolor=INK,
+    )  # fmt: skip
+    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
+    return save_svg(figure, path)
+
+
+def _panel(axes: Axes, one: Compared, colours: Mapping[str, str]) -> None:
+    for key, (_, colour, style) in DRAWN_AS.items():
+        places, levels = _known(one.levels[key])
+        axes.plot(places, levels, color=colour, linestyle=style, linewidth=1.3, zorder=2)
+    for method, colour in colours.items():
+        places, levels = _known(one.levels[f"{method}_db"])
+        axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=3)
+    axes.set_xticks(range(len(one.strengths)), [shown(strength) for strength in one.strengths])
+    axes.tick_params(labelsize=7.5)
+    axes.set_xlabel(one.fault.unit, color=FAINT, fontsize=8.5)
+    titled(axes, one.fault.title)
+
+
+def _known(levels: Sequence[float | None]) -> tuple[list[int], list[float]]:
+    known = [(i, level) for i, level in enumerate(levels) if level is not None]
+    return [i for i, _ in known], [level for _, level in known]
+
+
+def theory_sections(
+    points: Sequence[TheoryPoint], methods: Sequence[str], folder: Path
+) -> list[Section]:
+    """Return a section for each scene, its chart written into a folder."""
+    sections = []
+    every = compared(points, methods)
+    for scene in dict.fromkeys(one.scene for one in every):
+        some = [one for one in every if one.scene == scene]
+        picture = draw_theory(some, folder / f"theory-{scene}.svg")
+        body = (
+            '<p class="lead">Bound: the expected error of the posterior mean of Gaussian textures '
+            "with each patch's own mean and variance, at its true disparity, from Psi and noise; "
+            "dotted: with an error of the disparity by the Cramer-Rao bound. Oracle: that "
+            "estimator on the noisy frames. Methods are told neither disparity nor variance, and "
+            "may know more of natural textures than their variance: they can exceed the bound. "
+            "All on the same samples.</p>"
+            f'<img class="shown" alt="Predicted and measured PSNR on {text(scene)}" '
+            f'src="{embedded(picture)}">'
+            f"<h3>Does theory predict the break?</h3>{_breaks_table(some)}"
+            f"{_summary(some)}"
+            f"<h3>Which figure of Psi tells how a method does?</h3>{_ranks_table(some)}"
+            f"<h3>Psi by its figures</h3>{_figures_table(some)}"
+        )
+        title = f"Theory beside it, {scene}"
+        sections.append(Section(f"theory-{scene}", title, title, body))
+    return sections
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    body = "".join(
+        f'<tr><th scope="row">{text(row[0])}</th>'
+        + "".join(f"<td>{text(cell)}</td>" for cell in row[1:])
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        f'<div class="scroll"><table class="breaks">{table_head(heads)}<tbody>{body}</tbody>'
+        "</table></div>"
+    )
+
+
+def _rho(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.2f}"
+
+
+def _breaks_table(some: Sequence[Compared]) -> str:
+    methods = some[0].methods
+    heads = ["Fault", "Unit", "Bound", "Oracle"]
+    for method in methods:
+        heads += [method, "judged", "rank correlation"]
+    rows = []
+    for one in some:
+        row = [one.fault.title, one.fault.unit]
+        for key in (BOUND, ORACLE):
+            row.append(told(below_best(one.levels[key], one.fault.whole), one.strengths))
+        for method in methods:
+            levels = one.levels[f"{method}_db"]
+            row.append(told(below_best(levels, one.fault.whole), one.strengths))
+            row += [judged(one, method), _rho(rank_correlation(one.levels[BOUND], levels))]
+        rows.append(row)
+    return _table(heads, rows)
+
+
+def oracle_offset(some: Sequence[Compared]) -> tuple[float, float]:
+    """Return mean and root mean square of the oracle's PSNR less the bound's, dB."""
+    apart = [
+        found - bound
+        for one in some
+        for found, bound in zip(one.levels[ORACLE], one.levels[BOUND], strict=True)
+        if found is not None and bound is not None
+    ]
+    return float(np.mean(apart)), float(np.sqrt(np.mean(np.square(apart))))
+
+
+def _summary(some: Sequence[Compared]) -> str:
+    mean, root = oracle_offset(some)
+    lines = [
+        f"The oracle lies {mean:+.2f} dB from the bound on average (root mean square {root:.2f} "
+        "dB): what the scene's surfaces, edges and occlusions differ by from Gaussian textures on "
+        "planes."
+    ]
+    for method in some[0].methods:
+        verdicts = {one.fault.title: judged(one, method) for one in some}
+        missed = [
+            f"{title.lower()} ({verdict})"
+            for title, verdict in verdicts.items()
+            if any(word in verdict for word in ("sooner", "later", "only"))
+        ]
+        agreed = len(verdicts) - len(missed)
+        lines.append(
+            f"{method}: the bound says where it breaks, or that it does not, for {agreed} of "
+            f"{len(verdicts)} faults; not for: {', '.join(missed) or 'none'}."
+        )
+    return "".join(f"<p>{text(line)}</p>" for line in lines)
+
+
+def _ranks(some: Sequence[Compared], key: str, method: str) -> list[float | None]:
+    """Return the rank correlation of a figure with a method's PSNR, for each fault."""
+    found = []
+    for one in some:
+        levels = one.levels[f"{method}_db"]
+        known = [level for level in levels if level is not None]
+        varied = len(known) > 2 and max(known) - min(known) > LEAST_SPREAD_DB
+        values = [math.inf if value is None else value for value in one.levels[key]]
+        found.append(rank_correlation(values, levels) if varied else None)
+    return found
+
+
+def _mean(ranks: Sequence[float | None], more: bool) -> float | None:
+    known = [rank if more else -rank for rank in ranks if rank is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _ranks_table(some: Sequence[Compared]) -> str:
+    methods = some[0].methods
+    heads = ["Figure", "better is", "on the whole", *(one.fault.title for one in some)]
+    rows = []
+    for key, (title, more) in FIGURES.items():
+        ranks = [_ranks(some, key, method) for method in methods]
+        means = " / ".join(_rho(_mean(one, more)) for one in ranks)
+        cells = [" / ".join(_rho(rank) for rank in both) for both in zip(*ranks, strict=True)]
+        rows.append([title, "more" if more else "less", means, *cells])
+    lead = (
+        f"<p>Rank correlation (Spearman) of the figure with the PSNR of {' / '.join(methods)} "
+        "over the strengths of each fault; –: it does not vary. On the whole: the mean, turned so "
+        "that +1 is a figure that orders all cameras as the method does, 0 one that says "
+        "nothing.</p>"
+    )
+    return lead + _table(heads, rows)
+
+
+def _figures_table(some: Sequence[Compared]) -> str:
+    names = [
+        "told", "gain", "least_squares_gain", "condition", "condition_of_two", "unexplained",
+        "spot_coherence", "ray_coherence", "crb_px", "zzb_px",
+    ]  # fmt: skip
+    heads = ["Fault", "Strength", *(FIGURES[name][0] for name in names)]
+    rows = []
+    for one in some:
+        for i, strength in enumerate(one.strengths):
+            values = [one.levels[name][i] for name in names]
+            cells = ["∞" if value is None else f"{value:.3g}" for value in values]
+            rows.append([one.fault.title, f"{strength:g} {one.fault.unit}", *cells])
+    return _table(heads, rows)

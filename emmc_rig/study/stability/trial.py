@@ -1,0 +1,125 @@
+"""One trial: what a method is told (Psi, readings, noise, usable pixels) and what was there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import Scene, zoomed_scene
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from simulators.raycaster import World
+from simulators.scenes import SCENES
+
+Array = NDArray[np.floating]
+
+
+class NotApplicableError(AppError):
+    """This fault cannot befall this camera or scene; the message says why."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is captured, and by what. scene: see `open_scene`.
+
+    size: rows and columns; None takes all of a measured scene. zoom: a built-in scene is rendered
+    so many times larger, and cut. seed: of the noise, of what is random in a fault, and of a
+    built-in scene.
+    """
+
+    scene: str
+    camera: Camera
+    size: tuple[int, int] | None = None
+    seed: int = 0
+    zoom: int = 1
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the scene is a built-in one, which can be changed."""
+        return self.scene in SCENES
+
+    def need_built_in(self) -> None:
+        """Raise NotApplicableError for a measured scene."""
+        if not self.is_built_in:
+            raise NotApplicableError("built-in scenes only: what was measured cannot be changed so")
+
+    def scene_seen(
+        self, views: tuple[int, int] | None = None, change: Callable[[World], World] | None = None
+    ) -> Scene:
+        """Return the scene in the camera's views, or in others; changed, if it is a built-in one.
+
+        Raises what `zoomed_scene` does.
+        """
+        views = views or self.camera.views
+        if change is None:
+            return _opened(self.scene, self.size, views, self.seed, self.zoom)
+        return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
+
+    def with_camera(self, **changed: object) -> Setup:
+        """Return the setup with some fields of the camera replaced."""
+        return dataclasses.replace(self, camera=self.camera.model_copy(update=changed))
+
+
+@lru_cache(maxsize=4)
+def _opened(
+    spec: str, size: tuple[int, int] | None, views: tuple[int, int], seed: int, zoom: int
+) -> Scene:
+    return zoomed_scene(spec, size, views, seed, zoom)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a method gets, and what it should find.
+
+    psi, readings, noise_sigma, usable: the method's inputs; `psi` is the assumed one. true_psi: the
+    one that made the readings. truth: (v, u, y, x, c); disparity_px: (y, x), None where it is not
+    known. peak: of the PSNR; below 1 where the scene has less contrast to show.
+    """
+
+    psi: ImagingMatrix
+    readings: NDArray[np.float32]
+    noise_sigma: float
+    usable: NDArray[np.bool_]
+    truth: Array
+    disparity_px: Array | None
+    true_psi: ImagingMatrix
+    peak: float = 1.0
+
+
+def taken(
+    setup: Setup,
+    *,
+    scene: Scene | None = None,
+    true_psi: ImagingMatrix | None = None,
+    shot_scenes: list[Array] | None = None,
+    change_clean: Callable[[Array], Array] | None = None,
+    unusable: NDArray[np.bool_] | None = None,
+) -> Trial:
+    """Return the trial of a setup; the method assumes the Psi of its camera.
+
+    scene: instead of the setup's. true_psi: makes the readings, instead of the assumed one.
+    shot_scenes: the light field before each shot, where it changes. change_clean: what becomes of
+    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels that the method is told of.
+    """
+    scene = scene or setup.scene_seen()
+    truth = scene.light_field
+    size = (truth.shape[2], truth.shape[3])
+    psi = build_imaging_matrix(setup.camera, size)
+    real = true_psi or psi
+    if shot_scenes is None:
+        clean = real.forward(truth)
+    else:
+        clean = np.stack([real.forward(seen)[shot] for shot, seen in enumerate(shot_scenes)])
+    if change_clean is not None:
+        clean = change_clean(clean)
+    # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
+    clean = np.maximum(clean, 0)
+    shots = setup.camera.read_out(clean, setup.seed)
+    usable = shots.usable if unusable is None else shots.usable & ~unusable
+    return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)

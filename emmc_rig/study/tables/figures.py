@@ -1,0 +1,301 @@
+"""The paper's Figures 5, 6, 7, 9 and 10, and the masks of Figure 8, drawn from cells and scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.report import DisplayCurve
+from emmc_rig.study.points import digest_of
+from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.demosaic import demosaiced_rggb
+from emmc_rig.study.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
+from emmc_rig.study.tables.plan import (
+    MASK_TITLES,
+    MASKS,
+    METHOD_TITLES,
+    SCENARIOS,
+    Capture,
+    Cell,
+    Part,
+    cells_of,
+    scenes_of,
+)
+from emmc_rig.study.tables.run import Run
+from emmc_rig.study.tables.shots import Sensors, Shots
+
+Array = NDArray[np.floating]
+PIECE_SHARE, LEAST_PIECE_PX = 0.16, 28
+EPI_PX, EPI_ROW_PX = 80, 3
+MASK_CELLS = 24
+
+
+def draw_figures(folder: Path, run: Run, results: Mapping[Cell, dict]) -> dict[str, Path]:
+    """Write the chosen figures as PNG; return the files by part. Those without cells are left out.
+
+    folder: exists.
+    """
+    written = {}
+    for part in run.parts:
+        draw = _DRAW.get(part.name)
+        if draw is None or not all(cell in results for cell in cells_of(part, run.library.names)):
+            continue
+        path = folder / f"{part.name}.png"
+        draw(path, part, run, results)
+        written[part.name] = path
+    return written
+
+
+def _piece_side(picture: Array) -> int:
+    return max(LEAST_PIECE_PX, round(PIECE_SHARE * picture.shape[1]))
+
+
+def _kept(run: Run, cell: Cell) -> Pictures:
+    found = Pictures.load(run.picture_path(digest_of(run.inputs(cell))))
+    assert found is not None, "do_cells leaves pictures for every cell of a figure"
+    return found
+
+
+def _name(capture: Capture) -> str:
+    name = f"({capture.scenario}) {SCENARIOS[capture.scenario]} × {capture.shots}"
+    return f"{name}, demosaiced first" if capture.demosaiced else name
+
+
+def _db(result: Mapping, cell: Cell) -> str:
+    text = f"{result['psnr_db']:.2f} dB"
+    printed = cell.paper_psnr_db
+    return text if printed is None else f"{text} (paper: {printed:.2f})"
+
+
+def _figure_5(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    (scene,) = scenes_of(part, run.library.names)
+    sensors = Sensors(run.settings.seed)
+    truth = run.library.light_field(scene, run.settings.cut)
+    tiles: list[Tile | None] = []
+    (piece,) = telling_pieces(truth[0, 0], _piece_side(truth[0, 0]))
+    # What reaches the sensor in the same total time, relative to one CFA shot.
+    shown: list[tuple[str, Shots, Array, float]] = []
+    for capture in part.captures:
+        shots = sensors.take(capture, truth, scene)
+        shown.append((_name(capture), shots, *_as_picture(capture, shots)))
+        if capture.scenario == "ii":
+            interpolated = demosaiced_rggb(shots.frames[0]).transpose(1, 2, 0)
+            shown.append(("(ii) demosaiced, to compare", shots, interpolated, 1.0))
+    white = next(p for name, _, p, _ in shown if "mono" in name)
+    curve = DisplayCurve.fitted_to(white)
+    for name, shots, picture, light in shown:
+        scenario = name[1 : name.index(")")]
+        told = "" if "demosaiced" in name else f"sensor PSNR {shots.sensor_psnr_db:.2f} dB"
+        if paper.known_as(scene) == "dragons" and told:
+            printed = paper.SENSOR_PSNR_DB.get(scenario)
+            told += f" (paper: {'over 50' if printed is None else f'{printed:.2f}'})"
+        tiles.append(
+            Tile(
+                f"{name}\n{told}",
+                screen(picture * light, curve),
+                (_stretched(piece.of(picture)),),
+                (piece,),
+            )
+        )
+    write_mosaic(
+        path,
+        f"{part.title}: {scene}",
+        [("", tiles)],
+        "Above in true proportion of the light collected, below a piece with its contrast "
+        "stretched. (i) and (iii) share the time among three shots; of (iii) the first is shown.",
+    )
+
+
+def _as_picture(capture: Capture, shots: Shots) -> tuple[Array, float]:
+    """Return frames as a picture (y, x, 3), and the light they collected against a CFA shot."""
+    if capture.scenario == "i":
+        return shots.frames.transpose(1, 2, 0), 1 / 3
+    frame = shots.frames[0]
+    if capture.scenario == "iii":
+        return np.repeat(frame[..., None], 3, axis=-1), 1.0
+    tile = cfa_tile("rggb")
+    rows, columns = frame.shape
+    seen = tile[np.arange(rows) % 2][:, np.arange(columns) % 2]
+    return frame[..., None] * seen, 1.0
+
+
+def _stretched(picture: Array) -> NDArray[np.uint8]:
+    """Return screen codes from the darkest to the brightest percents."""
+    low, high = np.percentile(picture[picture > 0] if (picture > 0).any() else picture, [1, 99])
+    scaled = np.clip((picture - low) / max(float(high - low), 1e-6), 0, 1)
+    return (np.sqrt(scaled) * 255 + 0.5).astype(np.uint8)
+
+
+def _view_tile(title: str, pictures: Pictures, piece: Piece, curve: DisplayCurve) -> Tile:
+    """Return the top-left view with the piece from it and from the centre view."""
+    corner, centre = screen(pictures.corner, curve), screen(pictures.centre, curve)
+    return Tile(title, corner, (piece.of(corner), piece.of(centre)), (piece,))
+
+
+def _figure_6(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    (scene,) = scenes_of(part, run.library.names)
+    truth = run.library.light_field(scene, run.settings.cut)
+    true = pictures_of(truth, telling_lines(truth))
+    curve = DisplayCurve.fitted_to(true.centre)
+    (piece,) = telling_pieces(true.corner, _piece_side(true.corner))
+    (method,) = part.methods
+    rows = []
+    for noisy, heading in ((False, "Noise-free"), (True, "With sensor noise")):
+        tiles: list[Tile | None] = [_view_tile("true\n", true, piece, curve)]
+        for capture in part.captures:
+            if capture.noisy == noisy:
+                cell = Cell(scene, capture, method)
+                title = f"{_name(capture)}\n{_db(results[cell], cell)}"
+                tiles.append(_view_tile(title, _kept(run, cell), piece, curve))
+        rows.append((heading, tiles))
+    write_mosaic(
+        path,
+        f"{part.title}: {scene}",
+        rows,
+        "Top-left view; below, the framed piece of it, and the same place in the centre view.",
+        tile_px=320,
+    )
+
+
+def _figure_7(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    (scene,) = scenes_of(part, run.library.names)
+    (capture,) = part.captures
+    truth = run.library.light_field(scene, run.settings.cut)
+    y, x = telling_lines(truth)
+    true = pictures_of(truth, (y, x))
+    curve = DisplayCurve.fitted_to(true.centre)
+    length = min(EPI_PX, *true.centre.shape[:2])
+    left, top = (_busiest(epi, length) for epi in (true.across, true.down))
+
+    def strips(pictures: Pictures, name: str) -> list[Tile | None]:
+        return [
+            Tile(
+                f"{name}\n{line}",
+                np.repeat(screen(epi[:, start : start + length], curve), EPI_ROW_PX, axis=0),
+            )
+            for epi, start, line in (
+                (pictures.across, left, f"row {y} (orange), all u downwards"),
+                (pictures.down, top, f"column {x} (blue), all v downwards"),
+            )
+        ]
+
+    def marked(pictures: Pictures, name: str) -> Tile:
+        view = screen(pictures.centre, curve).copy()
+        thick = max(1, view.shape[1] // 300)
+        cv2.line(view, (left, y), (left + length - 1, y), FRAMES[0], thick)
+        cv2.line(view, (x, top), (x, top + length - 1), FRAMES[1], thick)
+        return Tile(f"{name}\ncentre view with the two lines", view)
+
+    shown = {"true": true}
+    for method in part.methods:
+        cell = Cell(scene, capture, method)
+        shown[f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"] = _kept(run, cell)
+    named = list(shown.items())
+    write_mosaic(
+        path,
+        f"{part.title}: {scene}",
+        [
+            ("", [marked(pictures, name) for name, pictures in (named[0], named[2])]),
+            *(("", strips(pictures, name)) for name, pictures in named),
+        ],
+        "A point's slope is its disparity.",
+        tile_px=480,
+    )
+
+
+def _busiest(epi: Array, width: int) -> int:
+    """Return where the piece of an epipolar image begins whose views differ most."""
+    change = np.abs(epi[-1] - epi[0]).mean(axis=-1)
+    width = min(width, change.size)
+    sums = np.convolve(change, np.ones(width), "valid")
+    return int(sums.argmax())
+
+
+def _figure_8(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    scene = scenes_of(part, run.library.names)[0]
+    (method,) = part.pictured
+    truth = run.library.light_field(scene, run.settings.cut)
+    true = truth[0, 0]
+    curve = DisplayCurve.fitted_to(true)
+    (piece,) = telling_pieces(true, _piece_side(true))
+    codes = screen(true, curve)
+    tiles: list[Tile | None] = [Tile("true\n", codes, (piece.of(codes),), (piece,))]
+    for capture in part.captures:
+        cell = Cell(scene, capture, method)
+        found = screen(_kept(run, cell).corner, curve)
+        cells = MASKS[capture.mask].draw(1, MASK_CELLS, MASK_CELLS, 1.0)[0]
+        pattern = (cells * 255 + 0.5).astype(np.uint8)
+        title = f"{MASK_TITLES[capture.mask]}\n{results[cell]['psnr_db']:.2f} dB"
+        tiles.append(Tile(title, found, (pattern, piece.of(found)), (piece,)))
+    write_mosaic(
+        path,
+        f"{part.title}: {scene}, {METHOD_TITLES[method]}",
+        [("", tiles)],
+        f"Top-left view; below, {MASK_CELLS}x{MASK_CELLS} cells of the mask, and the framed piece.",
+        tile_px=320,
+    )
+
+
+def _centre_tile(title: str, picture: Array, pieces: Sequence[Piece], curve: DisplayCurve) -> Tile:
+    codes = screen(picture, curve)
+    return Tile(title, codes, tuple(piece.of(codes) for piece in pieces), tuple(pieces))
+
+
+def _figure_9(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    (scene,) = scenes_of(part, run.library.names)
+    truth = run.library.light_field(scene, run.settings.cut)
+    true = pictures_of(truth, telling_lines(truth)).centre
+    curve = DisplayCurve.fitted_to(true)
+    pieces = telling_pieces(true, _piece_side(true), 2)
+    rows = []
+    for method in part.methods:
+        tiles: list[Tile | None] = [_centre_tile("true\n", true, pieces, curve)]
+        for capture in part.captures:
+            cell = Cell(scene, capture, method)
+            title = f"{_name(capture)}\n{_db(results[cell], cell)}"
+            tiles.append(_centre_tile(title, _kept(run, cell).centre, pieces, curve))
+        rows.append((METHOD_TITLES[method], tiles))
+    note = "Centre view, noise-free; below, the framed pieces."
+    write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=300)
+
+
+def _figure_10(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+    (scene,) = scenes_of(part, run.library.names)
+    (method,) = part.methods
+    truth = run.library.light_field(scene, run.settings.binned_cut)
+    true = pictures_of(truth, telling_lines(truth)).centre
+    curve = DisplayCurve.fitted_to(true)
+    pieces = telling_pieces(true, _piece_side(true), 2)
+    found: dict[bool, list[Tile | None]] = {False: [], True: []}
+    for capture in part.captures:
+        cell = Cell(scene, capture, method)
+        title = f"{_name(capture)}\n{_db(results[cell], cell)}"
+        several = capture.shots > (3 if capture.scenario == "i" else 1)
+        found[several].append(_centre_tile(title, _kept(run, cell).centre, pieces, curve))
+    small = truth[2, 2].reshape(truth.shape[2] // 2, 2, truth.shape[3] // 2, 2, 3).mean((1, 3))
+    seen = cv2.resize(small, true.shape[1::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    rows = [
+        ("One image", [_centre_tile("true\n", true, pieces, curve), *found[False]]),
+        (
+            "Four images",
+            [_centre_tile("true, at the pixels' size\n", seen, pieces, curve), *found[True]],
+        ),
+    ]
+    note = "Centre view, noise-free, one pixel sums 2x2 samples; below, the framed pieces."
+    write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=340)
+
+
+_DRAW: dict[str, Callable[[Path, Part, Run, Mapping[Cell, dict]], None]] = {
+    "figure5": _figure_5,
+    "figure6": _figure_6,
+    "figure7": _figure_7,
+    "figure8": _figure_8,
+    "figure9": _figure_9,
+    "figure10": _figure_10,
+}

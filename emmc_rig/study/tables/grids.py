@@ -1,0 +1,165 @@
+"""Tables II, III, IV and Figure 8 as grids of ours beside the paper's, for screen and page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.plan import (
+    MASK_TITLES,
+    METHOD_TITLES,
+    PARTS,
+    SCENARIOS,
+    Capture,
+    Cell,
+    Part,
+    scenes_of,
+)
+
+Results = Mapping[Cell, Mapping]
+MEAN = "mean"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """PSNR in dB, ours and the paper's; None where there is none."""
+
+    ours: float | None
+    paper: float | None
+
+
+NOTHING = Pair(None, None)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a grid; `mean` for those that summarise scenes."""
+
+    heads: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    mean: bool = False
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One table. heads: what the first columns of each line say. columns: the captures."""
+
+    name: str
+    title: str
+    heads: tuple[str, ...]
+    columns: tuple[str, ...]
+    lines: tuple[Line, ...]
+
+
+def grids(parts: Sequence[Part], results: Results, scenes: Sequence[str]) -> list[Grid]:
+    """Return the grids of the parts that are tables; cells that were not measured stay empty."""
+    return [_MAKERS[part.name](part, results, scenes) for part in parts if part.name in _MAKERS]
+
+
+def pair_of(results: Results, cell: Cell) -> Pair:
+    """Return a cell's pair."""
+    found = results.get(cell)
+    return Pair(None if found is None else found["psnr_db"], cell.paper_psnr_db)
+
+
+def mean_pair(pairs: Iterable[Pair]) -> Pair:
+    """Return the means over scenes: of ours that exist, of the paper's if it has them all."""
+    listed = list(pairs)
+    ours = [pair.ours for pair in listed if pair.ours is not None]
+    theirs = [pair.paper for pair in listed if pair.paper is not None]
+    return Pair(
+        float(np.mean(ours)) if ours else None,
+        float(np.mean(theirs)) if theirs and len(theirs) == len(listed) else None,
+    )
+
+
+def _lines(
+    results: Results,
+    scenes: Sequence[str],
+    rows: Sequence[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]],
+) -> list[Line]:
+    """Return lines for every scene, then means, then the paper's own means where scenes differ.
+
+    rows: heads that follow the scene, captures of the columns, methods.
+    """
+    lines = []
+    for scene in [*scenes, MEAN]:
+        for heads, captures, methods in rows:
+            for method in methods:
+                columns = [
+                    [pair_of(results, Cell(name, capture, method)) for capture in captures]
+                    for name in (scenes if scene == MEAN else [scene])
+                ]
+                pairs = tuple(mean_pair(column) for column in zip(*columns, strict=True))
+                heading = (scene, *heads, METHOD_TITLES[method])
+                lines.append(Line(heading, pairs, scene == MEAN))
+    if len(scenes) == 1:
+        lines = [line for line in lines if not line.mean]
+    return lines
+
+
+def _papers_means(
+    part: Part, rows: Sequence[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]]
+) -> list[Line]:
+    """Return the paper's means over all its scenes of a part."""
+    scenes = scenes_of(part, list(paper.TITLES))
+    lines = []
+    for heads, captures, methods in rows:
+        for method in methods:
+            pairs = []
+            for capture in captures:
+                cells = [Cell(scene, capture, method) for scene in scenes]
+                values = [cell.paper_psnr_db for cell in cells]
+                known = [value for value in values if value is not None]
+                pairs.append(Pair(None, float(np.mean(known)) if known else None))
+            if any(pair.paper is not None for pair in pairs):
+                heading = (f"paper's {len(scenes)}", *heads, METHOD_TITLES[method])
+                lines.append(Line(heading, tuple(pairs), True))
+    return lines
+
+
+def _table_2(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
+    shown = scenes_of(part, scenes)
+    lines: list[Line] = []
+    for noisy, title in ((False, "noise-free"), (True, "noisy")):
+        captures = [capture for capture in part.captures if capture.noisy == noisy]
+        rows = [((title,), captures, part.methods)]
+        lines += _lines(results, shown, rows)
+        if any(paper.known_as(scene) not in paper.SYNTHETIC for scene in shown):
+            lines += _papers_means(part, rows)
+    columns = [c for c in part.captures if not c.noisy]
+    return Grid(part.name, part.title, ("scene", "noise", "method"), _names(columns), tuple(lines))
+
+
+def _table_3(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
+    rows = [((), part.captures, part.methods)]
+    lines = [*_lines(results, scenes_of(part, scenes), rows), *_papers_means(part, rows)]
+    return Grid(part.name, part.title, ("scene", "method"), _names(part.captures), tuple(lines))
+
+
+def _table_4(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
+    rows = []
+    for scenario, title in SCENARIOS.items():
+        captures = [capture for capture in part.captures if capture.scenario == scenario]
+        rows.append(((f"({scenario}) {title}",), captures, part.methods))
+    columns = ("1 (RGB 3)", "2 (RGB 6)", "3 (RGB 9)", "4 (RGB 12)")
+    lines = [*_lines(results, scenes_of(part, scenes), rows), *_papers_means(part, rows)]
+    return Grid(part.name, part.title, ("scene", "sensor", "method"), columns, tuple(lines))
+
+
+def _figure_8(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
+    rows = [((), part.captures, part.methods)]
+    columns = tuple(MASK_TITLES[capture.mask] for capture in part.captures)
+    lines = _lines(results, scenes_of(part, scenes), rows)
+    return Grid(part.name, part.title, ("scene", "method"), columns, tuple(lines))
+
+
+def _names(captures: Sequence[Capture]) -> tuple[str, ...]:
+    return tuple(f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures)
+
+
+_MAKERS = {"table2": _table_2, "table3": _table_3, "table4": _table_4, "figure8": _figure_8}
+assert set(_MAKERS) <= set(PARTS)

@@ -1,0 +1,78 @@
+"""Frames of a light field for one cell of a table, through its camera's Psi, with eq. 14's noise.
+
+The frames are made with the Psi that reconstructs them, as the paper does: an inverse crime, which
+`emmc-rig demo` avoids.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.camera import build_imaging_matrix, pixel_light
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.tables.demosaic import demosaiced_rggb
+from emmc_rig.study.tables.plan import Capture
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """What the sensor gave. frames, usable: (shot, pixel_y, pixel_x).
+
+    psi: what to reconstruct with. noise_sigma: root mean of the readings' variance, 0 without
+    noise. sensor_psnr_db: of the frames against those without noise.
+    """
+
+    psi: ImagingMatrix
+    frames: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+    noise_sigma: float
+    sensor_psnr_db: float
+
+
+class Sensors:
+    """Takes shots; keeps the last Psi, as the methods and noise levels of a capture share it."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._last: tuple[object, ImagingMatrix] | None = None
+
+    def psi(self, capture: Capture, size: tuple[int, int]) -> ImagingMatrix:
+        """Return Psi of a capture for a light field of `size` (rows, columns)."""
+        camera = capture.camera()
+        key = camera.model_dump_json(), size
+        if self._last is None or self._last[0] != key:
+            self._last = None
+            self._last = key, build_imaging_matrix(camera, size)
+        return self._last[1]
+
+    def take(self, capture: Capture, light_field: Array, scene: str) -> Shots:
+        """Return the shots of a light field (v, u, y, x, c).
+
+        The noise depends on the seed and the scene's name only, not on what was taken before.
+        """
+        camera = capture.camera()
+        size = light_field.shape[2], light_field.shape[3]
+        psi = self.psi(capture, size)
+        clean = psi.forward(light_field)
+        frames, usable, sigma = clean, np.ones(clean.shape, dtype=bool), 0.0
+        if capture.noisy:
+            noise = camera.sensor.noise
+            light, exposures_s = pixel_light(camera, size), camera.exposures_s()[:, None, None]
+            rng = np.random.default_rng([self._seed, *scene.encode()])
+            frames_dn = noise.expose_dn(clean, exposures_s, light, rng)
+            usable = ~noise.saturated(frames_dn)
+            frames = noise.normalise(frames_dn, exposures_s, light)
+            variance = noise.variance(frames, exposures_s, light)
+            sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
+        quality = psnr_db(frames, clean)
+        if capture.demosaiced:
+            frames = demosaiced_rggb(frames[0])
+            usable = np.repeat(usable, 3, axis=0)
+            psi = self.psi(capture.solved_as(), size)
+        return Shots(psi, frames.astype(np.float32), usable, sigma, quality)

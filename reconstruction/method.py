@@ -1,0 +1,95 @@
+"""A method of reconstruction as one object: assumptions, cost, settings, solve, sensitivities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import checked_noise
+from reconstruction.result import Progress, Reconstruction
+from reconstruction.sparse import PatchEstimates
+
+if TYPE_CHECKING:
+    from reconstruction.methods import MethodSettings
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a method reconstructs from.
+
+    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
+    one or of each. usable: pixels to fit (default all). dictionary: for methods that need one.
+    estimates: what `estimate_patches` found from the same inputs, to go on from. clock: seconds.
+    """
+
+    psi: ImagingMatrix
+    frames: Array
+    noise_sigma: float | Array
+    usable: NDArray[np.bool_] | None
+    dictionary: Dictionary | None
+    estimates: PatchEstimates | None
+    on_step: Callable[[Progress], None] | None
+    clock: Callable[[], float]
+
+    @property
+    def typical_noise(self) -> float:
+        """The root mean square of the readings' deviations, for methods that take one."""
+        return checked_noise(self.psi, self.noise_sigma, self.usable)[0]
+
+    def needed_dictionary(self, method: str) -> Dictionary:
+        """Return the dictionary; raises ReconstructionError when there is none."""
+        if self.dictionary is None:
+            raise ReconstructionError(
+                f"'{method}' needs a dictionary: `emmc-rig train` makes one, --dictionary names it"
+            )
+        return self.dictionary
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How much faults of a capture harm a method: factors on the verdict's limits, 1 for TV's.
+
+    psi: on those of an error of Psi; methods that assume more than total variation lose 3 dB
+    sooner. bad_pixels: total variation evens out twice as many single wrong readings. one_shot:
+    whether one shot nearly does, because one picture is carried to all views.
+    """
+
+    psi: float = 0.7
+    bad_pixels: float = 1.0
+    one_shot: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One way to reconstruct, as a module of `reconstruction.methods` offers it.
+
+    assumes, cost, when: for people; `cost` in the letters of COSTS. solve: from what is given and
+    the settings of all methods. part, settings: the name and type of its own part of the settings.
+    """
+
+    name: str
+    title: str
+    assumes: str
+    cost: str
+    when: str
+    solve: Callable[[Given, MethodSettings], Reconstruction]
+    part: str
+    settings: type[Settings]
+    needs_dictionary: bool = False
+    sensitivity: Sensitivity = field(default_factory=Sensitivity)
+
+
+COSTS = (
+    "N values of the light field, s shots; p patches of q values and m readings, n atoms: "
+    "building Psi D takes 2/3 p n q operations where pixels see one colour, 2 p n q else"
+)

@@ -1,0 +1,116 @@
+"""The methods by name, and one call for all.
+
+Every module of this package offers methods in its METHODS, and so does a module that another
+distribution names by an entry point of the group `emmc_rig.methods`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import pkgutil
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, create_model
+
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings
+from reconstruction.adaptive.method import AdaptiveSettings
+from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import checked_inputs, checked_noise
+from reconstruction.method import Given, Method
+from reconstruction.result import Progress, Reconstruction
+from reconstruction.screening import screened
+from reconstruction.sparse import PatchEstimates, SparseSettings
+from reconstruction.tv import TVSettings
+
+Array = NDArray[np.floating]
+Part = TypeVar("Part", bound=Settings)
+DEFAULT_METHOD = "adaptive"
+ENTRY_POINTS = "emmc_rig.methods"
+
+
+def offered() -> Iterator[Method]:
+    """Yield the methods of the modules here, and of those that entry points name."""
+    for module in pkgutil.iter_modules(__path__):
+        yield from import_module(f"{__name__}.{module.name}").METHODS
+    for entry in entry_points(group=ENTRY_POINTS):
+        yield from entry.load().METHODS
+
+
+METHODS = {method.name: method for method in sorted(offered(), key=lambda one: one.name)}
+
+
+class ShippedSettings(Settings):
+    """Settings of every method; each takes its own part.
+
+    screening: whether frames are screened first, see `reconstruction.screening`.
+    """
+
+    screening: bool = True
+    tv: TVSettings = Field(default_factory=TVSettings)
+    sparse: SparseSettings = Field(default_factory=SparseSettings)
+    adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)
+
+    def of(self, kind: type[Part]) -> Part:
+        """Return the part of a type: a method's own, which no field above names."""
+        return next(part for _, part in self if type(part) is kind)
+
+
+if TYPE_CHECKING:
+    MethodSettings = ShippedSettings
+else:
+    _own = {one.part: (one.settings, one.settings()) for one in METHODS.values()}
+    _own = {part: kind for part, kind in _own.items() if part not in ShippedSettings.model_fields}
+    MethodSettings = create_model("MethodSettings", __base__=ShippedSettings, **_own)
+
+
+def find_method(name: str) -> Method:
+    """Return a method by name; raises ReconstructionError naming the nearest."""
+    if name in METHODS:
+        return METHODS[name]
+    near = difflib.get_close_matches(name, METHODS, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    raise ReconstructionError(f"no method '{name}': {hint}known are {', '.join(METHODS)}")
+
+
+def reconstruct(
+    name: str,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float | Array,
+    dictionary: Dictionary | None = None,
+    settings: MethodSettings | None = None,
+    usable: NDArray[np.bool_] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    estimates: PatchEstimates | None = None,
+) -> Reconstruction:
+    """Return the light field that the method called `name` estimates.
+
+    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
+    one or of each (known: estimated from a reading it would favour those that noise made small);
+    methods that take one take the root mean square. usable: pixels to fit (default all).
+    estimates: what `estimate_patches` found from the same inputs, for `dict-...` and `tv-dict` to
+    go on from. Raises ReconstructionError for a method that is not known, a dictionary
+    that is missing, and inputs that do not fit each other.
+    """
+    method = find_method(name)
+    settings = settings or MethodSettings()
+    given = Given(psi, frames, noise_sigma, usable, dictionary, estimates, on_step, clock)
+    if not settings.screening:
+        return method.solve(given, settings)
+    started = clock()
+    frames, usable = checked_inputs(psi, frames, checked_noise(psi, noise_sigma, usable)[0], usable)
+    seen = screened(psi, frames, usable)
+    took = clock() - started
+    given = dataclasses.replace(given, frames=seen.frames, usable=seen.usable)
+    result = method.solve(given, settings)
+    return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.told)

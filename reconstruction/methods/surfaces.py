@@ -1,0 +1,55 @@
+"""The methods `adaptive` and `adaptive-fast`: surfaces by evidence, and their texture."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+from reconstruction.adaptive.method import AdaptiveSettings, fast, reconstruct_adaptive
+from reconstruction.method import Given, Method, Sensitivity
+from reconstruction.result import Reconstruction
+
+if TYPE_CHECKING:
+    from reconstruction.methods import MethodSettings
+
+
+def _solve(
+    name: str,
+    chosen: Callable[[AdaptiveSettings], AdaptiveSettings],
+    given: Given,
+    settings: MethodSettings,
+) -> Reconstruction:
+    result = reconstruct_adaptive(
+        given.psi, given.frames, given.noise_sigma, chosen(settings.adaptive), given.usable,
+        given.on_step, given.clock,
+    )  # fmt: skip
+    return dataclasses.replace(result, method=name)
+
+
+METHODS = (
+    Method(
+        "adaptive",
+        "surfaces whose disparity the evidence of patches chooses, and their texture",
+        "what is seen lies on surfaces, alike from all views but where one hides another",
+        "p patches 81 m^2/2 (2 + l d) + l (d + 28) m^3/6 for d disparities, l texture lengths; "
+        "8 x 12 x 32 N/6",
+        "one shot; nothing to train; disparity and standard deviation wanted",
+        partial(_solve, "adaptive", lambda settings: settings),
+        "adaptive",
+        AdaptiveSettings,
+        sensitivity=Sensitivity(one_shot=True),
+    ),
+    Method(
+        "adaptive-fast",
+        "as adaptive: fewer patches and disparities, fewer steps",
+        "as adaptive",
+        "about a quarter of adaptive",
+        "previews; still ahead of tv from one shot",
+        partial(_solve, "adaptive-fast", fast),
+        "adaptive",
+        AdaptiveSettings,
+        sensitivity=Sensitivity(one_shot=True),
+    ),
+)

@@ -1,0 +1,84 @@
+"""The method `tv-dict`: total variation drawn towards sparse patches (the paper's TV-Dict)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.choices import choose_mu
+from reconstruction.inputs import checked_inputs
+from reconstruction.method import Given, Method
+from reconstruction.patch_term import PatchTerm
+from reconstruction.result import Reconstruction
+from reconstruction.sparse import SparseSettings, estimate_patches
+from reconstruction.tv import TVSettings, reconstruct_tv
+
+if TYPE_CHECKING:
+    from reconstruction.methods import MethodSettings
+
+Array = NDArray[np.floating]
+PATCHED_MU, PATCHED_RHO = 3.0, 18.0
+PATCH_AREA = 81
+"""Of the patches for which the weights were fitted: 9 x 9."""
+
+
+def patched_weights(
+    tv: TVSettings, sparse: SparseSettings, psi: ImagingMatrix, readings: Array, noise_sigma: float
+) -> TVSettings:
+    """Return the settings with mu and rho chosen for a patch term, where they are not set.
+
+    readings: the usable ones. mu is 3 times that of total variation alone, rho 18 mu / (brightness
+    cover), the cover being the number of patches on a sample. The factors were fitted on two full
+    real light fields and six crops (Bayer, monochrome and RGB, one and three shots): 6 is better
+    by 0.2 to 0.9 dB where total variation alone beats the patches, 18 by 0.3 to 0.6 dB elsewhere.
+    """
+    mu = tv.mu or PATCHED_MU * choose_mu(psi, readings, noise_sigma, tv.order)
+    brightness = max(float(np.mean(readings)) / max(psi.light_efficiency(), 1e-12), 1e-12)
+    cover = PATCH_AREA / sparse.stride**2
+    rho = tv.rho if "rho" in tv.model_fields_set else PATCHED_RHO * mu / (brightness * cover)
+    return tv.model_copy(update={"mu": mu, "rho": rho})
+
+
+def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
+    started = given.clock()
+    psi, noise, dictionary = given.psi, given.typical_noise, given.needed_dictionary("tv-dict")
+    frames, usable = checked_inputs(psi, given.frames, noise, given.usable)
+    found = given.estimates or estimate_patches(
+        psi, frames, noise, dictionary, settings.sparse, usable, given.on_step
+    )
+    first_s = given.clock() - started
+    term = PatchTerm(found.light_field, found.weight)
+    tv = patched_weights(settings.tv, settings.sparse, psi, frames[usable], noise)
+    result = reconstruct_tv(
+        psi, frames, noise, tv, usable, given.on_step, patch_term=term, clock=given.clock
+    )
+    return dataclasses.replace(
+        result,
+        method="tv-dict",
+        seconds=given.clock() - started,
+        parameters={
+            **result.parameters,
+            "patches": len(found.atoms),
+            "atoms_per_patch": float(found.atoms.mean()),
+            "first_stage_seconds": first_s,
+        },
+    )
+
+
+METHODS = (
+    Method(
+        "tv-dict",
+        "DV_K drawn towards sparse patches (the paper's TV-Dict)",
+        "what `tv` and `dict-admm` assume, each where it holds",
+        "that of dict-admm, then that of tv with 4N bytes more a step",
+        "the best of the paper's, from any number of shots",
+        _solve,
+        "tv",
+        TVSettings,
+        needs_dictionary=True,
+    ),
+)

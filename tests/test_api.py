@@ -1,0 +1,205 @@
+"""The Python API: the snippet of the documentation, arrays and frames alike, what is shown."""
+
+import doctest
+import subprocess
+import sys
+from importlib import import_module
+from types import FunctionType
+
+import matplotlib
+import numpy as np
+import pytest
+import yaml
+from matplotlib import pyplot
+
+import emmc_rig as emmc
+from emmc_rig.files import scenes
+from emmc_rig.model.lightfield import load_hdf5, psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
+
+SNIPPET = """
+import emmc_rig as emmc
+camera = emmc.camera("rgbw-bayer-1shot")
+scene = emmc.scene("deep-occlusions", size=(64, 80))
+psi = camera.psi(scene.size)
+frames = psi @ scene                      # or camera.expose(scene, seed=0), with noise
+result = emmc.reconstruct(psi, frames)    # the default method
+result.light_field, result.sigma, result.disparity, result.verdict
+result.show()                             # matplotlib figure; _repr_html_ in notebooks
+rig = emmc.rig("simulated"); emmc.capture("plan.yaml", rig); emmc.calibrate("plan-session")
+"""
+PLAN = {
+    "camera": "rgbw-bayer-1shot",
+    "shots": [{"exposure_s": 0.05}],
+    "whiteboards": {
+        "views": [[2, 2]],
+        "shots": [0],
+        "references": 2,
+        "open": [{"repeats": 2}, {"held_out": True}],
+    },
+    "darks": {"repeats": 2},
+}
+
+
+@pytest.fixture(autouse=True)
+def headless():
+    """Draw into memory: no window, wherever the tests run."""
+    before = matplotlib.get_backend()
+    matplotlib.use("agg")
+    yield
+    pyplot.close("all")
+    matplotlib.use(before)
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """A small scene, its Psi and its frames with noise."""
+    camera = emmc.camera("rgbw-bayer-2shots")
+    scene = emmc.scene("deep-occlusions", size=(36, 44))
+    psi = camera.psi(scene.size)
+    return scene, psi, camera.expose(scene, seed=0, psi=psi)
+
+
+def test_the_snippet_of_the_documentation_runs_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    # The simulated rig's default, smaller: the snippet names no size.
+    monkeypatch.setattr(scenes, "_DEFAULT_SIZE_PX", (32, 48))
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+    names = {}
+    exec(SNIPPET, names)
+    result, scene = names["result"], names["scene"]
+    assert result.light_field.shape == (5, 5, 64, 80, 3)
+    assert result.sigma.shape == (5, 5, 64, 80)
+    assert result.disparity.shape == (64, 80)
+    assert result.verdict.level in ("trust", "doubt", "do not use")
+    compared = result.compare(scene)
+    assert compared["psnr_db"] == psnr_db(result.light_field, scene.light_field)
+    assert compared["psnr_db"] > compared["replicate_psnr_db"]
+    session = emmc.Session(tmp_path / "plan-session")
+    assert session.is_complete
+    assert (session.folder / "report.html").is_file()
+
+
+def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+    rig = emmc.rig("simulated", scene="near-planar", size=(32, 48), rays=256)
+    assert "near-planar" in repr(rig)
+    with pytest.raises(emmc.ERRORS, match="say which rig"):
+        emmc.capture("plan.yaml")
+    session = emmc.capture("plan.yaml", rig)
+    assert repr(session).endswith("12 of 12 frames)")
+    assert emmc.capture(session.folder).stored == session.stored
+    calibration = emmc.calibrate(session)
+    calibration.save("psi")
+    saved = ImagingMatrix.load(tmp_path / "psi" / "psi.h5")
+    np.testing.assert_array_equal(saved.weights, calibration.psi.weights)
+    assert "parametric" in repr(calibration)
+    assert "32x48" in repr(calibration)
+    psi, frames = emmc.open_frames(session.folder)
+    assert frames.shape == psi.frames_shape == (1, 32, 48)
+
+
+def test_an_array_of_readings_is_taken_with_the_noise_of_the_sensor(taken):
+    _, psi, frames = taken
+    given = emmc.reconstruct(psi, frames, "tv")
+    array = emmc.reconstruct(psi, frames.readings, "tv")
+    assert array.frames.noise_sigma == pytest.approx(frames.noise_sigma, rel=1e-6)
+    np.testing.assert_allclose(array.light_field, given.light_field, atol=1e-5)
+    quiet = emmc.reconstruct(psi, frames.readings, "tv", noise_sigma=1e-4)
+    assert quiet.frames.noise_sigma == pytest.approx(1e-4)
+
+
+def test_an_array_for_a_psi_of_no_known_camera_needs_its_noise(taken):
+    _, psi, frames = taken
+    unknown = ImagingMatrix(psi.weights, psi.colour, psi.binning)
+    with pytest.raises(emmc.ERRORS, match="give the readings' noise_sigma"):
+        emmc.reconstruct(unknown, frames.readings)
+    with pytest.raises(emmc.ERRORS, match="frames of shape"):
+        emmc.reconstruct(psi, frames.readings[:, :-2])
+
+
+def test_frames_are_arrays_to_numpy(taken):
+    scene, psi, frames = taken
+    np.testing.assert_array_equal(np.asarray(frames), frames.readings)
+    np.testing.assert_array_equal(psi @ scene, psi.forward(scene.light_field))
+    np.testing.assert_array_equal(psi.T @ frames, psi.adjoint(frames.readings))
+    error = frames.readings - frames.noise_free
+    assert frames.noise_sigma == pytest.approx(error.std(), rel=0.06)
+
+
+def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
+    _, psi, frames = taken
+    result = emmc.reconstruct(psi, frames, "dict-omp", dictionary="dct")
+    result.save(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "light_field.h5",
+        "metrics.json",
+        "pictures",
+    }
+    saved = load_hdf5(tmp_path / "out" / "light_field.h5")
+    np.testing.assert_array_equal(saved, result.light_field)
+    assert result.metrics()["dictionary"] == "dct"
+    assert result.sigma is None
+    assert result.disparity is None
+
+
+def test_what_the_api_returns_is_shown_in_one_line(taken):
+    scene, psi, frames = taken
+    result = emmc.reconstruct(psi, frames, "tv")
+    assert repr(scene) == "Scene('deep-occlusions', 5x5 views of 36x44)"
+    assert repr(psi) == "Psi(2 shots, 5x5 views, 36x44, rggb, 0.32 MB)"
+    assert repr(frames).startswith("SimulatedFrames(2 shots of 36x44 pixels, noise ")
+    assert repr(result).startswith("Result(tv, 5x5 views of 36x44, converged in ")
+    assert str(emmc.camera("rgbw-mono")).startswith("Camera(")
+    assert len(repr(emmc.camera("rgbw-mono"))) < 120
+    page = result._repr_html_()
+    assert "data:image/png;base64," in page
+    assert "verdict: " in page
+
+
+def test_public_names_are_functions_and_classes_whatever_was_imported_before():
+    import emmc_rig.calibrate.session
+    import emmc_rig.capture.plan
+    import emmc_rig.rig.rig_config  # noqa: F401
+
+    for name in ("calibrate", "camera", "capture", "open_frames", "reconstruct", "rig", "scene"):
+        assert isinstance(getattr(emmc, name), FunctionType)
+        assert getattr(emmc, name).__doc__
+    for name in ("Camera", "Frames", "Psi", "Result", "Scene", "Session"):
+        assert isinstance(getattr(emmc, name), type)
+    assert set(emmc.__all__) <= set(dir(emmc))
+    with pytest.raises(AttributeError, match="recontruct"):
+        _ = emmc.recontruct
+
+
+@pytest.mark.parametrize(
+    ("module", "unwanted"),
+    [
+        ("emmc_rig", ["numpy", "pydantic", "typer"]),
+        ("emmc_rig.capture", ["matplotlib"]),
+        ("emmc_rig.capture.sequencer", ["matplotlib"]),
+        ("emmc_rig.cli", ["numpy", "scipy", "cv2", "numba", "matplotlib", "pydantic"]),
+    ],
+)
+def test_a_module_loads_only_what_it_needs(module, unwanted):
+    code = f"import sys, {module}; print(*sorted(set({unwanted}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "emmc_rig",
+        "emmc_rig.files.cameras",
+        "emmc_rig.files.scenes",
+        "emmc_rig.model.sensing",
+        "emmc_rig.reconstruct.solve",
+        "emmc_rig.rig.rig_config",
+    ],
+)
+def test_the_examples_in_docstrings_give_what_they_show(module):
+    tested = doctest.testmod(import_module(module), extraglobs={})
+    assert tested.attempted > 0
+    assert tested.failed == 0

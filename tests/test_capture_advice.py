@@ -1,0 +1,780 @@
+"""Every error that a capture can end in: its advice, carried out, ends in a complete session.
+
+The texts are taken from the source: one without a walk here fails the test, as does a walk without
+its text. A walk brings the fault about, yields what the program said, and does as it is told.
+"""
+
+import ast
+import errno
+import hashlib
+import inspect
+import io
+import os
+import shutil
+import signal
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import yaml
+from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
+
+import drivers.errors
+import emmc_rig
+from drivers.errors import DriverError
+from emmc_rig import cli
+from emmc_rig.capture import command, sequencer
+from emmc_rig.capture.checks import SaturatedError
+from emmc_rig.capture.retries import HOPELESS
+from emmc_rig.rig.rig_config import AskingAttendant
+from emmc_rig.session import session as session_module
+from emmc_rig.session.lock import held
+from emmc_rig.session.session import Session
+from emmc_rig.session.storage import SystemDisk
+from emmc_rig.session.verify import verify
+from simulators.dng import encode_dng
+
+HOUSE = Path(emmc_rig.__file__).parent
+SCANNED = (
+    *sorted((HOUSE / "capture").glob("*.py")),
+    HOUSE / "session" / "session.py",
+    HOUSE / "session" / "lock.py",
+    HOUSE / "commands" / "capture.py",
+    HOUSE / "rig" / "rig_config.py",
+)
+NO_CAPTURE = ("direct.py", "simulate.py", "enough.py")
+"""Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
+GUARDS = (
+    "cannot be metered, the board is dark",  # such a frame is refused as black before
+    "was not captured yet; resume it",  # only frames are read that were hashed just before
+    "is damaged, its SHA-256 is not the journal's",
+    "); resume it",
+    "no session, it holds no",  # a folder that is none is a plan, or the place for one
+    "another program",  # a program that holds the lock and never says its name
+)
+"""What other commands print, and what earlier checks keep a capture from."""
+PLAN = {
+    "camera": "rgbw-bayer-3shots",
+    "shots": [{"exposure_s": 0.01}, {"exposure_s": 0.02}],
+    "whiteboards": {"views": [[2, 2]], "repeats": 1, "references": 2, "exposure_s": 0.02},
+    "darks": {"repeats": 2},
+    "retries": {"per_frame": 1},
+}
+CAPTURE = ("capture", "plan.yaml", "--rig", "simulated")
+AGAIN = "shot-1-e0-r0"
+"""The last frame of the plan."""
+WALKS = {}
+WRITTEN = {}
+"""The plan of `emmc-rig calibrate --plan`, once written: it takes seconds."""
+
+
+def walk(text):
+    """Register a walk by a part of the text that the program says, as it is in the source."""
+
+    def registered(function):
+        WALKS[text] = function
+        return function
+
+    return registered
+
+
+class Light(NamedFrames):
+    """Frames of their own name again, whose brightness is the exposure's, and what goes wrong.
+
+    factor: by the beginning of a frame's name, what its light is multiplied with. faults: errors to
+    be raised by the beginning of the frame's name. swapped: a frame that shows what another does.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.factor, self.faults, self.swapped, self.last = {}, {}, {}, b""
+        self.repeats = False
+
+    def capture(self, exposure_s):
+        for start, fault in self.faults.items():
+            if self.name.startswith(start):
+                raise fault
+        if self.repeats and self.last:
+            return self.last
+        name = self.swapped.get(self.name, self.name)
+        digest = hashlib.sha256(name.encode()).digest()
+        rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+        factor = next((f for start, f in self.factor.items() if name.startswith(start)), 1.0)
+        span = factor * 20 if name.startswith("dark") else factor * 1e5 * min(exposure_s, 0.03)
+        counts = BLACK + span * rng.uniform(0.5, 1.0, self.size)
+        counts = np.clip(counts, BLACK, WHITE).astype(np.uint16)
+        self.last = encode_dng(counts, "rggb", BLACK, WHITE, exposure_s)
+        return self.last
+
+
+class Bench:
+    """A folder with a plan, a rig in it, and the program."""
+
+    def __init__(self, folder, run, patch):
+        self.folder, self.run, self.patch = folder, run, patch
+        self.light = Light()
+        self.rig = still_rig()
+        self.finish = CAPTURE
+        self.session = folder / "plan-session"
+        patch.setattr(command, "opened_rig", self.opened)
+        self.plan()
+
+    @contextmanager
+    def opened(self, description, camera, ask):
+        device = self.rig.camera
+        device._transport = self.light
+        self.light.last = b""
+        yield replace(self.rig, about_to_expose=self.light.announce, reopen_camera=None)
+
+    def plan(self, path="plan.yaml", **changes):
+        """Write the plan, changed; None leaves a key out."""
+        settings = {**PLAN, **changes}
+        (self.folder / path).write_text(yaml.safe_dump(settings))
+
+    def boards(self, **changes):
+        self.plan(whiteboards={**PLAN["whiteboards"], **changes})
+
+    def small_camera(self, **changes):
+        """Write a camera of few views, and a plan for it."""
+        mask = {"distance_mm": 0.24, "cell_um": 24.0, "pattern": {"kind": "random_rgbw", "seed": 0}}
+        camera = {
+            "title": "few views",
+            "views": [3, 3],
+            "sensor": {"cfa": "rggb"},
+            "masks": {"mask": mask},
+            "more_shots_step_um": {"mask": [270, 162]},
+        }
+        (self.folder / "camera.yaml").write_text(yaml.safe_dump(camera))
+        self.plan(camera="camera.yaml", **changes)
+
+    def refused(self, *arguments):
+        """Run the program, by default the capture, and return the one line that it ends with."""
+        code, _, err = self.run(*(arguments or self.finish))
+        lines = [line for line in err.splitlines() if line.startswith("emmc-rig:")]
+        assert code in (1, 130), err
+        assert len(lines) == 1, err
+        assert "Traceback" not in err
+        return lines[0]
+
+    def begun(self):
+        """Take all frames but the last one."""
+        self.light.faults[AGAIN] = DriverError("a cable is loose", "fix it")
+        self.refused()
+        self.light.faults.clear()
+        assert len(Session(self.session).missing()) == 1
+
+    def copied(self):
+        shutil.copytree(self.session, self.folder / "copy")
+
+    def restored(self):
+        shutil.rmtree(self.session)
+        shutil.copytree(self.folder / "copy", self.session)
+
+
+@pytest.fixture(scope="module")
+def quick_cli():
+    """The command line, put together once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "app", typer.main.get_command(cli.app))
+        yield
+
+
+@pytest.fixture
+def bench(tmp_path, run, monkeypatch, quick_cli):
+    return Bench(tmp_path, run, monkeypatch)
+
+
+# What the plan says.
+
+
+@walk("whiteboards.views: [")
+def views_that_are_none(bench):
+    bench.boards(views=[[7, 2]])
+    yield bench.refused()
+    bench.boards(views=[[4, 2]])
+
+
+@walk(" shots, from 0")
+def shots_that_are_none(bench):
+    bench.boards(shots=[0, 2])
+    yield bench.refused()
+    bench.boards(shots=[0, 1])
+
+
+@walk("no mask of this camera moves: leave it out")
+def a_board_beyond_a_mask_that_stands(bench):
+    one = {"camera": "coded-aperture-random", "shots": [{"exposure_s": 0.01}]}
+    boards = {"views": [], "references": 2, "exposure_s": 0.02}
+    bench.plan(**one, whiteboards={**boards, "open": [{"mask_um": [9, 9]}]})
+    yield bench.refused()
+    bench.plan(**one, whiteboards={**boards, "open": [{}]})
+
+
+@walk("the camera has no mask to move: leave its place out")
+def a_place_for_no_mask(bench):
+    bench.plan(camera="conventional", shots=[{"exposure_s": 0.01, "mask_um": [1, 1]}])
+    yield bench.refused()
+    bench.plan(camera="conventional", shots=[{"exposure_s": 0.01}])
+
+
+@walk("give mask_um or mask_cells, not both")
+def a_place_twice(bench):
+    bench.plan(shots=[{"mask_um": [1, 1], "mask_cells": [1, 1]}])
+    yield bench.refused()
+    bench.plan(shots=[{"mask_um": [1, 1]}])
+
+
+@walk("moves two masks apart, the rig has one mask stage")
+def two_masks_at_two_places(bench):
+    mask = {"distance_mm": 0.24, "cell_um": 24.0, "pattern": {"kind": "random_rgbw", "seed": 0}}
+    camera = {
+        "title": "two masks",
+        "views": [5, 5],
+        "sensor": {"cfa": "rggb"},
+        "masks": {"near": mask, "far": {**mask, "distance_mm": 0.48}},
+        "shots": [{"offset_um": {"near": [0, 0], "far": [24, 0]}}],
+    }
+    (bench.folder / "camera.yaml").write_text(yaml.safe_dump(camera))
+    bench.plan(camera="camera.yaml", shots=[{"exposure_s": 0.01}])
+    yield bench.refused()
+    bench.plan(camera="camera.yaml", shots=[{"exposure_s": 0.01, "mask_um": [24, 0]}])
+
+
+@walk("is always its own: leave camera_shot out")
+def another_pattern_in_every_shot(bench):
+    camera = "coded-aperture-sequential-random"
+    bench.plan(camera=camera, shots=[{"exposure_s": 0.01, "camera_shot": 1}])
+    yield bench.refused()
+    bench.plan(camera=camera, shots=[{"exposure_s": 0.01}])
+
+
+# A target, which needs a choice; that the plan has one then, the dry run says.
+
+
+def accepted_with_a_target(bench):
+    code, _, err = bench.run(*CAPTURE, "--until", "30dB", "--dry-run")
+    assert code == 0, err
+
+
+@walk("--until: the plan has one shot")
+def a_target_without_a_choice(bench):
+    bench.plan(shots=[{"exposure_s": 0.01}])
+    yield bench.refused(*CAPTURE, "--until", "30dB")
+    bench.plan(shots=[{"exposure_s": 0.01}, {"mask_um": [270, 162]}], whiteboards={})
+    accepted_with_a_target(bench)
+    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "mask_um": [270, 162]}])
+
+
+@walk("--until: the plan has no ")
+def a_target_without_darks(bench):
+    bench.small_camera(darks=None)
+    yield bench.refused(*CAPTURE, "--until", "30dB")
+    calibration_plan(bench)
+
+
+@walk("--until: the plan has neither open whiteboards nor the pinhole")
+def a_target_without_boards(bench):
+    bench.small_camera()
+    yield bench.refused(*CAPTURE, "--until", "30dB")
+    calibration_plan(bench)
+
+
+@walk("--until: no open whiteboard of the plan is held out")
+def a_target_without_a_judge(bench):
+    bench.small_camera(whiteboards={**PLAN["whiteboards"], "open": [{"repeats": 1}]})
+    yield bench.refused(*CAPTURE, "--until", "30dB")
+    calibration_plan(bench)
+
+
+def calibration_plan(bench):
+    """Take the whiteboards of the plan that `emmc-rig calibrate --plan` writes, as advised."""
+    if not WRITTEN:
+        arguments = ("calibrate", "--plan", "--camera", "camera.yaml", "--size", "16x20")
+        code, _, err = bench.run(*arguments)
+        assert code == 0, err
+        path = bench.folder / "emmc-calibration" / "plan.yaml"
+        WRITTEN.update(yaml.safe_load(path.read_text()))
+    bench.small_camera(whiteboards=WRITTEN["whiteboards"], darks=WRITTEN["darks"])
+    accepted_with_a_target(bench)
+
+
+# What the devices can not do.
+
+
+@walk(": the camera exposes from ")
+def an_exposure_beyond_the_camera(bench):
+    bench.plan(shots=[{"exposure_s": 7200.0}])
+    line = bench.refused(*CAPTURE, "--dry-run")
+    assert "change shots.0.exposure_s in the plan" in line
+    assert bench.refused() == line
+    assert not bench.session.exists()
+    yield line
+    bench.plan(shots=[{"exposure_s": 0.02}])
+
+
+@walk(": the camera's gain goes from ")
+def a_gain_beyond_the_camera(bench):
+    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "gain": 8}])
+    line = bench.refused(*CAPTURE, "--dry-run")
+    assert "change shots.1.gain in the plan" in line
+    yield line
+    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "gain": 1}])
+
+
+@walk(" um from its zero (")
+def a_place_beyond_the_stage(bench):
+    bench.plan(shots=[{"exposure_s": 0.01, "mask_um": [90_000, 0]}])
+    yield bench.refused(*CAPTURE, "--dry-run")
+    bench.plan(shots=[{"exposure_s": 0.01, "mask_um": [9_000, 0]}])
+
+
+@walk(" needs a stage axis '")
+def a_stage_without_an_axis(bench):
+    zero_um = bench.rig.zero_um
+    bench.rig = replace(bench.rig, zero_um={k: um for k, um in zero_um.items() if k != "mask_y"})
+    yield bench.refused(*CAPTURE, "--dry-run")
+    bench.rig = replace(bench.rig, zero_um=zero_um)
+
+
+@walk(": write simulated, or the name of a YAML file of devices")
+def a_rig_that_is_none(bench):
+    yield bench.refused("capture", "plan.yaml", "--rig", "real")
+
+
+# Frames that cannot be right.
+
+
+@walk("is saturated in ")
+def a_shot_that_is_too_bright(bench):
+    bench.light.factor = {AGAIN: 10.0}
+    line = bench.refused()
+    assert "lower shots.1.exposure_s in the plan" in line
+    before = Session(bench.session)
+    assert not [e for e in before.journal.entries if e["kind"] == "retry" and e["attempt"] > 1]
+    yield line
+    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.002}])
+    code, out, err = bench.run(*CAPTURE)
+    assert code == 0, err
+    assert "9 frames taken stay" in err
+    assert "1 taken in" in out
+    code, out, _ = bench.run("session", "show", "plan-session")
+    assert "plan 0       9 frames, by plan.yaml" in out
+    assert "plan 1       1 frames, by amended-1-plan.yaml" in out
+    after = Session(bench.session)
+    assert after.stored[AGAIN]["exposure_s"] == 0.002
+    assert all(after.stored[name] == entry for name, entry in before.stored.items())
+
+
+@walk("is black, its brightest pixels ")
+def a_lens_cap(bench):
+    bench.light.factor = {AGAIN: 0.0}
+    yield bench.refused()
+    bench.light.factor = {}
+
+
+@walk("is not dark, on average ")
+def a_lamp_left_on(bench):
+    bench.light.factor = {"dark": 100.0}
+    yield bench.refused()
+    assert not bench.session.exists()
+    bench.light.factor = {}
+
+
+@walk("is the frame before it once more, bit by bit")
+def a_camera_that_repeats_itself(bench):
+    bench.light.repeats = True
+    yield bench.refused()
+    bench.light.repeats = False
+
+
+@walk("would be exposed for ")
+def a_camera_on_automatic_exposure(bench):
+    camera = bench.rig.camera
+    honest = camera.set_exposure_s
+    camera.set_exposure_s = lambda exposure_s: honest(4 * exposure_s)
+    yield bench.refused()
+    camera.set_exposure_s = honest
+
+
+@walk("was exposed while ")
+def a_stage_that_is_pushed(bench):
+    stage = bench.rig.stage
+    honest = stage.position_um
+    stage.position_um = lambda axis: honest(axis) + 9.0
+    yield bench.refused()
+    stage.position_um = honest
+
+
+@walk("gave up after ")
+def a_fault_that_stays(bench):
+    bench.light.faults[AGAIN] = DriverError("a cable is loose", "fix it")
+    yield bench.refused()
+    bench.light.faults.clear()
+
+
+@walk(" retries of the session are spent")
+def faults_that_go_on(bench):
+    bench.plan(retries={"per_session": 0})
+    bench.light.faults[AGAIN] = DriverError("a cable is loose", "fix it")
+    yield bench.refused()
+    bench.light.faults.clear()
+
+
+@walk("the bench is no longer as it was: frame ")
+def a_board_that_was_moved(bench):
+    bench.begun()
+    bench.light.swapped = {"board-s1-v2-u2-white-r0": "elsewhere"}
+    bench.light.swapped |= {"board-s0-v2-u2-white-r0": "elsewhere"}
+    yield bench.refused()
+    bench.light.swapped = {}
+
+
+@walk("its bytes changed in this computer's memory")
+def memory_that_loses_bits(bench):
+    class Spoilt(Session):
+        def store(self, frame, suffix, data, sha256, facts):
+            super().store(frame, suffix, data, sha256[::-1], facts)
+
+    bench.patch.setattr(command, "Session", Spoilt)
+    yield bench.refused()
+    bench.patch.setattr(command, "Session", Session)
+
+
+# What lies in the folder.
+
+
+@walk("name a plan, or write one with --new CAMERA")
+def no_argument(bench):
+    code, _, err = bench.run("capture")
+    assert code == 2
+    yield " ".join(err.split())
+
+
+@walk(": no such file; write a plan with: emmc-rig capture --new CAMERA")
+def no_plan(bench):
+    (bench.folder / "plan.yaml").unlink()
+    yield bench.refused()
+    assert bench.run("capture", "--new", PLAN["camera"])[0] == 0
+    written = yaml.safe_load((bench.folder / "plan.yaml").read_text())
+    bench.plan(camera=written["camera"])
+
+
+@walk("say which rig: --rig simulated")
+def no_rig(bench):
+    yield bench.refused("capture", "plan.yaml")
+
+
+@walk("holds something else than a session; name another --out")
+def a_folder_of_something_else(bench):
+    (bench.folder / "mine").mkdir()
+    (bench.folder / "mine" / "thesis.txt").write_text("mine")
+    yield bench.refused(*CAPTURE, "--out", "mine")
+    bench.finish = (*CAPTURE, "--out", "other")
+    bench.session = bench.folder / "other"
+
+
+@walk(" is gone; restore it from a copy, or name another --out")
+def no_journal(bench):
+    bench.begun()
+    bench.copied()
+    (bench.session / "journal.jsonl").unlink()
+    yield bench.refused()
+    bench.restored()
+
+
+@walk(": its first line is damaged; restore it from a copy")
+def a_damaged_journal(bench):
+    bench.begun()
+    bench.copied()
+    journal = bench.session / "journal.jsonl"
+    journal.write_bytes(b"x" + journal.read_bytes())
+    yield bench.refused()
+    bench.restored()
+
+
+@walk(": was changed after the session began; restore it from a copy")
+def an_edited_camera_in_the_session(bench):
+    bench.begun()
+    bench.copied()
+    (bench.session / "camera.json").write_text("{}")
+    yield bench.refused()
+    bench.restored()
+
+
+@walk("); restore it from a copy")
+def a_frozen_file_that_is_gone(bench):
+    bench.begun()
+    bench.copied()
+    (bench.session / "frames.json").unlink()
+    yield bench.refused()
+    bench.restored()
+
+
+@walk(": made by a later emmc-rig; update this one")
+def a_session_of_a_later_program(bench):
+    with pytest.MonkeyPatch.context() as later:
+        later.setattr(session_module, "FORMAT", session_module.FORMAT + 1)
+        bench.begun()
+    yield bench.refused()
+    bench.patch.setattr(session_module, "FORMAT", session_module.FORMAT + 1)
+
+
+@walk("); mend that")
+def a_journal_that_cannot_be_read(bench):
+    bench.begun()
+
+    def refuse(disk, path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SystemDisk, "reader", refuse)
+        line = bench.refused()
+    yield line
+
+
+@walk("); mend that, or name another folder")
+def a_folder_that_cannot_be_made(bench):
+    def refuse(disk, path):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SystemDisk, "make_folder", refuse)
+        line = bench.refused()
+    yield line
+
+
+@walk("make that possible, or name another folder")
+def a_lock_that_cannot_be_written(bench):
+    lock = bench.folder / ".plan-session.lock"
+    lock.mkdir()
+    yield bench.refused()
+    lock.rmdir()
+
+
+@walk("); name another folder")
+def a_file_among_the_folders_above(bench):
+    yield bench.refused(*CAPTURE, "--out", "plan.yaml/in/it")
+    bench.finish = (*CAPTURE, "--out", "other")
+    bench.session = bench.folder / "other"
+
+
+@walk(": held by ")
+def another_program_at_work(bench):
+    with held(bench.session):
+        line = bench.refused()
+    assert f"(process {os.getpid()} on " in line
+    yield line
+
+
+@walk(" are free; make room, or name another --out")
+def a_small_disk(bench):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SystemDisk, "free_bytes", lambda disk, folder: 1000)
+        line = bench.refused()
+    assert not bench.session.exists()
+    yield line
+
+
+@walk(", then run the same command to go on; ")
+def a_disk_that_fills(bench):
+    honest = SystemDisk.create
+
+    def filling(disk, path):
+        if AGAIN in path.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return honest(disk, path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SystemDisk, "create", filling)
+        line = bench.refused()
+    assert "9 of 10 frames are safe" in line
+    yield line
+
+
+# Going on with something else than what frames were taken by.
+
+
+@walk("; leave --rig out, or name another --out")
+def another_rig(bench):
+    bench.begun()
+    yield bench.refused(*CAPTURE, "--scene", "dark")
+    bench.finish = ("capture", "plan.yaml")
+
+
+@walk(": connect that one, or name another --out")
+def another_camera(bench):
+    bench.begun()
+    camera = bench.rig.camera
+    identity = camera.identity
+    camera.identity = replace(identity, serial="8")
+    yield bench.refused()
+    camera.identity = identity
+
+
+@walk("the camera was edited since session ")
+def an_edited_camera(bench):
+    bench.begun()
+    bench.plan(camera="rgbw-bayer-2shots")
+    yield bench.refused()
+    bench.plan()
+
+
+@walk("frames of this shot are taken in session ")
+def another_mask_place(bench):
+    bench.begun()
+    bench.plan(shots=[{"exposure_s": 0.01, "mask_um": [9, 9]}, {"exposure_s": 0.01}])
+    yield bench.refused()
+    bench.plan()
+
+
+@walk("shots: a mask shows another pattern in every shot")
+def more_shots_of_changing_patterns(bench):
+    camera = "coded-aperture-sequential-random"
+    bench.plan(camera=camera)
+    bench.begun()
+    bench.plan(camera=camera, shots=[*PLAN["shots"], {"exposure_s": 0.01}])
+    yield bench.refused()
+    bench.plan(camera=camera)
+
+
+@walk(" is taken, and the edited plan has ")
+def another_gain(bench):
+    bench.begun()
+    bench.plan(shots=[{"exposure_s": 0.01, "lamp": "red"}, {"exposure_s": 0.01}])
+    yield bench.refused()
+    bench.plan()
+
+
+# What somebody did.
+
+
+@walk(" frames are still to be taken; ")
+def a_stop_after_the_frame(bench):
+    honest = sequencer.check
+
+    def stopping(planned, *rest):
+        if planned.id == "dark-0-r1":
+            signal.raise_signal(signal.SIGINT)
+        return honest(planned, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sequencer, "check", stopping)
+        line = bench.refused()
+    bench.finish = ("capture", "plan-session")
+    yield line
+
+
+@walk("stopped at once; ")
+def a_stop_at_once(bench):
+    bench.light.faults["shot"] = KeyboardInterrupt()
+    line = bench.refused()
+    bench.light.faults.clear()
+    bench.finish = ("capture", "plan-session")
+    yield line
+
+
+@walk("run this on a terminal, or automate the lamp and masks")
+def work_by_hand_without_a_terminal(bench):
+    quiet = bench.rig
+    opened = bench.opened
+
+    @contextmanager
+    def by_hand(description, camera, ask):
+        bench.rig = replace(quiet, attendant=AskingAttendant(camera, ask))
+        with opened(description, camera, ask) as rig:
+            yield rig
+
+    bench.patch.setattr(command, "opened_rig", by_hand)
+    bench.patch.setattr("sys.stdin", io.StringIO())
+    yield bench.refused()
+    assert not bench.session.exists()
+    terminal = io.StringIO("\n" * 40)
+    terminal.isatty = lambda: True
+    bench.patch.setattr("sys.stdin", terminal)
+
+
+@walk(": exists already; name another --out")
+def a_new_plan_where_one_is(bench):
+    yield bench.refused("capture", "--new", PLAN["camera"])
+    assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
+
+
+@walk("); name another --out")
+def a_new_plan_in_no_folder(bench):
+    yield bench.refused("capture", "--new", PLAN["camera"], "--out", "nowhere/plan.yaml")
+    assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
+
+
+def sample(kind):
+    """An error of the drivers, made of values that its signature takes."""
+    values = {str: "x", int: 1, float: 1.0, bytes: b"x", tuple[float, float]: (0.0, 1.0)}
+    taken = [
+        values.get(one.annotation, ("x",))
+        for one in inspect.signature(kind).parameters.values()
+        if one.kind == one.POSITIONAL_OR_KEYWORD and one.default is one.empty
+    ]
+    return kind(*taken)
+
+
+def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
+    kinds = [
+        kind
+        for kind in vars(drivers.errors).values()
+        if inspect.isclass(kind) and issubclass(kind, DriverError)
+    ]
+    assert set(HOPELESS) - set(kinds) == {SaturatedError}
+    bench.begun()
+    bench.rig.stage.reconnect = lambda: None
+    for kind in kinds:
+        fault = sample(kind)
+        bench.light.faults[AGAIN] = fault
+        line = bench.refused()
+        assert str(fault) in line
+        assert "9 frames are kept: mend it, then run the same command" in line
+        retries = [e for e in Session(bench.session).journal.entries if e["kind"] == "retry"]
+        assert retries[-1]["attempt"] == (1 if isinstance(fault, HOPELESS) else 2)
+    bench.light.faults.clear()
+    assert bench.run(*CAPTURE)[0] == 0
+    assert verify(Session(bench.session)).is_complete
+
+
+def texts():
+    """Every text that the scanned modules raise: its place, and its constant parts."""
+    for path in SCANNED:
+        if path.name in NO_CAPTURE:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            said = node.exc if isinstance(node, ast.Raise) else node
+            of_error = said is not node or ast.unparse(node).startswith("super().__init__(")
+            if isinstance(said, ast.Call) and of_error:
+                raised = [one for one in ast.walk(said) if isinstance(one, ast.Constant)]
+                parts = [one.value for one in raised if isinstance(one.value, str)]
+                yield f"{path.name}:{node.lineno}", [one for one in parts if " " in one.strip()]
+
+
+def test_every_text_has_a_walk_and_every_walk_its_text():
+    known = [*WALKS, *GUARDS]
+    used = set()
+    for place, parts in texts():
+        if parts:
+            found = {one for one in known if any(one in part for part in [*parts, "".join(parts)])}
+            assert found, f"{place}: no walk for {parts}"
+            used |= found
+    assert set(known) - used == set()
+
+
+@pytest.mark.parametrize("text", WALKS)
+def test_advice_carried_out_ends_in_a_complete_session(bench, text):
+    steps = WALKS[text](bench)
+    line = next(steps)
+    assert text in line
+    assert next(steps, None) is None
+    code, out, err = bench.run(*bench.finish)
+    assert code == 0, err
+    assert "complete: " in out
+    verdict = verify(Session(bench.session))
+    assert verdict.is_complete
+    assert not verdict.leftovers

@@ -1,0 +1,84 @@
+"""The methods by name: a new one is one module, which brings its own settings."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
+
+MEAN_PICTURE = textwrap.dedent('''
+    """The method `mean`: one grey for all, from the mean reading."""
+
+    import numpy as np
+    from pydantic import Field
+
+    from emmc_rig.model.settings import Settings
+    from reconstruction.method import Method
+    from reconstruction.result import Reconstruction, Status
+
+
+    class MeanSettings(Settings):
+        """Settings of `mean`."""
+
+        gain: float = Field(default=1.0, gt=0)
+
+
+    def _solve(given, settings):
+        level = settings.of(MeanSettings).gain * given.frames.mean()
+        light_field = np.full(given.psi.light_field_shape, level, dtype=np.float32)
+        return Reconstruction("mean", light_field, Status.CONVERGED, "", 1, (), 0.0, {})
+
+
+    METHODS = (
+        Method("mean", "mean reading", "a flat scene", "N", "never", _solve, "mean", MeanSettings),
+    )
+''')
+USED = textwrap.dedent("""
+    import numpy as np
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.model.camera import build_imaging_matrix
+    from reconstruction.methods import MethodSettings, reconstruct
+
+    psi = build_imaging_matrix(find_camera("rgbw-mono"), (8, 8))
+    settings = MethodSettings.model_validate({"mean": {"gain": 0.5}})
+    frames = np.full(psi.frames_shape, 0.2, np.float32)
+    result = reconstruct("mean", psi, frames, 0.01, settings=settings)
+    print(result.method, round(float(result.light_field.mean()), 3))
+    try:
+        MethodSettings.model_validate({"mean": {"gian": 0.5}})
+    except ValueError:
+        print("misspelt settings refused")
+""")
+
+
+def test_another_package_offers_a_method_by_one_module_with_settings_of_its_own(tmp_path):
+    (tmp_path / "mean_picture.py").write_text(MEAN_PICTURE, encoding="utf-8")
+    installed = tmp_path / "mean_picture-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: mean-picture\nVersion: 1\n")
+    (installed / "entry_points.txt").write_text("[emmc_rig.methods]\nmean = mean_picture\n")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    ran = subprocess.run(
+        [sys.executable, "-c", USED],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert ran.stdout.splitlines() == ["mean 0.1", "misspelt settings refused"], ran.stderr
+
+
+def test_a_method_that_is_misspelt_is_refused_with_the_nearest():
+    with pytest.raises(ReconstructionError, match="did you mean 'adaptive'"):
+        find_method("adaptve")
+
+
+def test_every_method_finds_its_part_of_the_settings():
+    settings = MethodSettings()
+    for method in METHODS.values():
+        assert getattr(settings, method.part) == settings.of(method.settings)
+
+
+def test_the_default_method_needs_no_dictionary():
+    assert not find_method(DEFAULT_METHOD).needs_dictionary
