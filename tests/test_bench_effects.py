@@ -83,7 +83,7 @@ def snell(x, u, thickness, index):
         above = (LENS_UM - thickness) * sine / np.sqrt(1 - sine**2)
         return thickness * inside / np.sqrt(1 - inside**2) + above - (u - x)
 
-    sine = brentq(missed, -0.9, 0.9, xtol=1e-14)
+    sine = float(brentq(missed, -0.9, 0.9, xtol=1e-14))  # type: ignore[arg-type]
     inside = sine / index
     below = thickness * inside / np.sqrt(1 - inside**2)
     return x + below + (DISTANCE_UM - thickness) * sine / np.sqrt(1 - sine**2)

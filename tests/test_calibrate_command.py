@@ -160,12 +160,17 @@ def test_the_stage_is_mapped_and_shown(camera_file, tmp_path):
     assert up[0] - down[0] == pytest.approx(2.0, abs=0.3)
 
 
+def test_a_size_that_is_none_is_wrong_usage(run, tmp_path):
+    code, _, error = run("calibrate", "--size", "32", "--out", tmp_path / "result")
+    assert code == 2
+    assert "write ROWSxCOLUMNS" in " ".join(error.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--route", "best"], "--route best: use one of auto, parametric, mixed, free"),
         (["--target", "2"], "a relative error lies between 0 and 1"),
-        (["--size", "32"], "write ROWSxCOLUMNS"),
         (["--check", "speed"], "--check speed: use all, or some of psi, bound"),
         (["--camera", "conventional"], "one mask between lens and sensor"),
     ],
