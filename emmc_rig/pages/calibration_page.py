@@ -37,6 +37,10 @@ WORDS = {
     "leak": ("Transmittance, closed", ""),
     "vignetting": ("Vignetting", ""),
     "falloff": ("Falloff over the aperture", ""),
+    "tilt_x_rad": ("Tilt, x", "rad"),
+    "tilt_y_rad": ("Tilt, y", "rad"),
+    "bow_um": ("Bow at the corner", "um"),
+    "glass_um": ("Glass between mask and sensor", "um"),
 }
 
 
@@ -54,12 +58,14 @@ def write_calibration_report(
     beside the fit.
     """
     sections = [("choice", "Chosen", _choice(outcome, metrics))]
+    sections.append(("found", "Found and taken into account", _findings(outcome.findings)))
     sections.append(("redo", "What to measure again", _advice(outcome.advice)))
     best = outcome.mixed or outcome.parametric
     first = outcome.parametric
     if best is not None and first is not None:
         sections.append(("fit", "Fit", _fit(metrics, truth or {}, first.fit.history)))
-    sections.append(("residuals", "Residual maps", _residuals(list(outcome.judged.values()))))
+    maps = _kinds(outcome.judged[outcome.chosen]) + _residuals(list(outcome.judged.values()))
+    sections.append(("residuals", "Residual maps", maps))
     sections.append(("psi", "Psi", _psi(outcome)))
     if sensor is not None:
         sections.append(("sensor", "Sensor", _sensor(sensor)))
@@ -97,7 +103,7 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
     known = errors.get(outcome.chosen)
     cards = "".join(
         (
-            card("Route", outcome.chosen, "the simplest at the noise", "good"),
+            card("Route", outcome.chosen, "the surest at the noise", "good"),
             card(
                 "Held-out residual",
                 f"{judged.chi2:.2f}",
@@ -138,6 +144,21 @@ def _advice(advice: Sequence[str]) -> str:
     if not advice:
         return '<p class="lead">Nothing: every whiteboard agrees with the others.</p>'
     return f"<ul>{''.join(f'<li>{text_of(line)}</li>' for line in advice)}</ul>"
+
+
+def _findings(findings: Sequence[str]) -> str:
+    if not findings:
+        return '<p class="lead">Lamp, board, filters and mask are as designed.</p>'
+    return f"<ul>{''.join(f'<li>{text_of(line)}</li>' for line in findings)}</ul>"
+
+
+def _kinds(judged: HeldOut) -> str:
+    """Return how every kind of whiteboard is predicted, the worst first."""
+    rows = sorted(judged.groups.items(), key=lambda item: -item[1])
+    return _table(
+        ("Whiteboards, by the route chosen", "Residual / noise"),
+        [(name, f"{value:.2f}") for name, value in rows],
+    )
 
 
 def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float]) -> str:
