@@ -90,7 +90,8 @@ class AptStage(HostStage):
         super().__init__(axes, (one.transport for one in axes.values()), clock, settings)
         for axis, one in axes.items():
             check_tolerance(axis, settings.tolerance_um, 1 / one.actuator.counts_per_um)
-        links = {transport: _Link(transport, clock) for transport in self._transports}
+        transports = dict.fromkeys(one.transport for one in axes.values())
+        links = {transport: _Link(transport, clock) for transport in transports}
         self._channels = {axis: _Channel(axis, one, links) for axis, one in axes.items()}
         self._homing_since_s: dict[str, float] = {}
         self._start_up()

@@ -160,6 +160,13 @@ class SpeedLimitError(DriverError):
         self.top_speed_um_s = top_speed_um_s
 
 
+class SpeedFixedError(DriverError):
+    """The axis has one speed, which cannot be chosen; nothing was sent to the device."""
+
+    def __init__(self, axis: str, advice: str) -> None:
+        super().__init__(f"the speed of {axis} cannot be chosen", advice, axis=axis)
+
+
 class NotHomedError(DriverError):
     """The axis does not know where it is; nothing was sent to the device."""
 
@@ -478,3 +485,20 @@ class FrameLostError(DriverError):
         super().__init__(f"frame lost, {reason}: {advice}")
         self.reason = reason
         self.advice = advice
+
+
+class MicroManagerError(DriverError):
+    """Micro-Manager's core, or a device behind it, said no."""
+
+    def __init__(
+        self, what: str, advice: str = "see the adapter's page at micro-manager.org"
+    ) -> None:
+        super().__init__(what, advice)
+
+
+class GphotoError(DriverError):
+    """libgphoto2, or the camera behind it, said no; `code` is its number."""
+
+    def __init__(self, what: str, code: int, meaning: str, advice: str) -> None:
+        super().__init__(f"libgphoto2 could not {what} ({meaning})", advice)
+        self.code = code

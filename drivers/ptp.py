@@ -1,7 +1,7 @@
 """PTP still cameras: sessions, captures, downloads in parts, and the camera that gives RAW frames.
 
 Source: ISO 15740 (PIMA 15740:2000), clauses 10 (operations), 11 (responses), 12 (events) and
-13 (properties).
+13 (properties). What makers do otherwise is in `drivers.ptp_canon` and `drivers.ptp_sony`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ from drivers.errors import (
     UsbStalledError,
     UsbTimeoutError,
 )
+from drivers.ptp_canon import EosBody, is_eos
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
+from drivers.ptp_dials import EXPOSURE_UNIT_S, Body, StandardBody
+from drivers.ptp_sony import SonyBody, is_sony
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
 
 _log = logging.getLogger(__name__)
@@ -46,12 +49,6 @@ NO_WAIT_S = 0.001
 MOST_NEW_OBJECTS = 64
 LONGEST_EXPOSURE_S = 3600.0
 """What a camera that states nonsense can make the driver wait."""
-
-EXPOSURE_UNIT_S = 1e-4
-EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
-"""Bulb and time, by which no exposure can be asked for."""
-ISO_SPECIALS = frozenset((0xFFFF,))
-"""Automatic."""
 
 REFUSALS = {
     Code.SESSION_NOT_OPEN: "open the camera again",
@@ -124,8 +121,9 @@ class PtpTransport(Protocol):
 class PtpSession:
     """An open session with a camera; `info` is what it said of itself.
 
-    An exchange that breaks off, Ctrl-C included, is cleared away before the next one. Any thread
-    may call; `lock` is held for one exchange, and by a camera for a whole capture.
+    `body`: how this maker's cameras are released. An exchange that breaks off, Ctrl-C included,
+    is cleared away before the next one. Any thread may call; `lock` is held for one exchange, and
+    by a camera for a whole capture.
     """
 
     def __init__(
@@ -146,6 +144,7 @@ class PtpSession:
         try:
             self._open()
             self.info = codec.DeviceInfo.decode(self.fetch(Operation.GET_DEVICE_INFO))
+            self.body = _body(self)
         except BaseException:
             transport.close()
             raise
@@ -163,13 +162,13 @@ class PtpSession:
                 self._closed = True
                 self._transport.close()
 
-    def can(self, operation: Operation) -> bool:
+    def can(self, operation: int) -> bool:
         """Whether the camera says that it knows the operation."""
         return operation in self.info.operations
 
     def request(
         self,
-        operation: Operation,
+        operation: int,
         *parameters: int,
         data: bytes | None = None,
         sink: Callable[[memoryview], object] = lambda piece: None,
@@ -195,7 +194,7 @@ class PtpSession:
                 raise CameraBusyError(_shown(operation), waited_s)
             self.clock.sleep(self.settings.busy_poll_s)
 
-    def fetch(self, operation: Operation, *parameters: int, patient: bool = True) -> bytes:
+    def fetch(self, operation: int, *parameters: int, patient: bool = True) -> bytes:
         """Make one exchange and return the data that came; raises as `request`."""
         received = io.BytesIO()
         self.request(operation, *parameters, sink=received.write, patient=patient)
@@ -250,12 +249,16 @@ class PtpSession:
         """
         with self.lock:
             self._forget_events()
-            seen = set(self.handles())
-            self.request(Operation.INITIATE_CAPTURE, 0, 0)
+            seen = set(self.handles()) if self.body.on_card else set()
+            self.body.release()
             self._owed = True
             taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
             self._owed = False
             return taken
+
+    def next_event(self, timeout_s: float) -> Message | None:
+        """Return what came through the pipe of events next, None when nothing did in time."""
+        return self._transport.event(timeout_s)
 
     def download(
         self,
@@ -304,7 +307,7 @@ class PtpSession:
 
     def _exchange(
         self,
-        operation: Operation,
+        operation: int,
         parameters: Parameters,
         data: bytes | None,
         sink: Callable[[memoryview], object],
@@ -329,7 +332,7 @@ class PtpSession:
         """Read events away; one picture too late must not pass for the next."""
         wait_s = self.settings.pair_limit_s if self._owed else NO_WAIT_S
         for _ in range(STALE_EVENTS_TOLERATED):
-            if self._transport.event(wait_s) is None:
+            if self.body.event(wait_s) is None:
                 return
 
     def _await_objects(
@@ -347,7 +350,7 @@ class PtpSession:
         others: list[tuple[int, ObjectInfo]] = []
         done = False
         while (now_s := clock.now_s()) < deadline_s and not (found and (done or not all_of_it)):
-            event = self._transport.event(min(settings.event_poll_s, deadline_s - now_s))
+            event = self.body.event(min(settings.event_poll_s, deadline_s - now_s))
             if event is None and clock.now_s() < exposed_s:
                 continue
             new = self._new_objects(event, seen)
@@ -389,6 +392,8 @@ class PtpSession:
 
     def _new_objects(self, event: Message | None, seen: set[int]) -> list[int]:
         if event is None or event.code == EventCode.CAPTURE_COMPLETE:
+            if not self.body.on_card:
+                return []
             try:
                 return [handle for handle in self.handles(patient=False) if handle not in seen]
             except CameraBusyError:
@@ -498,13 +503,12 @@ class PtpCamera:
         self._from_card = from_card
         try:
             info = session.info
-            if not session.can(Operation.INITIATE_CAPTURE):
+            self._exposure, self._iso = session.body.exposure, session.body.iso
+            if isinstance(session.body, StandardBody) and not session.can(
+                Operation.INITIATE_CAPTURE
+            ):
                 raise _refused(Operation.INITIATE_CAPTURE, Code.OPERATION_NOT_SUPPORTED)
             self.identity = CameraIdentity(info.maker, info.model, info.serial, info.version)
-            self._exposure = session.describe(Property.EXPOSURE_TIME)
-            self._iso = session.describe(Property.EXPOSURE_INDEX)
-            self._exposure_units = _number(self._exposure, EXPOSURE_SPECIALS)
-            self._iso_now = _number(self._iso, ISO_SPECIALS)
         except BaseException:
             session.close()
             raise
@@ -534,36 +538,35 @@ class PtpCamera:
     @property
     def exposure_s(self) -> float:
         """Exposure of the next frame, as the camera states it."""
-        if self._exposure_units is None:
+        exposure_s = self._exposure.value
+        if exposure_s is None:
             raise CameraSettingError("exposure", "is not told over PTP: see the frames' own")
-        return self._exposure_units * EXPOSURE_UNIT_S
+        return exposure_s
 
     @property
     def exposure_limits_s(self) -> Limits:
         """Shortest and longest exposure; equal where it cannot be chosen."""
-        if self._exposure is None or not self._exposure.writable:
-            return self.exposure_s, self.exposure_s
-        low, high = codec.limits(self._exposure, EXPOSURE_SPECIALS)
-        return low * EXPOSURE_UNIT_S, high * EXPOSURE_UNIT_S
+        return self._exposure.limits or (self.exposure_s, self.exposure_s)
 
     @property
     def gain(self) -> float:
         """Gain of the next frame: ISO over the lowest ISO."""
-        return 1.0 if not self._iso_now else self._iso_now / self._base_iso
+        return (self._iso.value or self._base_iso) / self._base_iso
 
     @property
     def gain_limits(self) -> Limits:
         """Lowest and highest gain; equal where it cannot be chosen."""
-        if self._iso is None or not self._iso.writable:
+        limits = self._iso.limits
+        if limits is None:
             return self.gain, self.gain
-        low, high = codec.limits(self._iso, ISO_SPECIALS)
-        return low / self._base_iso, high / self._base_iso
+        return limits[0] / self._base_iso, limits[1] / self._base_iso
 
     @property
     def battery_percent(self) -> float | None:
         """Charge of the battery, None where the camera does not say."""
         described = self.session.describe(Property.BATTERY_LEVEL)
-        return _number(described)
+        value = described.current if described is not None else None
+        return value if isinstance(value, int) and value > 0 else None
 
     def details(self) -> dict[str, str]:
         """Return what else the camera says of itself, by name."""
@@ -585,15 +588,14 @@ class PtpCamera:
         of the session.
         """
         check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
-        if self._exposure is not None and self._exposure.writable:
-            target = exposure_s / EXPOSURE_UNIT_S
-            self._exposure_units = self._set(self._exposure, target, EXPOSURE_SPECIALS)
+        if self._exposure.limits is not None:
+            self._exposure.choose(exposure_s)
 
     def set_gain(self, gain: float) -> None:
         """Choose the gain of the frames that follow: the nearest ISO; raises as the exposure."""
         check_setting("gain", gain, self.gain_limits)
-        if self._iso is not None and self._iso.writable:
-            self._iso_now = self._set(self._iso, gain * self._base_iso, ISO_SPECIALS)
+        if self._iso.limits is not None:
+            self._iso.choose(gain * self._base_iso)
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `RawFrameError` or an error of the session.
@@ -602,14 +604,15 @@ class PtpCamera:
         """
         session = self.session
         with session.lock:
-            exposure_s = None if self._exposure_units is None else self.exposure_s
-            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=self._from_card)
+            exposure_s = self._exposure.value
+            clears = self._from_card and session.body.on_card
+            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=clears)
             data = session.download(taken.handle, taken.info, self.on_progress)
             arrived_s = session.clock.now_s()
             frame = decode_raw(data, self._shape)
             check_frame(frame, self._cfa, exposure_s, EXPOSURE_UNIT_S)
             self._shape, self._cfa = frame.mosaic.shape, frame.cfa
-            if self._from_card:
+            if clears:
                 for handle in (taken.handle, *(other for other, _ in taken.others)):
                     session.delete(handle)
         return replace(
@@ -627,25 +630,17 @@ class PtpCamera:
 
     @property
     def _base_iso(self) -> float:
-        return codec.limits(self._iso, ISO_SPECIALS)[0] if self._iso else 1
-
-    def _set(
-        self, described: codec.PropertyDescription, target: float, special: frozenset[int]
-    ) -> int | None:
-        value = codec.nearest(described, target, special)
-        try:
-            made = self.session.write(described, value)
-        except ValueError as error:
-            raise CameraSettingError(f"property {described.code:#06x}", str(error)) from error
-        return made if isinstance(made, int) and made > 0 else None
+        limits = self._iso.limits
+        return limits[0] if limits else self._iso.value or 1.0
 
 
-def _number(
-    described: codec.PropertyDescription | None, special: frozenset[int] = frozenset()
-) -> int | None:
-    """Return a property's value where it is a number that means one."""
-    value = described.current if described is not None else None
-    return value if isinstance(value, int) and value > 0 and value not in special else None
+def _body(session: PtpSession) -> Body:
+    """Return how this camera is released, by its maker and what it says that it can do."""
+    if is_eos(session.info):
+        return EosBody(session)
+    if is_sony(session.info):
+        return SonyBody(session)
+    return StandardBody(session)
 
 
 def _camera_time_s(text: str) -> float | None:
@@ -664,7 +659,7 @@ def _shown(operation: int) -> str:
         return f"operation {operation:#06x}"
 
 
-def _refused(operation: Operation, code: int) -> PtpRefusedError:
+def _refused(operation: int, code: int) -> PtpRefusedError:
     try:
         known = Code(code)
     except ValueError:

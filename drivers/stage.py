@@ -28,7 +28,6 @@ from drivers.errors import (
     TransportTimeoutError,
     UnknownAxisError,
 )
-from drivers.transport import Transport
 
 _log = logging.getLogger(__name__)
 
@@ -102,6 +101,10 @@ class Stage(Protocol):
         """Let go of the ports; nothing is moved or stopped."""
         ...
 
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *exception: object) -> None: ...
+
 
 @dataclass(frozen=True)
 class StageSettings:
@@ -167,6 +170,18 @@ def check_tolerance(axis: str, tolerance_um: float, resolution_um: float) -> Non
         )
 
 
+class Link(Protocol):
+    """What leads to a device: a port, or a library that holds it."""
+
+    def reopen(self) -> None:
+        """Open it again, wherever it is now; raises a `PortError`."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it; closing twice is allowed."""
+        ...
+
+
 class HostStage(ABC):
     """The host's side of a stage, over the primitives of one protocol.
 
@@ -178,7 +193,7 @@ class HostStage(ABC):
     def __init__(
         self,
         axes: Iterable[str],
-        transports: Iterable[Transport],
+        transports: Iterable[Link],
         clock: Clock,
         settings: StageSettings,
     ) -> None:
@@ -400,7 +415,7 @@ class HostStage(ABC):
         for axis, speed_um_s in self._speeds_um_s.items():
             self.set_speed_um_s(axis, speed_um_s)
 
-    def _reopen(self, transport: Transport, deadline_s: float) -> None:
+    def _reopen(self, transport: Link, deadline_s: float) -> None:
         while True:
             try:
                 transport.reopen()

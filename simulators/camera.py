@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.clock import Clock
-from simulators.dng import encode_dng
+from drivers.dng import encode_dng
 from simulators.faults import Faults
 
 Array = np.ndarray

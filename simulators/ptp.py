@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from drivers.clock import Clock
+from drivers.dng import encode_dng
 from drivers.errors import PtpFormatError
 from drivers.ptp_codec import (
     EVERYTHING,
@@ -43,7 +44,6 @@ from drivers.ptp_codec import (
     encode_value,
 )
 from drivers.usb import INTERRUPT
-from simulators.dng import encode_dng
 from simulators.faults import Faults
 from simulators.usb import (
     DeviceSpec,
@@ -106,7 +106,7 @@ class Answer:
 
 
 class PtpCameraSimulator:
-    """The camera behind whatever wire.
+    """The camera behind whatever wire; subclasses are other makers' cameras.
 
     `render(exposure_s)` returns the uint16 `(y, x)` mosaic in DN that the sensor reads at the
     lowest ISO, called when the exposure is over. `exposures`: the choices in units of 0.1 ms, or
@@ -114,6 +114,14 @@ class PtpCameraSimulator:
     that it does not know. Faults are armed with
     `faults.inject`; those of the wire strike there.
     """
+
+    maker, model = "EMMC", "EMMC simulated camera"
+    vendor_extension = 0
+    vendor_operations: tuple[int, ...] = ()
+    hidden: tuple[int, ...] = ()
+    """Properties of the standard that it does not have."""
+    with_data: tuple[int, ...] = (Operation.SET_PROPERTY,)
+    """Operations that the host sends data with."""
 
     def __init__(
         self,
@@ -154,14 +162,22 @@ class PtpCameraSimulator:
         self._last_handle = FOLDER
         self._shots = 0
         self._due: tuple[float, float, int] | None = None
+        self._orphaned = False
         self._lock = threading.RLock()
 
     def power_up(self) -> None:
         """Forget the session and a capture under way; the card keeps its files."""
         with self._lock:
             self.session = 0
-            self._due = None
+            self._due, self._orphaned = None, False
             self.events.clear()
+
+    def end_session(self) -> None:
+        """Close the session, if one is open; its events go with it, a picture is still stored."""
+        with self._lock:
+            self.session = 0
+            self.events.clear()
+            self._orphaned = self._due is not None
 
     def wait_event(self, timeout_s: float) -> Message | None:
         """Return the next event, letting time pass until it comes; None: none in time."""
@@ -183,7 +199,10 @@ class PtpCameraSimulator:
             return
         _, exposure_s, transaction = self._due
         self._due = None
+        before = self.events.copy()
         self._store_shot(exposure_s, transaction)
+        if self._orphaned:
+            self.events, self._orphaned = before, False
 
     def respond(self, request: Message, data: bytes) -> Answer:
         """Carry out a request; `data` is what came with it."""
@@ -191,26 +210,39 @@ class PtpCameraSimulator:
             self.advance()
             if self.faults.strikes("busy"):
                 return Answer(Code.BUSY)
-            try:
-                operation = Operation(request.code)
-            except ValueError:
-                return Answer(Code.OPERATION_NOT_SUPPORTED)
-            if operation in self._lacks:
-                return Answer(Code.OPERATION_NOT_SUPPORTED)
-            if not self.session and operation not in _WITHOUT_SESSION:
+            if not self.session and request.code not in _WITHOUT_SESSION:
                 return Answer(Code.SESSION_NOT_OPEN)
             arguments = (*request.parameters, 0, 0, 0, 0, 0)
-            return _ANSWERS[operation](self, arguments, data, request.transaction)
+            if request.code in self.vendor_operations:
+                return self._vendor_answer(request.code, arguments, data, request.transaction)
+            return self._standard_answer(request.code, arguments, data, request.transaction)
+
+    def _standard_answer(
+        self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int
+    ) -> Answer:
+        if code not in _ANSWERS or code in self._lacks:
+            return Answer(Code.OPERATION_NOT_SUPPORTED)
+        return getattr(self, _ANSWERS[code])(arguments, data, transaction)
+
+    def _vendor_answer(
+        self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int
+    ) -> Answer:
+        """Carry out one of `vendor_operations`."""
+        return Answer(Code.OPERATION_NOT_SUPPORTED)
 
     def _device_info(self, *request: object) -> Answer:
         info = DeviceInfo(
-            operations=tuple(o for o in Operation if o not in self._lacks),
+            operations=(
+                *(o for o in Operation if o not in self._lacks),
+                *self.vendor_operations,
+            ),
+            vendor_extension=self.vendor_extension,
             events=tuple(EventCode),
-            properties=tuple(self._values),
+            properties=tuple(one for one in self._values if one not in self.hidden),
             capture_formats=(Format.DNG,),
             image_formats=(Format.DNG, Format.JPEG),
-            maker="EMMC",
-            model="EMMC simulated camera",
+            maker=self.maker,
+            model=self.model,
             version="1.0",
             serial=self.serial,
         )
@@ -225,7 +257,7 @@ class PtpCameraSimulator:
         return Answer()
 
     def _close_session(self, *request: object) -> Answer:
-        self.session = 0
+        self.end_session()
         return Answer()
 
     def _storage_ids(self, *request: object) -> Answer:
@@ -265,6 +297,9 @@ class PtpCameraSimulator:
             return Answer(Code.INVALID_HANDLE)
         return Answer(data=memoryview(self.objects[arguments[0]][1]))
 
+    def _thumb(self, *request: object) -> Answer:
+        return Answer(Code.NO_THUMBNAIL)
+
     def _partial_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         handle, offset, most = arguments[:3]
         if handle not in self.objects:
@@ -281,20 +316,20 @@ class PtpCameraSimulator:
 
     def _describe(self, arguments: tuple[int, ...], *request: object) -> Answer:
         code = arguments[0]
-        if code not in self._values:
+        if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
         return Answer(data=encode_description(self._description(code)))
 
     def _read(self, arguments: tuple[int, ...], *request: object) -> Answer:
         code = arguments[0]
-        if code not in self._values:
+        if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
         described = self._description(code)
         return Answer(data=encode_value(described.data_type, described.current))
 
     def _write(self, arguments: tuple[int, ...], data: bytes, *request: object) -> Answer:
         code = arguments[0]
-        if code not in self._values:
+        if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
         described = self._description(code)
         if not described.writable:
@@ -393,25 +428,25 @@ class PtpCameraSimulator:
 
 
 _WITHOUT_SESSION = (Operation.GET_DEVICE_INFO, Operation.OPEN_SESSION)
-_ANSWERS = {
-    Operation.GET_DEVICE_INFO: PtpCameraSimulator._device_info,
-    Operation.OPEN_SESSION: PtpCameraSimulator._open_session,
-    Operation.CLOSE_SESSION: PtpCameraSimulator._close_session,
-    Operation.GET_STORAGE_IDS: PtpCameraSimulator._storage_ids,
-    Operation.GET_STORAGE_INFO: PtpCameraSimulator._storage_info,
-    Operation.GET_NUM_OBJECTS: PtpCameraSimulator._count_objects,
-    Operation.GET_OBJECT_HANDLES: PtpCameraSimulator._object_handles,
-    Operation.GET_OBJECT_INFO: PtpCameraSimulator._object_info,
-    Operation.GET_OBJECT: PtpCameraSimulator._object,
-    Operation.GET_THUMB: lambda *request: Answer(Code.NO_THUMBNAIL),
-    Operation.DELETE_OBJECT: PtpCameraSimulator._delete,
-    Operation.INITIATE_CAPTURE: PtpCameraSimulator._capture,
-    Operation.GET_PROPERTY_DESCRIPTION: PtpCameraSimulator._describe,
-    Operation.GET_PROPERTY: PtpCameraSimulator._read,
-    Operation.SET_PROPERTY: PtpCameraSimulator._write,
-    Operation.GET_PARTIAL_OBJECT: PtpCameraSimulator._partial_object,
+_ANSWERS: dict[int, str] = {
+    Operation.GET_DEVICE_INFO: "_device_info",
+    Operation.OPEN_SESSION: "_open_session",
+    Operation.CLOSE_SESSION: "_close_session",
+    Operation.GET_STORAGE_IDS: "_storage_ids",
+    Operation.GET_STORAGE_INFO: "_storage_info",
+    Operation.GET_NUM_OBJECTS: "_count_objects",
+    Operation.GET_OBJECT_HANDLES: "_object_handles",
+    Operation.GET_OBJECT_INFO: "_object_info",
+    Operation.GET_OBJECT: "_object",
+    Operation.GET_THUMB: "_thumb",
+    Operation.DELETE_OBJECT: "_delete",
+    Operation.INITIATE_CAPTURE: "_capture",
+    Operation.GET_PROPERTY_DESCRIPTION: "_describe",
+    Operation.GET_PROPERTY: "_read",
+    Operation.SET_PROPERTY: "_write",
+    Operation.GET_PARTIAL_OBJECT: "_partial_object",
 }
-_WITH_DATA = (Operation.SET_PROPERTY,)
+"""Names of the methods that answer: a subclass may answer otherwise."""
 _DOWNLOADS = (Operation.GET_OBJECT, Operation.GET_PARTIAL_OBJECT)
 
 
@@ -503,7 +538,7 @@ class PtpUsbFunction(UsbFunction):
     def _take(self, kind: int, container: bytes) -> None:
         if kind == Kind.COMMAND:
             self._command = decode_message(container)
-            if self._command.code not in _WITH_DATA:
+            if self._command.code not in self.camera.with_data:
                 self._answer(self._command, b"")
         elif kind == Kind.DATA and self._command is not None:
             self._answer(self._command, container[HEADER_SIZE:])

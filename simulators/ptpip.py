@@ -1,10 +1,13 @@
 """The simulated still camera on a TCP port: PTP/IP, so that other programs can take pictures.
 
-Listens on this computer only. Source: CIPA DC-005 (PTP over TCP/IP), clauses 2 and 3.
+Listens on this computer only, to one initiator at a time: a session ends with its command
+connection, and its event connection with it. Source: CIPA DC-005 (PTP over TCP/IP), clauses 2
+and 3.
 """
 
 from __future__ import annotations
 
+import select
 import socket
 import struct
 import threading
@@ -18,7 +21,11 @@ PACKET = struct.Struct("<II")
 MOST_BYTES = 1 << 24
 DATA_BYTES = 1 << 18
 EVENT_POLL_S = 0.05
+LEAVE_S = 1.0
+"""How long a new initiator waits for the one before it to hang up."""
 DATA_FOLLOWS = 2
+UNKNOWN_CONNECTION, BUSY = 1, 2
+"""Reasons of an INIT_FAIL: rejected, or another initiator is connected."""
 
 INIT_COMMAND, INIT_COMMAND_ACK, INIT_EVENT, INIT_EVENT_ACK, INIT_FAIL = 1, 2, 3, 4, 5
 REQUEST, RESPONSE, EVENT, START_DATA, DATA, CANCEL, END_DATA, PROBE, PROBE_ANSWER = range(6, 15)
@@ -35,6 +42,9 @@ class PtpIpServer:
         self._listener.settimeout(EVENT_POLL_S)
         self.port: int = self._listener.getsockname()[1]
         self._ended = threading.Event()
+        self._initiator = threading.Lock()
+        self._connections = 0
+        self._connected = 0
         self._threads: list[threading.Thread] = []
         self._start(self._accept)
 
@@ -62,17 +72,30 @@ class PtpIpServer:
         """Greet a connection and serve what it turns out to be."""
         with connection, suppress(ConnectionError):
             connection.settimeout(EVENT_POLL_S)
-            kind, _ = self._receive(connection)
+            kind, payload = self._receive(connection)
             if kind == INIT_COMMAND:
-                name = "EMMC simulated camera\x00".encode("utf-16-le")
-                hello = struct.pack("<I", 1) + GUID + name + struct.pack("<I", VERSION)
-                _send(connection, INIT_COMMAND_ACK, hello)
-                self._answer_requests(connection)
-            elif kind == INIT_EVENT:
-                _send(connection, INIT_EVENT_ACK)
-                self._send_events(connection)
+                self._serve_initiator(connection)
+            elif kind == INIT_EVENT and len(payload) == 4:
+                self._send_events(connection, int.from_bytes(payload, "little"))
             else:
-                _send(connection, INIT_FAIL, struct.pack("<I", 1))
+                _refuse(connection, UNKNOWN_CONNECTION)
+
+    def _serve_initiator(self, connection: socket.socket) -> None:
+        """Serve a command connection under a number of its own, while no other is served."""
+        if not self._initiator.acquire(timeout=LEAVE_S):
+            _refuse(connection, BUSY)
+            return
+        try:
+            self._connections += 1
+            self._connected = self._connections
+            name = "EMMC simulated camera\x00".encode("utf-16-le")
+            number = struct.pack("<I", self._connected)
+            _send(connection, INIT_COMMAND_ACK, number + GUID + name + struct.pack("<I", VERSION))
+            self._answer_requests(connection)
+        finally:
+            self._connected = 0
+            self._camera.end_session()
+            self._initiator.release()
 
     def _answer_requests(self, connection: socket.socket) -> None:
         while True:
@@ -109,9 +132,14 @@ class PtpIpServer:
         parameters = struct.pack(f"<{len(answer.parameters)}I", *answer.parameters)
         _send(connection, RESPONSE, struct.pack("<HI", answer.code, transaction) + parameters)
 
-    def _send_events(self, connection: socket.socket) -> None:
-        while not self._ended.is_set():
-            event = self._camera.wait_event(EVENT_POLL_S)
+    def _send_events(self, connection: socket.socket, number: int) -> None:
+        """Pass events on as long as both connections of that number last."""
+        if number != self._connected:
+            _refuse(connection, UNKNOWN_CONNECTION)
+            return
+        _send(connection, INIT_EVENT_ACK)
+        while self._connected == number and not self._ended.is_set() and not _left(connection):
+            event = self._camera.wait_event(0.0)
             if event is None:
                 self._ended.wait(EVENT_POLL_S)
                 continue
@@ -135,6 +163,16 @@ class PtpIpServer:
                     raise ConnectionError("the other side left")
                 data += piece
         return bytes(data)
+
+
+def _left(connection: socket.socket) -> bool:
+    """Return whether the other side has hung up."""
+    readable, _, _ = select.select([connection], [], [], 0)
+    return bool(readable) and not connection.recv(1, socket.MSG_PEEK)
+
+
+def _refuse(connection: socket.socket, reason: int) -> None:
+    _send(connection, INIT_FAIL, struct.pack("<I", reason))
 
 
 def _send(connection: socket.socket, kind: int, payload: bytes = b"") -> None:

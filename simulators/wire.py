@@ -259,13 +259,15 @@ class PtyServer(_Server):
         tty.setraw(self._line)
         self.port = os.ttyname(self._line)
         if self._link is not None:
-            if self._link.is_symlink():
+            if self._link.is_symlink() and self._link.readlink().parent == Path(self.port).parent:
                 self._link.unlink()
             self._link.symlink_to(self.port)
 
     def _close(self) -> None:
         if self._link is not None:
-            self._link.unlink(missing_ok=True)
+            with suppress(OSError):
+                if self._link.readlink() == Path(self.port):
+                    self._link.unlink()
         os.close(self._device)
         os.close(self._line)
 

@@ -11,11 +11,11 @@ import numpy as np
 import yaml
 
 from drivers.camera import CameraIdentity, RawFileCamera
+from drivers.dng import encode_dng
 from emmc_rig.capture.command import Wish, new_session, planned_frames
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.rig.hardware import Rig
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.still import StillStage
 
 SIZE = (24, 32)

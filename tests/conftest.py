@@ -10,6 +10,8 @@ from programs import exit_code
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 
+pytest.register_assert_rewrite("emmc_rig.conformance.cameras", "emmc_rig.conformance.stages")
+
 
 def pytest_addoption(parser):
     parser.addoption(

@@ -17,14 +17,14 @@ import typer
 from capture_rigs import still_rig
 
 from emmc_rig import cli
-from emmc_rig.calibrate import run as calibrate_run
+from emmc_rig.calibrate import session as calibrate_session
 from emmc_rig.capture import command
-from emmc_rig.commands.calibrate import calibrate
+from emmc_rig.errors import AppError
 from emmc_rig.pages import session_sheet
 from emmc_rig.session import export, prune
 from emmc_rig.session.readings import whiteboards
 
-LOADED_BEFORE = (session_sheet, export, prune, calibrate)
+LOADED_BEFORE = (session_sheet, export, prune)
 FAILED = 99
 
 
@@ -34,17 +34,10 @@ def quick_rig(description, camera, ask):
     yield still_rig()
 
 
-def read_whiteboards(session, folder, route, bars):
-    """Stand in for `calibrate_session`: read all that it reads, without the fit."""
+def read_whiteboards(session, *rest):
+    """Stand in for `session_outcome`: read all that it reads, and stop before the fit."""
     count = len(whiteboards(session).pinholes)
-    (folder / "metrics.json").write_text(json.dumps({"pinholes": count}))
-    return {
-        "chosen": route,
-        "why": f"{count} pinholes read",
-        "frames": {route: count},
-        "held_out": {route: {"relative_error": 0.0, "chi2": 1.0}},
-        "advice": [],
-    }
+    raise AppError(f"{count} pinholes read")
 
 
 def _child(arguments, name, wait_s):
@@ -52,7 +45,7 @@ def _child(arguments, name, wait_s):
     os.dup2(log, 1)
     os.dup2(log, 2)
     command.opened_rig = quick_rig
-    calibrate_run.calibrate_session = read_whiteboards
+    calibrate_session.session_outcome = read_whiteboards
     sys.argv = ["emmc-rig", *arguments]
     time.sleep(wait_s)
     cli.main()
@@ -66,7 +59,7 @@ def _forked(arguments, folder, name, wait_s):
             os.chdir(folder)
             _child(arguments, name, wait_s)
         except SystemExit as stop:
-            code = stop.code or 0
+            code = int(stop.code or 0)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

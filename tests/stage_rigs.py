@@ -1,93 +1,22 @@
 """Stages for tests: each protocol's simulated firmware on each kind of wire, or a real one."""
 
-import time
-from abc import ABC, abstractmethod
-from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any, ClassVar
 
 from drivers import grbl_codec as codec
 from drivers.apt import AptAxis, AptStage
 from drivers.apt_codec import Id
 from drivers.grbl import GrblStage
-from drivers.stage import DEFAULT_SETTINGS
-from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
+from emmc_rig.conformance.rigs import StageRig
 from simulators.apt import AptController
-from simulators.clock import JumpingClock, ManualClock
 from simulators.grbl import GrblController
-from simulators.wire import PtyServer, TcpServer
 from simulators.zaber import AxisSpec, ZaberChain
 
-WIRES = ("memory", "pty", "tcp")
-MEMORY_TIMEOUT_S = 0.5
-WIRE_TIMEOUT_S = 0.05
-"""Replies over a pseudo-terminal or TCP really take time: far less than this."""
-WIRE_PACE = 5.0
-WIRE_POLL_S = 0.1
 QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
 """mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
 
 
-class Rig(ABC):
-    """One stage: simulated firmware, the wire to it, and where its axes really are."""
-
-    axes: tuple[str, ...]
-    senses_stalls = True
-    replies_are_numbered = False
-
-    @abstractmethod
-    def make_device(self) -> Any: ...
-
-    @abstractmethod
-    def make_from(self, settings): ...
-
-    @abstractmethod
-    def true_um(self, axis): ...
-
-    @abstractmethod
-    def is_move(self, occasion): ...
-
-    def __init__(self, wire: str, opened: ExitStack, tmp_path):
-        self.wire = wire
-        self.clock = ManualClock() if wire == "memory" else JumpingClock(WIRE_PACE)
-        self.timeout_s = MEMORY_TIMEOUT_S if wire == "memory" else WIRE_TIMEOUT_S
-        self.timeout_on_clock_s = self.timeout_s * (1.0 if wire == "memory" else WIRE_PACE)
-        self.device = self.make_device()
-        self.device.late_by_s = 1.5 * self.timeout_on_clock_s
-        self.server = None
-        self.link = tmp_path / "stage"
-        if wire == "pty":
-            self.server = opened.enter_context(PtyServer(self.device, self.link))
-        elif wire == "tcp":
-            self.server = opened.enter_context(TcpServer(self.device))
-        self.transport = self.make_transport()
-        opened.callback(self.transport.close)
-
-    def make_transport(self):
-        if self.server is None:
-            return self.device.transport(self.timeout_s)
-        port = f"{self.link}*" if self.wire == "pty" else self.server.port
-        return SerialTransport(port, timeout_s=self.timeout_s, flow_control=False)
-
-    def let_bytes_arrive(self):
-        """On a real wire bytes are under way for a while; jumps of the clock must not pass them."""
-        if self.server is not None:
-            time.sleep(0.03)
-
-    def replug(self, power_lost=False):
-        self.device.replug(power_lost)
-        deadline_s = time.monotonic() + 5.0
-        while self.server is not None and not self.server.is_open:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.001)
-
-    def make_stage(self, **settings):
-        poll_s = DEFAULT_SETTINGS.poll_s if self.server is None else WIRE_POLL_S
-        return self.make_from(replace(DEFAULT_SETTINGS, poll_s=poll_s, **settings))
-
-
-class ZaberRig(Rig):
+class ZaberRig(StageRig):
     replies_are_numbered = True
     axes = ("mask_x", "mask_y")
     addresses: ClassVar = {"mask_x": (1, 1), "mask_y": (2, 1)}
@@ -111,7 +40,7 @@ class ZaberRig(Rig):
         return b" get pos" in occasion.command
 
 
-class GrblRig(Rig):
+class GrblRig(StageRig):
     axes = ("mask_x", "mask_y")
     letters: ClassVar = {"mask_x": "X", "mask_y": "Y"}
     senses_stalls = False
@@ -133,7 +62,7 @@ class GrblRig(Rig):
         return b"?" in occasion.command
 
 
-class AptRig(Rig):
+class AptRig(StageRig):
     axes = ("mask_x",)
 
     def make_device(self) -> Any:

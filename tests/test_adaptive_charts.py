@@ -5,9 +5,10 @@ import pytest
 from emmc_rig.capture.plan import planned_camera
 from emmc_rig.capture.until import refuse_without_choice
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.progress import Silent
 from emmc_rig.session.session import Session
 from emmc_rig.study import ablation, next_shot
-from emmc_rig.study.points import open_folder
+from emmc_rig.study.sweep import open_folder
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
@@ -65,14 +66,15 @@ def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     few = tmp_path / "few-views.yaml"
     few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
     camera = find_camera(str(few))
-    folder = open_folder(tmp_path / "out", next_shot.ROWS, "shots")
+    folder = open_folder(tmp_path / "out", next_shot.ROWS, "chart --next-shot")
     told = []
+    watcher = Silent()
+    monkeypatch.setattr(watcher, "step", told.append)
 
     def measured():
-        rows = next_shot.next_shots(
-            ["near-planar"], str(few), camera, (32, 40), 0, folder, told.append, 64, 2
+        return next_shot.next_shots(
+            ["near-planar"], str(few), camera, (32, 40), 0, folder, watcher, 64, 2
         )
-        return list(rows)
 
     (scene,) = measured()
     assert [one.count for one in scene.chosen] == [1, 2]

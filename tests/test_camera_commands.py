@@ -11,6 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from drivers.clock import SYSTEM_CLOCK
+from drivers.dng import encode_dng
 from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
@@ -22,7 +23,6 @@ from emmc_rig.rig import hardware
 from emmc_rig.rig.hardware import open_camera, scene_simulator
 from emmc_rig.study.benchmarks.ptp import picture_timing
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.ptp import PtpUsbFunction
 from simulators.usb import SimulatedUsb
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from capture_rigs import begun, plan_and_camera, still_rig, wish_for
 
+from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from drivers.raw import decode_raw
 from emmc_rig.capture.checks import check, figures
@@ -40,7 +41,6 @@ from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
 from simulators.disk import SimulatedDisk
-from simulators.dng import encode_dng
 
 ROOT = Path("/disk")
 SIZE = (24, 32)

@@ -32,6 +32,7 @@ from emmc_rig.capture.retries import HOPELESS
 from emmc_rig.rig.rig_config import AskingAttendant
 from emmc_rig.session import session as session_module
 from emmc_rig.session.lock import held
+from emmc_rig.session.readings import whiteboards
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SystemDisk
 from emmc_rig.session.verify import verify
@@ -48,6 +49,7 @@ SCANNED = (
 NO_CAPTURE = ("direct.py", "simulate.py", "enough.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (
+    ": is no list of frames; restore it from a copy",  # nor then would its SHA-256 be the journal's
     "cannot be metered, the board is dark",  # such a frame is refused as black before
     "was not captured yet; resume it",  # only frames are read that were hashed just before
     "is damaged, its SHA-256 is not the journal's",
@@ -708,6 +710,18 @@ def a_new_plan_in_no_folder(bench):
     assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
 
 
+def test_repeats_that_an_edit_made_different_are_averaged_where_most_are_alike(bench):
+    bench.boards(references=3)
+    bench.light.factor = {"reference-s0-white-r1": 10.0}
+    assert "lower whiteboards.exposure_s in the plan" in bench.refused()
+    bench.light.factor = {}
+    bench.boards(references=3, exposure_s=0.01)
+    assert bench.run(*CAPTURE)[0] == 0
+    references = whiteboards(Session(bench.session)).references
+    assert (references[0, "white"].exposure_s, references[0, "white"].count) == (0.01, 2)
+    assert (references[1, "white"].exposure_s, references[1, "white"].count) == (0.01, 3)
+
+
 def sample(kind):
     """An error of the drivers, made of values that its signature takes."""
     values = {str: "x", int: 1, float: 1.0, bytes: b"x", tuple[float, float]: (0.0, 1.0)}
@@ -752,7 +766,7 @@ def texts():
             if isinstance(said, ast.Call) and of_error:
                 raised = [one for one in ast.walk(said) if isinstance(one, ast.Constant)]
                 parts = [one.value for one in raised if isinstance(one.value, str)]
-                yield f"{path.name}:{node.lineno}", [one for one in parts if " " in one.strip()]
+                yield f"{path.name}:{said.lineno}", [one for one in parts if " " in one.strip()]
 
 
 def test_every_text_has_a_walk_and_every_walk_its_text():

@@ -12,6 +12,8 @@ from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
+    Boards,
+    OpenBoard,
     Plan,
     differences,
     load_plan,
@@ -220,7 +222,8 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     path.write_text(new_plan(name, camera), encoding="utf-8")
     plan = load_plan(path)
     assert planned_camera(plan).shots == camera.shots
-    assert Plan(camera=name, shots=plan.shots, title=name) == plan
+    boards = Boards(open=(OpenBoard(held_out=True),))
+    assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards) == plan
     np.testing.assert_allclose(
         [bracket[0] for bracket in exposures_s(plan, camera)], camera.exposures_s(), rtol=1e-5
     )

@@ -12,12 +12,17 @@ from emmc_rig.advice.recommend import Problem, Row, advised, parse_budget, parse
 from emmc_rig.errors import AppError
 from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.lightfield import replicate_centre
-from emmc_rig.study.chart.advice_rows import advice_rows
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
-from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
+from emmc_rig.study.chart.front import POOLED, Mark, advice_rows, charts, pareto_front
 from emmc_rig.study.chart.lock import timing_lock
 from emmc_rig.study.chart.peers import PEERS, Given
-from emmc_rig.study.chart.plan import ChartSettings, Configuration, Point, charted_points, sweeps
+from emmc_rig.study.chart.points import (
+    ChartSettings,
+    Configuration,
+    Point,
+    charted_points,
+    scalings,
+)
 from emmc_rig.study.chart.scaling import growths
 from emmc_rig.study.chart.scores import angular_snr_db, scored, swept_disparity
 from reconstruction.dictionary import dct_dictionary
@@ -112,7 +117,7 @@ def size_of(point):
 
 
 def test_growth_is_fitted_and_compared_with_what_the_method_counts():
-    swept = [s for s in sweeps(SETTINGS, 2) if s.configuration.method == "tv"]
+    swept = [s for s in scalings(SETTINGS, 2) if s.configuration.method == "tv"]
     assert {s.axis for s in swept} == {"pixels", "views", "shots", "disparity range", "cores"}
     pixels, shots = swept[0], next(s for s in swept if s.axis == "shots")
     results = {

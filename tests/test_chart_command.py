@@ -18,17 +18,16 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
-from emmc_rig.study.chart import lock, measure, plan
-from emmc_rig.study.chart import run as chart_run
+from emmc_rig.study.chart import chart_sweep, lock, measure, points
 from emmc_rig.study.chart.captures import Capture, kept_capture
-from emmc_rig.study.chart.command import chart_settings, run_chart
+from emmc_rig.study.chart.chart_sweep import ChartSweep
+from emmc_rig.study.chart.charting import COLUMNS, run_chart
 from emmc_rig.study.chart.lock import timing_lock
 from emmc_rig.study.chart.measure import measured
 from emmc_rig.study.chart.peers import Peer
-from emmc_rig.study.chart.rows import COLUMNS
-from emmc_rig.study.chart.run import POINTS, ChartStopped
+from emmc_rig.study.chart.points import chart_settings
 from emmc_rig.study.chart.worker import working
-from emmc_rig.study.points import digest_of
+from emmc_rig.study.sweep import SweepStopped, digest_of
 from simulators.scenes import render
 
 SIZE = (24, 32)
@@ -55,8 +54,8 @@ def lock_of_its_own(monkeypatch, tmp_path):
 def quick(monkeypatch):
     """Few settings of total variation alone, measured in this process, by a known yardstick."""
     monkeypatch.setattr(measure, "reference", lambda: Reference(0.01, 0.01))
-    monkeypatch.setattr(plan, "VARIATIONS", LEVELS)
-    monkeypatch.setattr(chart_run, "working", at_once(measured))
+    monkeypatch.setattr(points, "VARIATIONS", LEVELS)
+    monkeypatch.setattr(chart_sweep, "working", at_once(measured))
 
 
 def settings(**more):
@@ -97,12 +96,12 @@ def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
     assert len(page.ids) == len(set(page.ids))
     marks = [name for name in page.ids if name.startswith("mark-")]
     assert len(marks) == 6
-    points, pictures = (
+    marked, pictures = (
         json.loads(*re.findall(rf'id="{name}">(.*?)</script>', text))
         for name in ("points", "pictures")
     )
-    assert set(points) == set(marks)
-    shown = {pair[key] for one in points.values() for pair in one["pictures"]
+    assert set(marked) == set(marks)
+    shown = {pair[key] for one in marked.values() for pair in one["pictures"]
              for key in ("estimate", "truth")}  # fmt: skip
     assert shown == set(pictures)
     for name in shown:
@@ -126,15 +125,15 @@ def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
             raise KeyboardInterrupt
         return measured(job)
 
-    monkeypatch.setattr(chart_run, "working", at_once(stopping))
-    with pytest.raises(ChartStopped, match="1 of 2 points are kept"):
+    monkeypatch.setattr(chart_sweep, "working", at_once(stopping))
+    with pytest.raises(SweepStopped, match="1 of 2 points are kept"):
         run_chart(settings(), tmp_path / "out", Silent())
     run_chart(settings(), tmp_path / "out", Silent())
     assert len(calls) == 3
-    kept = (tmp_path / "out" / POINTS).read_text()
+    kept = (tmp_path / "out" / ChartSweep.journal).read_text()
     run_chart(settings(), tmp_path / "out", Silent())
     assert len(calls) == 3
-    assert (tmp_path / "out" / POINTS).read_text() == kept
+    assert (tmp_path / "out" / ChartSweep.journal).read_text() == kept
 
 
 def test_growth_is_charted(quick, monkeypatch, tmp_path):
@@ -154,13 +153,13 @@ def test_growth_is_charted(quick, monkeypatch, tmp_path):
         seconds = 1e-4 * size[0] * size[1]
         return {**figures, "cpu_seconds": seconds, "size": list(size)}
 
-    monkeypatch.setattr(chart_run.ChartRun, "_measured", as_quick_as_small)
+    monkeypatch.setattr(ChartSweep, "_measured", as_quick_as_small)
 
     def always_the_same(asked, seed, folder):
         path, _ = kept_capture(capture, seed, folder)
         return path, digest_of({"asked": repr(asked)})
 
-    monkeypatch.setattr(chart_run, "kept_capture", always_the_same)
+    monkeypatch.setattr(chart_sweep, "kept_capture", always_the_same)
     outcome = run_chart(settings(scaling=True), tmp_path / "out", Silent())
     pixels = next(growth for growth in outcome.growths if growth.axis == "pixels")
     assert pixels.exponent == pytest.approx(1)
@@ -222,8 +221,8 @@ def test_a_worker_that_fails_by_itself_says_why(job):
 
 
 def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
-    absent = Peer("nobody's", ("no_such_library",), plan.PEERS["sklearn-omp"].solve)
-    monkeypatch.setitem(plan.PEERS, "absent", absent)
+    absent = Peer("nobody's", ("no_such_library",), points.PEERS["sklearn-omp"].solve)
+    monkeypatch.setitem(points.PEERS, "absent", absent)
     outcome = run_chart(settings(methods=("tv", "absent")), tmp_path / "out", Silent())
     (line,) = outcome.left_out
     assert "pip install" in line
@@ -234,10 +233,10 @@ def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
 
 def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
     full = at_once(lambda _: {"failed": "no room", "keep": False})
-    monkeypatch.setattr(chart_run, "working", full)
+    monkeypatch.setattr(chart_sweep, "working", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
         run_chart(settings(), tmp_path / "out", Silent())
-    assert not (tmp_path / "out" / POINTS).read_text()
+    assert not (tmp_path / "out" / ChartSweep.journal).read_text()
 
 
 @pytest.mark.parametrize(
@@ -249,7 +248,7 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
         (["--camera", "no-camera"], "no-camera"),
         (["--size", "big"], "write ROWSxCOLUMNS"),
         (["--size", "8x8"], "needs 16x16"),
-        (["--out", "mine"], "something else than an earlier chart"),
+        (["--out", "mine"], "something else than an earlier `emmc-rig chart`"),
     ],
 )
 def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, told):

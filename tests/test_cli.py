@@ -43,7 +43,7 @@ def one_line(text):
 
 
 def leftovers(folder):
-    return [path.name for path in folder.iterdir() if ".part" in path.name or ".old" in path.name]
+    return [path.name for path in folder.rglob(".*")]
 
 
 def test_the_demo_writes_a_whole_result(run, tmp_path):

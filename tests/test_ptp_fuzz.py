@@ -13,13 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers import ptp_codec as codec
+from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from drivers.ptp import PtpCamera, PtpSession, PtpSettings
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import decode_by_libraw, decode_raw
 from drivers.usb import open_device
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb, StallError, UnpluggedError
 

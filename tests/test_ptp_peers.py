@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from drivers.clock import SystemClock
+from drivers.dng import encode_dng
 from drivers.ptp import PtpSession, PtpSettings, is_raw
 from drivers.ptp_codec import HEADER_SIZE, Format, Operation, Property
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import decode_raw
 from drivers.usb import INTERRUPT, open_device
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 from simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpCameraSimulator
 from simulators.ptpip import PtpIpServer
 from simulators.usb import (

@@ -9,11 +9,11 @@ import pytest
 import tifffile
 
 from drivers.camera import Camera, RawFileCamera
+from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
 from drivers.raw import decode_by_libraw, decode_raw
 from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
-from simulators.dng import encode_dng
 
 BAYER = ("rggb", "grbg", "gbrg", "bggr")
 BLACK_DN = np.array([[60, 61], [62, 63]])

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.pages.report import DisplayCurve, ReportContent, render, write_report
+from emmc_rig.pages.display import DisplayCurve
+from emmc_rig.pages.report import ReportContent, render, write_report
 
 VIEWS, HEIGHT, WIDTH = 5, 48, 64
 

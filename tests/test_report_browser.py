@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from browsers import MARKS, open_browser
 
-from emmc_rig.pages.report import DisplayCurve, ReportContent, write_report
+from emmc_rig.pages.display import DisplayCurve
+from emmc_rig.pages.report import ReportContent, write_report
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.webdriver.common.action_chains import ActionChains

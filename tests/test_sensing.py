@@ -310,7 +310,7 @@ def test_psi_multiplies_as_the_explicit_matrix(coded_camera, cfa):
     bound = 4 * EPS * np.linalg.norm(dense @ light_field.ravel()) * np.linalg.norm(frames)
     assert abs(forward - backward) <= bound
     with pytest.raises(SensingError, match="a light field of shape"):
-        psi @ frames
+        _ = psi @ frames
 
 
 @pytest.mark.parametrize("cfa", ["rggb", "mono"])
@@ -323,7 +323,7 @@ def test_scipy_takes_psi_as_a_linear_operator(coded_camera, cfa):
     np.testing.assert_allclose(operator @ x, dense @ x, atol=1e-5)
     np.testing.assert_allclose(operator.T @ y, dense.T @ y, atol=1e-5)
     columns = np.stack([x, 2 * x], axis=1)
-    np.testing.assert_allclose(operator @ columns, dense @ columns, atol=2e-5)
+    np.testing.assert_allclose(np.asarray(operator @ columns), dense @ columns, atol=2e-5)
     solved = lsqr(operator, dense @ x, iter_lim=200)[0]
     np.testing.assert_allclose(dense @ solved, dense @ x, atol=1e-3)
 

@@ -41,9 +41,8 @@ def test_the_report_of_a_session_shows_everything_and_asks_for_nothing(browser, 
     rig = still_rig()
     session, plan = begun(tmp_path, SYSTEM_DISK, rig)
     Sequencer(session, plan, rig).run()
-    page = session.folder / REPORT
-    write_sheet(session, page)
-    browser.get(page.as_uri())
+    write_sheet(session, session.folder)
+    browser.get((session.folder / REPORT).as_uri())
     pictures = browser.find_elements(By.CSS_SELECTOR, ".sheet img")
     assert len(pictures) == len(session.frames)
     assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)

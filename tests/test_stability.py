@@ -11,18 +11,17 @@ from emmc_rig import cli
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
+from emmc_rig.pages import drawing
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Silent
-from emmc_rig.study.stability import command as stability_command
-from emmc_rig.study.stability import draw
-from emmc_rig.study.stability import run as stability_run
+from emmc_rig.study.stability import fault_sweep, sweeping
 from emmc_rig.study.stability.breaking import Span, below_best, below_view, span, strength_at, told
-from emmc_rig.study.stability.command import BREAKS_CSV, POINTS_CSV, run_stability
-from emmc_rig.study.stability.curves import POOLED, curves
+from emmc_rig.study.stability.curves import POOLED, breaking_rows, curves
+from emmc_rig.study.stability.fault_points import Point, planned, stability_settings
+from emmc_rig.study.stability.fault_sweep import StabilitySweep
 from emmc_rig.study.stability.faults import FAULTS
-from emmc_rig.study.stability.plan import Point, planned, stability_settings
-from emmc_rig.study.stability.rows import breaking_rows
-from emmc_rig.study.stability.run import POINTS, StabilityStopped
+from emmc_rig.study.stability.sweeping import BREAKS_CSV, POINTS_CSV, run_stability
+from emmc_rig.study.sweep import SweepStopped
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from simulators.scenes import render
@@ -44,13 +43,13 @@ def few_steps(monkeypatch):
         chosen = MethodSettings.model_validate(few)
         return reconstruct(name, psi, readings, sigma, dictionary, chosen, usable)
 
-    monkeypatch.setattr(stability_run, "reconstruct", solved)
+    monkeypatch.setattr(fault_sweep, "reconstruct", solved)
 
 
 @pytest.fixture
 def undrawn(monkeypatch):
     """No charts: they take longer than a few steps do."""
-    monkeypatch.setattr(stability_command, "_written", lambda run, *_: run.folder)
+    monkeypatch.setattr(sweeping, "_write", lambda *_: None)
 
 
 def ends(found):
@@ -129,13 +128,13 @@ def test_screening_is_compared_where_it_should_matter():
 
 
 def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_path):
-    monkeypatch.setattr(draw, "PNG_DPI", 40)
+    monkeypatch.setattr(drawing, "PNG_DPI", 40)
     shed = tmp_path / "shed"
     save_views(shed, render("near-planar", size=(30, 36)).light_field)
     chosen = quick(
         scenes=["dark", str(shed)], faults=("flicker", "disparity-range"), screening="both"
     )
-    more = Section("theory", "Theory", "Theory beside it", "<p>expected</p>")
+    more = Section("theory", "Theory beside it", "<p>expected</p>", "Theory")
     outcome = run_stability(chosen, tmp_path / "out", Silent(), [more])
     folder = tmp_path / "out"
     assert outcome.curves[0].scene == POOLED
@@ -163,12 +162,12 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
 
 def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp_path):
     run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
-    lines = (tmp_path / "out" / POINTS).read_text().splitlines()
+    lines = (tmp_path / "out" / StabilitySweep.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
 
 
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):
-    calls, once = [], stability_run.reconstruct
+    calls, once = [], fault_sweep.reconstruct
 
     def stopping(*arguments):
         calls.append(arguments)
@@ -176,15 +175,15 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
             raise KeyboardInterrupt
         return once(*arguments)
 
-    monkeypatch.setattr(stability_run, "reconstruct", stopping)
-    with pytest.raises(StabilityStopped, match="1 of 4 points are kept"):
+    monkeypatch.setattr(fault_sweep, "reconstruct", stopping)
+    with pytest.raises(SweepStopped, match="1 of 4 points are kept"):
         run_stability(quick(), tmp_path / "out", Silent())
     run_stability(quick(), tmp_path / "out", Silent())
     assert len(calls) == 1 + 4
-    kept = (tmp_path / "out" / POINTS).read_text()
+    kept = (tmp_path / "out" / StabilitySweep.journal).read_text()
     run_stability(quick(), tmp_path / "out", Silent())
     assert len(calls) == 1 + 4
-    assert (tmp_path / "out" / POINTS).read_text() == kept
+    assert (tmp_path / "out" / StabilitySweep.journal).read_text() == kept
     run_stability(quick(seed=1), tmp_path / "out", Silent())
     assert len(calls) == 1 + 8
 
@@ -195,7 +194,7 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
             raise ReconstructionError("no light in shot 3")
         return reconstruct(name, psi, readings, *others)
 
-    monkeypatch.setattr(stability_run, "reconstruct", failing)
+    monkeypatch.setattr(fault_sweep, "reconstruct", failing)
     outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)
@@ -264,5 +263,5 @@ def test_wrong_input_is_one_line_and_leaves_nothing_half_written(
 def test_another_folder_s_content_is_left_alone(few_steps, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(AppError, match="holds something else than an earlier sweep"):
+    with pytest.raises(AppError, match="holds something else than an earlier `emmc-rig stability`"):
         run_stability(quick(), tmp_path / "mine", Silent())

@@ -8,14 +8,13 @@ from typer.testing import CliRunner
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.study.stability import beside, theory
+from emmc_rig.study.stability import beside, fault_points, theory
+from emmc_rig.study.stability.fault_points import stability_settings
 from emmc_rig.study.stability.faults import FAULTS, trial
-from emmc_rig.study.stability.plan import stability_settings
 from emmc_rig.study.stability.theory import (
     Place,
     Seen,
     TheoryPoint,
-    TheorySettings,
     measure_theory,
     misplaced,
     patch_texture,
@@ -138,18 +137,18 @@ def test_rank_correlation_takes_infinity_as_largest():
 
 def test_points_are_kept_and_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(theory, "QUICK_SWEPT", ("exposure",))
-    monkeypatch.setattr(theory, "find_camera", lambda name: CAMERA)
-    settings = TheorySettings(
-        True, ("near-planar",), "small", (32, 40), 4, ("tv",), patches=4, conditioned=1
-    )
+    for module in (theory, fault_points):
+        monkeypatch.setattr(module, "find_camera", lambda name: CAMERA)
+    monkeypatch.setattr(theory, "QUICK_PATCHES", (4, 1))
+    settings = stability_settings(True, ["near-planar"], (32, 40), camera="small")
     watcher = Counted()
-    points = measure_theory(settings, tmp_path, watcher)
+    points = measure_theory(settings, tmp_path, watcher, ("tv",))
     assert watcher.steps == watcher.total == len(FAULTS["exposure"].quick)
     bounds = [point.figures["bound_db"] or np.nan for point in points]
     assert all(bounds[i] > bounds[i + 1] for i in range(len(bounds) - 1))
-    monkeypatch.setattr(theory, "trial", None)
-    assert measure_theory(settings, tmp_path, Counted()) == points
-    (section,) = theory_sections(points, settings.methods, tmp_path)
+    monkeypatch.setattr(type(settings), "trial", None)
+    assert measure_theory(settings, tmp_path, Counted(), ("tv",)) == points
+    (section,) = theory_sections(points, ("tv",), tmp_path)
     assert "Exposure" in section.body
     assert (tmp_path / "theory-near-planar.png").is_file()
     one = compared(points, ("tv",))[0]

@@ -13,14 +13,14 @@ from rich.console import Console
 
 from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.progress import Silent
-from emmc_rig.study.tables.command import run_tables
+from emmc_rig.study.tables import reproducing
+from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
+from emmc_rig.study.tables.cells import PARTS, cells_of, distinct
 from emmc_rig.study.tables.console import shown
 from emmc_rig.study.tables.grids import MEAN
 from emmc_rig.study.tables.library import Cut
 from emmc_rig.study.tables.mosaic import Piece, Tile, composed, telling_pieces
-from emmc_rig.study.tables.plan import PARTS, cells_of, distinct
-from emmc_rig.study.tables.rows import COLUMNS
-from emmc_rig.study.tables.run import TablesSettings
+from emmc_rig.study.tables.reproducing import COLUMNS, run_tables
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.methods import MethodSettings
@@ -192,7 +192,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
     folder, outcome = whole
     (folder / "mine.txt").write_text("keep")
     before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
-    from emmc_rig.study.tables import run as module
+    from emmc_rig.study.tables import cell_sweep as module
 
     monkeypatch.setattr(module, "reconstruct", None)
     again = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
@@ -238,26 +238,22 @@ def test_a_dictionary_that_saw_the_scene_is_refused(run, scenes, tmp_path):
 
 
 def test_ctrl_c_is_told_with_how_to_go_on(run, scenes, monkeypatch):
-    from emmc_rig.study.tables import command
-
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
 
-    for stage in ("do_cells", "draw_figures"):
+    for place, stage in ((TablesSweep, "measure"), (reproducing, "draw_figures")):
         with monkeypatch.context() as patch:
-            patch.setattr(command, stage, interrupted)
+            patch.setattr(place, stage, interrupted)
             code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
         assert code == 130
         assert "run the same command again" in one_line(err)
 
 
 def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
-    from emmc_rig.study.tables import command
-
     def full(*arguments, **named):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(command, "draw_figures", full)
+    monkeypatch.setattr(reproducing, "draw_figures", full)
     code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
     assert (code, "No space left" in one_line(err)) == (1, True)
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.cells import METHODS, PARTS, Capture, Cell, cells_of
 from emmc_rig.study.tables.findings import CLAIMS, judge, printed_figures
-from emmc_rig.study.tables.plan import METHODS, PARTS, Capture, Cell, cells_of
 
 SCENES = ["dragons", "dice", "buttercup", "tulip"]
 FLAT = 25.0

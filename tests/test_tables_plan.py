@@ -5,7 +5,7 @@ import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.study.tables import paper
-from emmc_rig.study.tables.plan import (
+from emmc_rig.study.tables.cells import (
     MASKS,
     PARTS,
     Capture,

@@ -13,7 +13,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
 from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
 from emmc_rig.progress import Silent
-from emmc_rig.study.points import Journal, digest_of, open_folder
+from emmc_rig.study.sweep import Journal, SweepStopped, digest_of, open_folder
+from emmc_rig.study.tables.cell_sweep import FAST, Forecast, TablesSettings, TablesSweep
+from emmc_rig.study.tables.cells import PARTS, Capture, Cell, Part
+from emmc_rig.study.tables.colour_scores import scored
 from emmc_rig.study.tables.demosaic import demosaiced_rggb
 from emmc_rig.study.tables.dictionaries import (
     Given,
@@ -23,18 +26,7 @@ from emmc_rig.study.tables.dictionaries import (
     trained_on,
 )
 from emmc_rig.study.tables.library import Cut, Library, middle, scene_specs
-from emmc_rig.study.tables.plan import PARTS, Capture, Cell, Part
-from emmc_rig.study.tables.rows import csv_text
-from emmc_rig.study.tables.run import (
-    CELLS,
-    FAST,
-    Forecast,
-    Run,
-    TablesSettings,
-    TablesStopped,
-    do_cells,
-)
-from emmc_rig.study.tables.scores import scored
+from emmc_rig.study.tables.reproducing import cells_csv
 from emmc_rig.study.tables.shots import Sensors
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
@@ -87,9 +79,14 @@ def scenes(tmp_path_factory):
 
 def a_run(scenes, out, parts=(PART,), settings=TINY, source=None):
     library = Library(scene_specs(scenes), settings.cuts, settings.seed)
-    folder = open_folder(out, CELLS, "earlier tables")
+    folder = open_folder(out, TablesSweep.journal, "tables")
     source = source or LeaveOneOut(library, settings.training, folder / "dictionaries")
-    return Run(tuple(parts), library, source, settings, folder)
+    return TablesSweep(settings, folder, tuple(parts), library, source)
+
+
+def do_cells(run, watcher, clock=time.perf_counter):
+    run.clock = clock
+    return run.measure(watcher)
 
 
 def ticking():
@@ -115,17 +112,19 @@ class Impatient(Silent):
 
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(scenes, tmp_path):
     whole = a_run(scenes, tmp_path / "whole")
-    expected = csv_text(whole, do_cells(whole, Silent(), ticking()))
+    do_cells(whole, Silent(), ticking())
+    expected = cells_csv(whole)
     assert len(expected.splitlines()) == 1 + 3 * 3 * 3
     torn = a_run(scenes, tmp_path / "torn")
-    with pytest.raises(TablesStopped, match="4 of 27 cells are kept"):
+    with pytest.raises(SweepStopped, match="4 of 27 cells are kept"):
         do_cells(torn, Impatient(4), ticking())
-    path = tmp_path / "torn" / CELLS
+    path = tmp_path / "torn" / TablesSweep.journal
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(TablesStopped, match=r"8 of 27 cells .*run the same command again"):
+    with pytest.raises(SweepStopped, match=r"8 of 27 cells .*run the same command again"):
         do_cells(a_run(scenes, tmp_path / "torn"), Impatient(5), ticking())
     again = a_run(scenes, tmp_path / "torn")
-    assert csv_text(again, do_cells(again, Silent(), ticking())) == expected
+    do_cells(again, Silent(), ticking())
+    assert cells_csv(again) == expected
 
 
 def test_ctrl_c_in_the_middle_of_a_cell_keeps_those_before(scenes, tmp_path):
@@ -137,12 +136,12 @@ def test_ctrl_c_in_the_middle_of_a_cell_keeps_those_before(scenes, tmp_path):
             raise KeyboardInterrupt
         return 0.0
 
-    with pytest.raises(TablesStopped, match="cells are kept"):
+    with pytest.raises(SweepStopped, match="cells are kept"):
         do_cells(run, Silent(), clock)
-    kept = len(Journal(run.folder / CELLS))
+    kept = len(Journal(run.folder / TablesSweep.journal))
     assert 0 < kept < 27
     do_cells(run, Silent())
-    assert len(Journal(run.folder / CELLS)) == 27
+    assert len(Journal(run.folder / TablesSweep.journal)) == 27
 
 
 def test_sharing_the_first_stage_changes_no_result(scenes, tmp_path):
@@ -176,7 +175,7 @@ def test_patches_are_coded_by_the_papers_solver_unless_told():
 def test_nothing_is_done_twice(scenes, tmp_path, monkeypatch):
     run = a_run(scenes, tmp_path / "out")
     first = do_cells(run, Silent())
-    from emmc_rig.study.tables import run as module
+    from emmc_rig.study.tables import cell_sweep as module
 
     monkeypatch.setattr(module, "reconstruct", None)
     monkeypatch.setattr(module, "estimate_patches", None)
@@ -230,7 +229,7 @@ def test_pictures_that_are_lost_are_made_again(scenes, tmp_path):
     run = a_run(scenes, tmp_path / "out", [part])
     (cell,) = run.cells
     results = do_cells(run, Silent())
-    path = run.picture_path(digest_of(run.inputs(cell)))
+    path = run.picture(cell)
     first = Pictures.load(path)
     assert first is not None
     path.write_bytes(path.read_bytes()[:100])
@@ -324,24 +323,24 @@ def test_binned_pixels_take_the_dictionary_whose_patches_they_divide(tmp_path):
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     (tmp_path / "cat.jpg").write_text("meow")
     with pytest.raises(AppError, match="holds something else"):
-        open_folder(tmp_path, CELLS, "earlier tables")
+        open_folder(tmp_path, TablesSweep.journal, "tables")
     with pytest.raises(AppError, match="a file of that name"):
-        open_folder(tmp_path / "cat.jpg", CELLS, "earlier tables")
+        open_folder(tmp_path / "cat.jpg", TablesSweep.journal, "tables")
     assert [path.name for path in tmp_path.iterdir()] == ["cat.jpg"]
 
 
 def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
-    folder = open_folder(tmp_path / "out", CELLS, "earlier tables")
-    journal = Journal(folder / CELLS)
+    folder = open_folder(tmp_path / "out", TablesSweep.journal, "tables")
+    journal = Journal(folder / TablesSweep.journal)
     journal.add("a", {}, {"psnr_db": 1.0})
     journal.add("b", {}, {"psnr_db": 2.0})
-    path = folder / CELLS
+    path = folder / TablesSweep.journal
     path.write_bytes(path.read_bytes()[:-9])
-    torn = Journal(folder / CELLS)
+    torn = Journal(folder / TablesSweep.journal)
     assert (torn.get("a"), torn.get("b")) == ({"psnr_db": 1.0}, None)
     torn.add("c", {}, {"psnr_db": 3.0})
-    assert Journal(folder / CELLS).get("c") == {"psnr_db": 3.0}
-    assert Journal(folder / CELLS).get("a") == {"psnr_db": 1.0}
+    assert Journal(folder / TablesSweep.journal).get("c") == {"psnr_db": 3.0}
+    assert Journal(folder / TablesSweep.journal).get("a") == {"psnr_db": 1.0}
 
 
 def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
@@ -357,7 +356,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
         patch.setattr(Journal, "add", filling)
         with pytest.raises(AppError, match=r"No space left.*run the same command again"):
             do_cells(run, Silent())
-    assert len(Journal(run.folder / CELLS)) == 3
+    assert len(Journal(run.folder / TablesSweep.journal)) == 3
     assert len(do_cells(run, Silent())) == 27
 
 
@@ -467,4 +466,4 @@ def test_two_runs_may_share_a_folder(scenes, tmp_path):
     one, other = (a_run(scenes, tmp_path / "out") for _ in range(2))
     first, second = do_cells(one, Silent(), time.perf_counter), do_cells(other, Silent())
     assert first == second
-    assert Path(one.folder, CELLS).read_text().count("\n") == 27
+    assert Path(one.folder, TablesSweep.journal).read_text().count("\n") == 27

@@ -144,7 +144,7 @@ def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, to
         (["--leave-out", "dgo"], "did you mean 'dog'"),
         (["--out", "d.png"], "ends in .h5"),
         (["--out", "file/d.h5"], "cannot be written"),
-        (["--out", "other.h5"], "no dictionary"),
+        (["--out", "other.h5"], "exists already"),
         (["--resume"], "no checkpoint"),
     ],
 )

@@ -11,12 +11,13 @@ from calibration.routes import Outcome
 from calibration.whiteboard import Calibration
 from emmc_rig.calibrate.run import REPORT, ROUTES, outcome_figures, save_outcome
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import CALIBRATION, Session
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,7 +47,8 @@ class SessionCalibration:
 
         An earlier result of that name is replaced; raises AppError where something else is there.
         """
-        with result_folder(Path(out)) as folder:
+        place = Path(self.metrics["session"]) / CALIBRATION
+        with result_folder(Path(out), "calibrate", belongs_to=place) as folder:
             self.write(folder)
 
     def write(self, folder: Path) -> None:

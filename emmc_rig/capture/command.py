@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from emmc_rig.capture.sequencer import Outcome, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
@@ -44,10 +44,8 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
-    REPORT,
     Frozen,
     Session,
-    is_session,
     wall_time,
 )
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
@@ -129,6 +127,7 @@ def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
         )
     if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
         raise AppError(f"--out {wish.out}: holds something else than a session; name another --out")
+    refuse_inside_session(wish.out)
     return None
 
 
@@ -322,7 +321,7 @@ def capture_session(
             return None
         session, outcome = captured
         try:
-            write_sheet(session, session.folder / REPORT, quick_pictures(session))
+            write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
             watcher.tell(f"no report: {fault}")
     if not outcome.complete:
@@ -372,14 +371,5 @@ def capture(
 
 def write_new(path: Path, text: str) -> None:
     """Write a new file; raises AppError when one of that name is there, or it cannot be."""
-    try:
-        with open(path, "x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError as fault:
-        raise AppError(f"{path}: exists already; name another --out") from fault
-    except OSError as fault:
-        raise AppError(
-            f"{path}: cannot be written ({fault.strerror}); name another --out"
-        ) from fault
+    with new_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -28,8 +28,9 @@ shots:
 # without masks. `whiteboards: null` leaves them out.
 whiteboards:
   views: all                # or a list: [[0, 0], [2, 2]]
-  # open: [{{mask_um: [0, 0]}}, {{mask_um: [0, 0], held_out: true}}]   # masks in, whole aperture:
-  #                         few frames, for the parametric route of `emmc-rig calibrate`
+  open:                     # masks in, whole aperture
+    - {{held_out: true}}      # by which `emmc-rig calibrate` judges the Psi that it measures
+    # - {{mask_um: [0, 0]}}   # for the parametric route: few frames, see `calibrate --plan`
   # lamps: [white]          # default: what the sensor needs
   repeats: 2
   references: 4

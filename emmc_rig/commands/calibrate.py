@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
@@ -20,7 +21,9 @@ def calibrate(
     camera: Annotated[
         str, typer.Option("--camera", help="a shipped camera or a YAML file")
     ] = DEFAULT_CAMERA,
-    size: Annotated[str, typer.Option("--size", help="ROWSxCOLUMNS of samples")] = "192x256",
+    size: Annotated[
+        str, typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of samples")
+    ] = "192x256",
     route: Annotated[
         str, typer.Option("--route", help="auto (the surest), parametric, mixed or free")
     ] = "auto",
@@ -44,8 +47,8 @@ def calibrate(
         ),
     ] = None,
     known: Annotated[
-        Path, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
-    ] = Path("emmc-calibration"),
+        Path | None, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
+    ] = None,
     target: Annotated[
         float, typer.Option("--target", help="relative error of Psi to plan for")
     ] = 0.005,
@@ -59,17 +62,27 @@ def calibrate(
         bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
-    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-calibration"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="folder to write (default: of a session, in the session; emmc-calibration with "
+            "--plan, else emmc-bench, emmc-checks or emmc-drift)",
+        ),
+    ] = None,
 ) -> None:
     """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
     from emmc_rig.calibrate.bench import BenchTruth
     from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.cameras import find_camera
-    from emmc_rig.files.results import parse_size, result_folder
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import parse_size
 
     if drift is not None:
-        _judge_drift(known, drift, out)
+        if known is None:
+            raise typer.BadParameter("--drift needs --known, a folder that `calibrate` wrote")
+        _judge_drift(known, drift, out or Path("emmc-drift"))
         return
     if session is not None:
         if plan or check is not None or stage:
@@ -97,7 +110,8 @@ def calibrate(
 
         from emmc_rig.study.checks.command import run_checks
 
-        with result_folder(out) as folder:
+        out = out or Path("emmc-checks")
+        with result_folder(out, "calibrate --check") as folder:
             metrics = run_checks(settings, check, folder)
         table = Table("target", "measured", "asked", "")
         for row in metrics["rows"]:
@@ -109,7 +123,8 @@ def calibrate(
             raise AppError(f"{len(missed)} of {len(metrics['rows'])} missed: {'; '.join(missed)}")
         return
     if plan:
-        with result_folder(out) as folder:
+        out = out or Path("emmc-calibration")
+        with result_folder(out, "calibrate --plan") as folder:
             metrics = write_plan(settings, folder)
         typer.echo(
             f"{metrics['frames']} frames for a relative error of Psi of "
@@ -117,7 +132,8 @@ def calibrate(
         )
         typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         return
-    with result_folder(out) as folder, shown_bars() as bars:
+    out = out or Path("emmc-bench")
+    with result_folder(out, "calibrate") as folder, shown_bars() as bars:
         metrics = run_calibrate(settings, folder, bars)
     chosen = metrics["chosen"]
     typer.echo(
@@ -132,13 +148,15 @@ def calibrate(
     typer.echo(f"open {out / 'report.html'}")
 
 
-def _calibrate_session(path: Path, route: str, out: Path) -> None:
+def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
     import emmc_rig as emmc
     from emmc_rig.commands.bars import shown_bars
-    from emmc_rig.files.results import result_folder
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.session.session import CALIBRATION
 
-    captured = emmc.Session(path)
-    with result_folder(out) as folder, shown_bars() as bars:
+    captured, place = emmc.Session(path), path / CALIBRATION
+    out = out or place
+    with result_folder(out, "calibrate", belongs_to=place) as folder, shown_bars() as bars:
         calibration = emmc.calibrate(captured, route, watcher=bars)
         calibration.write(folder)
     metrics = calibration.metrics
@@ -157,9 +175,9 @@ def _calibrate_session(path: Path, route: str, out: Path) -> None:
 
 def _judge_drift(known: Path, frames: Path, out: Path) -> None:
     from emmc_rig.calibrate.drift import run_drift
-    from emmc_rig.files.results import result_folder
+    from emmc_rig.files.folders import result_folder
 
-    with result_folder(out) as folder:
+    with result_folder(out, "calibrate --drift") as folder:
         metrics = run_drift(known, frames, folder)
     typer.echo(metrics["words"])
     for kind, value in metrics["values"].items():

@@ -26,7 +26,8 @@ def cameras(
     from rich.table import Table
 
     import emmc_rig as emmc
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.pages.camera_sheet import (
         camera_figures,
         camera_rows,
@@ -49,7 +50,7 @@ def cameras(
     camera = emmc.camera(name)
     figures = camera_figures(camera)
     folder_name = out or Path(f"camera-{Path(name).stem}")
-    with result_folder(folder_name) as folder:
+    with result_folder(folder_name, "cameras") as folder:
         draw_camera(camera, folder / "camera.png")
         write_metrics(folder, {**figures, "command": command_line(), "versions": versions()})
     table = Table("figure", "value", title=camera.title)

@@ -22,7 +22,7 @@ from emmc_rig.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from emmc_rig.study.chart.plan import ChartSettings
+    from emmc_rig.study.chart.points import ChartSettings
 
 ONE_SHOT = "rgbw-bayer-1shot"
 TIMED_SIZE, TIMED_CALLS = (593, 840), 7
@@ -78,9 +78,9 @@ def chart(
     one_camera = (camera or [ONE_SHOT])[0]
     timed = shape or TIMED_SIZE, repeats or TIMED_CALLS
     if solvers:
-        chart_solvers(one_camera, dictionary, out or Path("emmc-kernels"))
+        chart_solvers(one_camera, dictionary, out or Path("emmc-solvers"))
     elif peers:
-        chart_peers(one_camera, *timed, out or Path("emmc-kernels"))
+        chart_peers(one_camera, *timed, out or Path("emmc-peers"))
     elif kernels:
         chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
     elif ablation:
@@ -93,7 +93,7 @@ def chart(
         cut = shape or STUDIED_SIZE
         chart_next_shot(scene or list(SCENES), one_camera, cut, targets, seed, place)
     else:
-        from emmc_rig.study.chart.command import chart_settings
+        from emmc_rig.study.chart.points import chart_settings
 
         settings = chart_settings(
             fast, scene or [], camera or [], shape, repeats,
@@ -108,11 +108,11 @@ def _chart_methods(settings: ChartSettings, place: Path) -> None:
     from rich.table import Table
 
     from emmc_rig.commands.bars import say, shown_bars
-    from emmc_rig.study.chart.command import run_chart, shown_charts
+    from emmc_rig.study.chart.charting import run_chart
 
     with shown_bars() as bars:
         outcome = run_chart(settings, place, bars)
-    for one in shown_charts(outcome.charts):
+    for one in outcome.shown():
         table = Table("the front", "s", "dB", title=one.title, box=SIMPLE)
         for mark in one.front():
             table.add_row(mark.configuration.label, f"{mark.seconds:.3g}", f"{mark.psnr_db:.2f}")

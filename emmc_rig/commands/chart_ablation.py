@@ -11,12 +11,13 @@ def chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, ou
     from rich.table import Table
 
     import emmc_rig as emmc
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.ablation import ablations
 
     table = Table("adaptive", "dB", "s", "buys dB", "costs s")
     rows = []
-    with result_folder(out) as folder:
+    with result_folder(out, "chart --ablation") as folder:
         for row in ablations(scene, emmc.camera(camera), size, seed):
             rows.append(row.as_dict())
             table.add_row(

@@ -13,14 +13,15 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
     from rich.table import Table
 
     import emmc_rig as emmc
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.imports import start_timings
     from emmc_rig.study.benchmarks.kernels import kernel_timings, reconstruction_memory
 
     described = emmc.camera(camera)
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")
     rows = []
-    with result_folder(out) as folder:
+    with result_folder(out, "chart --kernels") as folder:
         seconds, peak_gib = reconstruction_memory(camera, size)
         for timing in kernel_timings(described, size, repeats):
             rows.append(timing.as_dict())

@@ -18,15 +18,15 @@ def chart_next_shot(
 
     import emmc_rig as emmc
     from emmc_rig.commands.bars import shown_bars
+    from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.next_shot import ROWS, next_shots, savings, total_savings
-    from emmc_rig.study.points import open_folder
+    from emmc_rig.study.sweep import open_folder
 
     described = emmc.camera(camera)
-    folder = open_folder(out, ROWS, "shots of `emmc-rig chart --next-shot`")
+    folder = open_folder(out, ROWS, "chart --next-shot")
     with shown_bars() as bars:
-        bars.begin("capture and judge", None)
-        found = list(next_shots(scenes, camera, described, size, seed, folder, bars.step))
+        found = next_shots(scenes, camera, described, size, seed, folder, bars)
     names = ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number")
     table = Table(*names, box=SIMPLE)
     rows = [one for scene in found for one in savings(scene, until)]
@@ -51,4 +51,5 @@ def chart_next_shot(
         "command": command_line(),
         "versions": versions(),
     }
-    write_metrics(folder, metrics)
+    with result_folder(folder, "chart --next-shot", adds=True) as results:
+        write_metrics(results, metrics)

@@ -11,13 +11,14 @@ def chart_peers(camera: str, size: tuple[int, int], repeats: int, out: Path) -> 
     from rich.table import Table
 
     import emmc_rig as emmc
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.variational import variational_timings
 
     described = emmc.camera(camera)
     table = Table("primal-dual step", "ms", "times ours")
     rows = []
-    with result_folder(out) as folder:
+    with result_folder(out, "chart --peers") as folder:
         for timing in variational_timings(described, size, repeats):
             rows.append(timing.as_dict())
             table.add_row(timing.name, f"{timing.seconds * 1e3:.1f}", f"{timing.times_ours:.1f}")

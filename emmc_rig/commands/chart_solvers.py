@@ -16,14 +16,15 @@ def chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
     from emmc_rig.commands.bars import say
     from emmc_rig.errors import AppError
     from emmc_rig.files.dictionaries import open_dictionary
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
 
     described = emmc.camera(camera)
-    atoms = open_dictionary(dictionary, described.views, described.sensor.binning)
     table = Table("solver", "ms/patch", "passes", "GFLOP/s", "times its bound", "gap", "dB")
     rows, peers = [], []
-    with result_folder(out) as folder:
+    with result_folder(out, "chart --solvers") as folder:
+        atoms = open_dictionary(dictionary, described.views, described.sensor.binning)
         for timing in solver_timings(described, TIMED_SIZE, atoms):
             rows.append(timing.as_dict())
             table.add_row(

@@ -43,7 +43,8 @@ def demo(
     import emmc_rig as emmc
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.demo import DemoSettings, run_demo
-    from emmc_rig.files.results import parse_size, result_folder
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import parse_size
     from emmc_rig.model.settings import validated
     from reconstruction.methods import MethodSettings
 
@@ -62,7 +63,7 @@ def demo(
     )
     for warning in described.warnings():
         say("warning", warning)
-    with result_folder(out) as folder, shown_bars() as bars:
+    with result_folder(out, "demo") as folder, shown_bars() as bars:
         metrics = run_demo(settings, folder, bars)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     typer.echo(

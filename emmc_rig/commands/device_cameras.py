@@ -19,6 +19,7 @@ from rich.text import Text
 
 from emmc_rig.capture.keyboard import pressed_keys
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import new_file, refuse_inside_session
 
 if TYPE_CHECKING:
     from drivers.camera import Camera
@@ -28,7 +29,10 @@ if TYPE_CHECKING:
 SAVE_KEY, END_KEYS = "s", "q\x1b"
 
 CameraSpec = Annotated[
-    str, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+    str,
+    typer.Option(
+        "--camera", help="ptp:, u3v:, gphoto2:, mm:CONFIG.cfg, folder:DIR, simulated or a YAML file"
+    ),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
@@ -179,7 +183,8 @@ def frame_line(frame: RawFrame, figures: FrameFigures) -> str:
 
 
 def frames_folder(out: Path) -> Path:
-    """Return the folder, made if need be; raises AppError where it cannot be."""
+    """Return the folder, made if need be; raises AppError where it cannot be, or a session is."""
+    refuse_inside_session(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
@@ -197,7 +202,6 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
 
     from emmc_rig.pages.frame_view import preview
     from emmc_rig.session.frame_file import frame_facts, suffix_of
-    from emmc_rig.session.storage import SYSTEM_DISK, write_whole
 
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
@@ -210,13 +214,14 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
         "sha256": frame.sha256,
         **frame_facts(frame),
     }
-    try:
-        told = (json.dumps(facts, indent=2) + "\n").encode()
-        write_whole(SYSTEM_DISK, stem.with_suffix(".png"), png.tobytes())
-        write_whole(SYSTEM_DISK, stem.with_suffix(".json"), told)
-        write_whole(SYSTEM_DISK, original, frame.original)
-    except OSError as fault:
-        raise AppError(f"{original}: cannot be written ({fault.strerror})") from fault
+    files = {
+        stem.with_suffix(".png"): png.tobytes(),
+        stem.with_suffix(".json"): (json.dumps(facts, indent=2) + "\n").encode(),
+        original: frame.original,
+    }
+    for path, data in files.items():
+        with new_file(path) as partial:
+            partial.write_bytes(data)
     return original
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,11 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 from emmc_rig.capture.signals import ENDING, handled
+from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
-    from drivers.stage import HostStage
+    from drivers.stage import Stage
 
 app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
 _told = Console(stderr=True)
@@ -32,7 +33,8 @@ _told = Console(stderr=True)
 StageOption = Annotated[
     str | None,
     typer.Option(
-        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file that wires names to axes"
+        "--stage",
+        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file that wires names",
     ),
 ]
 RigOption = Annotated[
@@ -43,6 +45,7 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 
 register(app)
+app.command()(conform)
 
 
 @app.command("list")
@@ -177,9 +180,12 @@ def serve(
 ) -> None:
     """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
     from drivers.clock import SYSTEM_CLOCK
+    from emmc_rig.files.folders import refuse_inside_session
     from emmc_rig.rig.hardware import simulated_firmware
     from simulators.wire import PtyServer, TcpServer
 
+    if link is not None:
+        refuse_inside_session(link.parent)
     firmware = simulated_firmware(protocol, SYSTEM_CLOCK)
     if tcp is None:
         server = PtyServer(firmware, link)
@@ -211,47 +217,49 @@ def bench(
     out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
 ) -> None:
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
     from emmc_rig.study.benchmarks.u3v import u3v_timings
 
-    timings = stage_timings(repeats)
-    table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
-    for one in timings:
-        table.add_row(
-            one.protocol,
-            one.command,
-            f"{one.exchanges:g}",
-            f"{one.milliseconds:.3f}",
-            f"{one.milliseconds / one.exchanges:.3f}",
-        )
-    Console().print(table)
-    picture = picture_timing()
-    typer.echo(
-        f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
-        f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times rawpy "
-        "alone"
-    )
-    streams = list(u3v_timings())
-    for one in streams:
+    with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
+        timings = stage_timings(repeats)
+        table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
+        for one in timings:
+            table.add_row(
+                one.protocol,
+                one.command,
+                f"{one.exchanges:g}",
+                f"{one.milliseconds:.3f}",
+                f"{one.milliseconds / one.exchanges:.3f}",
+            )
+        Console().print(table)
+        picture = picture_timing()
         typer.echo(
-            f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, {one.gigabytes_per_s:.2f} GB/s"
+            f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
+            f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times "
+            "rawpy alone"
         )
-    if out is not None:
-        metrics = {
-            "stage_commands": [one.as_dict() for one in timings],
-            "picture": picture.as_dict(),
-            "usb3_vision": [one.as_dict() for one in streams],
-            "command": command_line(),
-            "versions": versions(),
-        }
-        with result_folder(out) as folder:
+        streams = list(u3v_timings())
+        for one in streams:
+            typer.echo(
+                f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
+                f"{one.gigabytes_per_s:.2f} GB/s"
+            )
+        if folder is not None:
+            metrics = {
+                "stage_commands": [one.as_dict() for one in timings],
+                "picture": picture.as_dict(),
+                "usb3_vision": [one.as_dict() for one in streams],
+                "command": command_line(),
+                "versions": versions(),
+            }
             write_metrics(folder, metrics)
 
 
 @contextmanager
-def _opened(stage: str | None, rig: str | None) -> Iterator[HostStage]:
+def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
     from drivers.errors import DriverError
     from emmc_rig.rig.hardware import open_stage
@@ -284,7 +292,7 @@ def _signals_interrupt() -> Iterator[None]:
         yield
 
 
-def _show(stage: HostStage) -> None:
+def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
     table = Table("axis", "homed", "position um", "limits um", "speed um/s", box=SIMPLE)

@@ -9,6 +9,9 @@ import typer
 
 DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
+SIZE_VARIABLE = "EMMC_SIZE"
+"""Environment variable: the --size where none is given, so that everything can be tried small."""
+
 SceneOption = Annotated[
     str,
     typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),
@@ -20,7 +23,10 @@ ShotsOption = Annotated[
     int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
 ]
 SizeOption = Annotated[
-    str | None, typer.Option("--size", help="ROWSxCOLUMNS: the middle of a scene, or its size")
+    str | None,
+    typer.Option(
+        "--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS: the middle of a scene, or its size"
+    ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
@@ -43,5 +49,6 @@ RigSceneOption = Annotated[
     str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
 ]
 RigSizeOption = Annotated[
-    str | None, typer.Option("--size", help="ROWSxCOLUMNS of the simulated light field")
+    str | None,
+    typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of the simulated light field"),
 ]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import DictionaryOption, OutOption
+from emmc_rig.commands.options import DictionaryOption
 from emmc_rig.commands.verdict import end_with_verdict
 
 
@@ -49,14 +49,21 @@ def reconstruct(
     strict: Annotated[
         bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
     ] = False,
-    out: OutOption = Path("emmc-reconstruction"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="folder to write (default: emmc-reconstruction; of a session, in the session)",
+        ),
+    ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.commands.bars import console, say, shown_bars
-    from emmc_rig.files.results import result_folder
+    from emmc_rig.files.folders import is_session, result_folder
     from emmc_rig.reconstruct.inputs import load_settings
     from emmc_rig.reconstruct.solve import reconstruct_folder
     from emmc_rig.reconstruct.tiles import reconstruct_folder_in_tiles
+    from emmc_rig.session.session import RECONSTRUCTION
     from reconstruction.methods import DEFAULT_METHOD
 
     if list_methods:
@@ -78,12 +85,15 @@ def reconstruct(
     elif chart_folder is not None:
         raise typer.BadParameter("--chart serves --budget and --want")
     method = method or DEFAULT_METHOD
+    place = frames / RECONSTRUCTION if is_session(frames) else None
+    out = out or place or Path("emmc-reconstruction")
+    results = result_folder(out, "reconstruct", belongs_to=place)
     if tile is not None:
         if truth is not None:
             raise typer.BadParameter(
                 "--truth needs the whole light field in memory, without --tile"
             )
-        with result_folder(out) as folder, shown_bars() as bars:
+        with results as folder, shown_bars() as bars:
             bars.begin(f"{method} in tiles", None)
             metrics = reconstruct_folder_in_tiles(
                 frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
@@ -92,7 +102,7 @@ def reconstruct(
         typer.echo(f"read {out / 'light_field.h5'}")
         end_with_verdict(metrics["verdict"], strict)
         return
-    with result_folder(out) as folder, shown_bars() as bars:
+    with results as folder, shown_bars() as bars:
         bars.begin(method, None)
         metrics = reconstruct_folder(
             frames, folder, method, psi, dictionary, chosen, truth,

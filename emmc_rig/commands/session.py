@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -135,7 +135,7 @@ def prune(
 def sheet(
     session: Folder,
     out: Annotated[
-        Path | None, typer.Option("--out", help="page to write (default: report.html in it)")
+        Path | None, typer.Option("--out", help="folder to write (default: the session)")
     ] = None,
     pictures: Annotated[int, typer.Option("--pictures", min=0, help="most to show")] = 200,
 ) -> None:
@@ -144,9 +144,9 @@ def sheet(
     from emmc_rig.session.session import REPORT, Session
 
     opened = Session(session)
-    path = out or opened.folder / REPORT
-    write_sheet(opened, path.absolute(), pictures)
-    typer.echo(f"open {path}")
+    folder = out or session
+    write_sheet(opened, folder, pictures)
+    typer.echo(f"open {folder / REPORT}")
 
 
 @app.command()
@@ -159,34 +159,36 @@ def bench(
     out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
 ) -> None:
     """Time what capturing costs beside the devices, and verifying and listing sessions."""
-    from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
 
-    measured = []
-    for one in overheads(folder, 300):
-        measured.append(one)
+    with nullcontext() if out is None else result_folder(out, "session bench") as results:
+        measured = []
+        for one in overheads(folder, 300):
+            measured.append(one)
+            typer.echo(
+                f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of "
+                f"{one.move_s:g} s: {one.sequencing_ms:.2f} ms each beside the devices, "
+                f"{one.handing_over_ms:.2f} ms handing over; {one.hidden_share:.0%} of hashing and "
+                "writing behind the bench's work"
+            )
+        rates = verification(folder, shots)
         typer.echo(
-            f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of {one.move_s:g} s: "
-            f"{one.sequencing_ms:.2f} ms each beside the devices, {one.handing_over_ms:.2f} ms "
-            f"handing over; {one.hidden_share:.0%} of hashing and writing behind the bench's work"
+            f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
+            f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
+            f"threads: {rates.share:.0%} of the slower"
         )
-    rates = verification(folder, shots)
-    typer.echo(
-        f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
-        f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
-        f"threads: {rates.share:.0%} of the slower"
-    )
-    listing_s = listing_seconds(folder, listed)
-    typer.echo(f"listing a session of {listed} shots: {listing_s:.3f} s")
-    if out is not None:
-        metrics = {
-            "overhead": [one.as_dict() for one in measured],
-            "verification": rates.as_dict(),
-            "listing": {"shots": listed, "seconds": listing_s},
-            "command": command_line(),
-            "versions": versions(),
-        }
-        with result_folder(out) as results:
+        listing_s = listing_seconds(folder, listed)
+        typer.echo(f"listing a session of {listed} shots: {listing_s:.3f} s")
+        if results is not None:
+            metrics = {
+                "overhead": [one.as_dict() for one in measured],
+                "verification": rates.as_dict(),
+                "listing": {"shots": listed, "seconds": listing_s},
+                "command": command_line(),
+                "versions": versions(),
+            }
             write_metrics(results, metrics)
 
 

@@ -32,10 +32,11 @@ def simulate(
 ) -> None:
     """Make frames of a light field through any camera, without a rig."""
     import emmc_rig as emmc
-    from emmc_rig.files.results import parse_size, result_folder
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import parse_size
 
     described = emmc.camera(camera, shots)
-    with result_folder(out) as folder:
+    with result_folder(out, "simulate") as folder:
         metrics = simulate_into(folder, scene, camera, described, parse_size(size), seed)
     typer.echo(
         f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "

@@ -56,7 +56,10 @@ def stability(
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
-    out: Annotated[Path, typer.Option("--out", help="folder to write")] = Path("emmc-stability"),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="folder to write (default: emmc-stability or emmc-verdicts)"),
+    ] = None,
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
     from rich.box import SIMPLE
@@ -66,16 +69,18 @@ def stability(
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.stability.beside import measure_beside
-    from emmc_rig.study.stability.command import run_stability
-    from emmc_rig.study.stability.plan import CAMERA, planned, stability_settings
-    from emmc_rig.study.stability.rows import breaking_rows
+    from emmc_rig.study.stability.curves import breaking_rows
+    from emmc_rig.study.stability.fault_points import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.sweeping import run_stability
 
     if faults:
         _list_faults()
         return
     if verdicts:
-        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, out)
+        place = out or Path("emmc-verdicts")
+        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, place)
         return
+    out = out or Path("emmc-stability")
     settings = stability_settings(
         fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,

@@ -34,9 +34,9 @@ def tables(
     from rich.console import Console
 
     from emmc_rig.commands.bars import shown_bars
-    from emmc_rig.study.tables.command import run_tables
+    from emmc_rig.study.tables.cell_sweep import FAST, TablesSettings
     from emmc_rig.study.tables.console import shown
-    from emmc_rig.study.tables.run import FAST, TablesSettings
+    from emmc_rig.study.tables.reproducing import run_tables
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     with shown_bars() as bars:

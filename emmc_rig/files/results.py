@@ -1,16 +1,13 @@
-"""Folders of results: written beside their final place, and renamed when they are whole."""
+"""What results say of themselves: metrics, versions, and figures for people."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import re
-import shutil
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -19,54 +16,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.errors import AppError, WrongUsageError
+from emmc_rig.errors import WrongUsageError
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
-
-
-@contextmanager
-def result_folder(out: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it takes the name `out` only when the block succeeds.
-
-    An earlier result (a folder with a metrics.json) is replaced; anything else that is in the
-    way raises AppError, as does a place that cannot be written. After a failure nothing is left.
-    """
-    out = Path(os.path.abspath(out))
-    if out.is_file():
-        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / METRICS).is_file():
-        raise AppError(
-            f"--out {out}: the folder holds something else than an earlier result; "
-            "choose another folder or empty it"
-        )
-    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
-    try:
-        partial.mkdir(parents=True)
-    except OSError as fault:
-        raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
-    try:
-        yield partial
-        _take_place(partial, out)
-    except OSError as fault:
-        raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _take_place(partial: Path, out: Path) -> None:
-    """Rename `partial` to `out`, the folder of that name set aside until it is done."""
-    old = out.with_name(f".{out.name}.{os.getpid()}.old")
-    if out.exists():
-        os.replace(out, old)
-    try:
-        os.replace(partial, out)
-    except OSError:
-        if old.exists():
-            os.replace(old, out)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def parse_size(
@@ -90,12 +44,12 @@ def parse_psnr(text: str, option: str) -> float:
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
-    """Write metrics.json."""
+    """Write metrics.json, see `metrics_text`."""
     (folder / METRICS).write_text(metrics_text(metrics), encoding="utf-8")
 
 
 def metrics_text(metrics: Mapping[str, object]) -> str:
-    """Return metrics as JSON; values that are not finite become null, as JSON has none."""
+    """Return plain data as JSON; values that are not finite become null, as JSON has none."""
     return json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
 
 

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 INK, FAINT, LINE, ACCENT = "#17202c", "#5b6776", "#dde2e9", "#1d5a9e"
+COLOURS = (
+    "#1d5a9e", "#c2410c", "#18794e", "#7c3aed", "#b45309", "#0e7490", "#be185d", "#4d7c0f",
+    "#475569", "#9f1239",
+)  # fmt: skip
+"""Of lines and marks that belong to one method."""
+LEGEND = {"fontsize": 8.5, "frameon": False, "labelcolor": INK}
 SALT = "emmc-rig"
+PNG_DPI = 160
 
 
 def sheet(
@@ -38,13 +49,47 @@ def sheet(
     return figure, axes
 
 
-def titled(axes: Axes, title: str) -> None:
-    """Give a panel its title."""
+def titled(axes: Axes, title: str, across: str = "") -> None:
+    """Give a panel its title, and its horizontal axis a label."""
     axes.set_title(title, loc="left", fontsize=10.5, color=INK, weight="bold")
+    if across:
+        axes.set_xlabel(across, color=FAINT, fontsize=9)
+
+
+def plain_log_ticks(axes: Axes, which: str) -> None:
+    """Label the ticks of a logarithmic axis, "x" or "y", as 1, 2, 5, 10, ... without powers."""
+    axis = getattr(axes, f"{which}axis")
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def legend_below(figure: Figure, lines: Iterable[Any], names: Iterable[str], columns: int) -> None:
+    """Put a legend of all panels below them, in as many columns as fit."""
+    columns = max(1, min(columns, int(figure.get_figwidth() / 2)))
+    figure.legend(list(lines), list(names), loc="outside lower center", ncols=columns, **LEGEND)
+
+
+def colours_of(methods: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each method, in the order in which they are first met."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(dict.fromkeys(methods))}
+
+
+def svg_of(figure: Figure) -> bytes:
+    """Return a figure as SVG without date and random names."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": SALT}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
 
 
 def save_svg(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG without date and random names; return its path."""
-    with matplotlib.rc_context({"svg.hashsalt": SALT}):
-        figure.savefig(path, format="svg", metadata={"Date": None})
+    path.write_bytes(svg_of(figure))
     return path
+
+
+def save_drawing(figure: Figure, path: Path) -> Path:
+    """Write a figure as SVG, and as PNG beside it; return the path of the SVG."""
+    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
+    return save_svg(figure, path)

@@ -1,29 +1,73 @@
-"""One HTML file that opens offline: the frame, style and small parts that all our pages share."""
+"""One HTML file that opens offline: the templates of all pages, and how they are filled in."""
 
 from __future__ import annotations
 
 import base64
-import html
-import re
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
+from xml.etree import ElementTree
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from emmc_rig.version import __version__
 
-CAVEATS = '<aside class="warnings" aria-label="How to read this"><h2>How to read this</h2>'
-KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".webp": "image/webp"}
+KINDS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".svg": "image/svg+xml",
+    ".webp": "image/webp",
+}
+TEMPLATES = PackageLoader("emmc_rig.pages")
+SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 
 @dataclass(frozen=True)
 class Section:
-    """key: its anchor. short: in the navigation. title: its heading. body: HTML."""
+    """key: its anchor. title: its heading. body: HTML. short: in the navigation, if not title."""
 
     key: str
-    short: str
     title: str
     body: str
+    short: str = ""
+
+
+@dataclass(frozen=True)
+class Card:
+    """A figure in a frame. tone: good, watch, bad, or "" for a plain one."""
+
+    label: str
+    value: str
+    note: str
+    tone: str = ""
+
+
+def number(value: float | None, form: str) -> str:
+    """Return a number by its format, a dash for None and for what is not finite."""
+    return "–" if value is None or not math.isfinite(value) else format(value, form)
+
+
+def source(name: str) -> Markup:
+    """Return a style sheet or a script as it is."""
+    return Markup(TEMPLATES.get_source(ENVIRONMENT, name)[0])
+
+
+ENVIRONMENT = Environment(
+    loader=TEMPLATES,
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+ENVIRONMENT.filters["number"] = number
+ENVIRONMENT.globals.update(source=source, generator=f"emmc-rig {__version__}")
+
+
+def fragment(template: str, **values: object) -> Markup:
+    """Return a template filled in; text is escaped unless it is Markup."""
+    return Markup(ENVIRONMENT.get_template(template).render(**values).lstrip())
 
 
 def framed(
@@ -31,62 +75,56 @@ def framed(
     about: Sequence[str],
     caveats: Sequence[str],
     sections: Sequence[Section],
-    style: str = "",
-    script: str = "",
+    styles: Sequence[str] = (),
+    scripts: Sequence[str] = (),
+    data: Mapping[str, object] | None = None,
     lead: str = "",
 ) -> str:
-    """Return the page. about: sentences under the title. caveats: how to read it.
+    """Return a page of sections.
 
-    style, script: what only this page needs, as CSS and JavaScript. lead: HTML before the sections.
+    about: sentences under the title. caveats: how to read it. styles, scripts: files beside the
+    templates that only this page needs; data: what the scripts read, by the name of its element.
+    lead: HTML before the sections.
     """
-    warnings = "".join(f"<li>{text(line)}</li>" for line in caveats)
-    if warnings:
-        lead = f"{CAVEATS}<ul>{warnings}</ul></aside>{lead}"
-    report = resources.files("emmc_rig.pages").joinpath("report.html").read_text("utf-8")
-    template = resources.files("emmc_rig.pages").joinpath("page.html").read_text("utf-8")
-    common = re.search(r"<style>(.*?)</style>", report, re.DOTALL)
-    assert common is not None
-    parts = {
-        "title": text(title),
-        "generator": text(f"emmc-rig {__version__}"),
-        "style": re.sub(r"\{\{\w+\}\}", "", common[1]),
-        "own_style": style,
-        "about": "".join(f"<p>{text(line)}</p>" for line in about),
-        "lead": lead,
-        "scripts": "; script-src 'unsafe-inline'" if script else "",
-        "navigation": "".join(
-            f'<li><a href="#{part.key}">{text(part.short)}</a></li>' for part in sections
-        ),
-        "sections": "".join(
-            f'<section id="{part.key}"><h2>{text(part.title)}</h2>{part.body}</section>'
-            for part in sections
-        ),
-        "script": f"<script>{script}</script>" if script else "",
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    return fragment(
+        "page.html", title=title, about=about, caveats=caveats, sections=sections, styles=styles,
+        scripts=scripts, data=data or {}, lead=lead,
+    )  # fmt: skip
 
 
-def text(value: object) -> str:
-    """Return a value as HTML text, safe in attributes too."""
-    return html.escape(str(value), quote=True)
+def provenance_section(provenance: Mapping[str, object]) -> Section:
+    """Return where everything came from."""
+    body = fragment("provenance.html", rows=provenance)
+    return Section("provenance", "Provenance", body)
 
 
-def table_head(names: Sequence[str]) -> str:
-    """Return the head of a table."""
-    cells = "".join(f'<th scope="col">{text(name)}</th>' for name in names)
-    return f"<thead><tr>{cells}</tr></thead>"
+def data_address(data: bytes, kind: str) -> str:
+    """Return bytes as an address that holds them. kind: the ending of a file of such."""
+    return f"data:{KINDS[kind]};base64,{base64.b64encode(data).decode()}"
 
 
 def embedded(path: Path) -> str:
     """Return a picture as a data address."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f"data:{KINDS[path.suffix]};base64,{data}"
+    return data_address(path.read_bytes(), path.suffix)
 
 
-def provenance_table(provenance: dict[str, str]) -> str:
-    """Return where everything came from, as a table."""
-    rows = "".join(
-        f'<tr><th scope="row">{text(key)}</th><td><code>{text(value)}</code></td></tr>'
-        for key, value in provenance.items()
-    )
-    return f'<table class="narrow"><tbody>{rows}</tbody></table>'
+def inline_svg(path: Path, key: str) -> Markup:
+    """Return a drawing as part of a page, where a script can reach its marks.
+
+    Names are put behind the key: on one page no drawing may refer to what is in another. Those of
+    marks, which begin with "mark-", stay as they are.
+    """
+    ElementTree.register_namespace("", SVG)
+    ElementTree.register_namespace("xlink", XLINK)
+    drawing = ElementTree.parse(path).getroot()
+    for element in drawing.iter():
+        for name, value in element.items():
+            if name == "id" and not value.startswith("mark-"):
+                element.set(name, f"{key}-{value}")
+            elif name in ("href", f"{{{XLINK}}}href") and value.startswith("#"):
+                element.set(name, f"#{key}-{value[1:]}")
+            elif "url(#" in value:
+                element.set(name, value.replace("url(#", f"url(#{key}-"))
+    for metadata in drawing.findall(f"{{{SVG}}}metadata"):
+        drawing.remove(metadata)
+    return Markup(ElementTree.tostring(drawing, encoding="unicode"))

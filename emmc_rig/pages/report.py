@@ -1,39 +1,37 @@
 """One self-contained HTML page from the outcome of a run; it opens offline and asks for nothing."""
 
-import base64
-import html
+from __future__ import annotations
+
 import itertools
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
-import cv2
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from emmc_rig.model.files import write_text
-from emmc_rig.version import __version__
+from emmc_rig.pages.display import (
+    HEAT,
+    JPEG_QUALITY,
+    TILE_MULTIPLE_PX,
+    DisplayCurve,
+    finite,
+    png_of,
+    reduced,
+    round_up,
+    sprite,
+    three_colours,
+)
+from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
+from emmc_rig.pages.page import Card, data_address, fragment
+from emmc_rig.pages.psi_panels import psi_panels
 
 Array = NDArray[np.floating]
-
-JPEG_QUALITY = 88
 ERROR_JPEG_QUALITY = 72  # an error map is mostly noise, and noise is what costs bytes
-TILE_MULTIPLE_PX = 16  # a JPEG block never straddles two views
-SPRITE_PIXELS = 24_000_000  # canvases above this fail on small machines; larger views are reduced
-DETAIL_PX = 40  # side of the piece of a Psi slice shown pixel for pixel
-THUMBNAIL_PX = 120  # side of a whole Psi slice
-HEAT = (
-    (13, 16, 38),
-    (62, 46, 128),
-    (160, 56, 132),
-    (234, 104, 80),
-    (250, 206, 104),
-    (255, 252, 232),
-)
 
 
 @dataclass(frozen=True)
@@ -93,55 +91,44 @@ def write_report(path: str | Path, content: ReportContent) -> None:
 
 
 def render(content: ReportContent) -> str:
-    """The page as text."""
-    template = resources.files("emmc_rig.pages").joinpath("report.html").read_text("utf-8")
+    """Return the page as text."""
     curve = DisplayCurve.fitted_to(content.estimate if content.truth is None else content.truth)
     errors = None if content.truth is None else Errors.between(content.estimate, content.truth)
-    parts = {
-        "title": text_of(content.title),
-        "generator": text_of(f"emmc-rig {__version__}"),
-        "scene": text_of(content.scene),
-        "camera": text_of(content.camera),
-        "camera_line": text_of(content.camera_line),
-        "camera_reference": text_of(content.camera_reference),
-        "warnings": _warnings(content),
-        "cards": _cards(content),
-        "capture_note": _capture_note(content),
-        "display_note": _display_note(content, curve),
-        "has_truth": "yes" if content.truth is not None else "no",
-        "view_psnr": "" if errors is None else _view_psnr(errors),
-        "error_figures": "" if errors is None else _error_figures(errors),
-        "psi": _psi(content),
-        "convergence": _convergence(content.objective),
-        "timings": _timings(content.stage_s),
-        "metrics": _metrics_table(content.metrics),
-        "provenance": _provenance(content),
-        "heat": ", ".join(f"rgb{stop}" for stop in HEAT),
-        "data": _page_data(content, curve, errors),
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-
-
-@dataclass(frozen=True)
-class DisplayCurve:
-    """How linear values become screen values: (gain x value) ^ (1 / gamma), 8 bits."""
-
-    gain: float
-    gamma: float
-
-    @classmethod
-    def fitted_to(cls, picture: Array) -> "DisplayCurve":
-        """Highlights at white, and the median of a dark scene lifted towards middle grey."""
-        sample = _finite(picture.reshape(-1)[::7])
-        white = max(float(np.percentile(sample, 99.7)), 1e-6)
-        median = min(max(float(np.median(sample)) / white, 1e-3), 0.99)
-        return cls(1 / white, min(max(math.log(median) / math.log(0.36), 1.0), 2.2))
-
-    def encode(self, linear: Array) -> NDArray[np.uint8]:
-        """Screen values of linear ones, any shape."""
-        levels = np.clip(_finite(linear) * np.float32(self.gain), 0, 1)
-        np.power(levels, np.float32(1 / self.gamma), out=levels)
-        return (levels * 255 + 0.5).astype(np.uint8)
+    rows, columns, height, width, _ = content.estimate.shape
+    shown = reduced(content.estimate)
+    frames = finite(content.frames)
+    return fragment(
+        "report.html",
+        title=content.title,
+        content=content,
+        caveats=(),
+        lead="",
+        styles=(),
+        heat=HEAT,
+        warnings=_warnings(content),
+        cards=_cards(content),
+        capture={
+            "shots": frames.shape[0],
+            "height": frames.shape[1],
+            "width": frames.shape[2],
+            "least": frames.min(),
+            "mean": frames.mean(),
+            "greatest": frames.max(),
+        },
+        views={"rows": rows, "columns": columns, "height": height, "width": width},
+        shown={"height": shown.shape[2], "width": shown.shape[3]},
+        curve=curve,
+        quality=JPEG_QUALITY,
+        view_psnr=[] if errors is None else _view_psnr(errors),
+        error_figures={} if errors is None else _error_figures(errors),
+        psi=None if content.psi is None else psi_panels(content.psi, content.psi_std),
+        convergence=_convergence(content.objective),
+        timings=_timings(content.stage_s),
+        figures=_figures(content.metrics),
+        provenance=_provenance(content),
+        data={"data": _page_data(content, shown, curve, errors)},
+        scripts=("report.js",),
+    )
 
 
 @dataclass(frozen=True)
@@ -152,9 +139,9 @@ class Errors:
     squared: Array
 
     @classmethod
-    def between(cls, estimate: Array, truth: Array) -> "Errors":
+    def between(cls, estimate: Array, truth: Array) -> Errors:
         """Errors of an estimate; values that are not finite count as 0, or 1 for +infinity."""
-        difference = _finite(estimate) - _finite(truth)
+        difference = finite(estimate) - finite(truth)
         return cls(np.abs(difference).mean(axis=-1), np.square(difference).mean(axis=-1))
 
 
@@ -163,87 +150,10 @@ def _expect_axes(name: str, array: Array, axes: str) -> None:
         raise ValueError(f"{name} has shape {array.shape}; expected axes ({axes})")
 
 
-def _finite(values: Array) -> NDArray[np.float32]:
-    values = np.asarray(values, np.float32)
-    if np.isfinite(values.sum(dtype=np.float64)):  # cheaper than asking every value
-        return values
-    return np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0)
-
-
-def text_of(value: object) -> str:
-    """Text for the page, escaped."""
-    return html.escape(str(value), quote=True)
-
-
-# Pictures
-
-
-def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
-    done, encoded = cv2.imencode(extension, image, options)
-    if not done:
-        raise ValueError(f"cannot encode a picture of shape {image.shape} as {extension}")
-    kind = {".jpg": "image/jpeg", ".png": "image/png"}[extension]
-    return f"data:{kind};base64,{base64.b64encode(encoded.tobytes()).decode()}"
-
-
-def png_of(image: NDArray[np.uint8]) -> str:
-    """A lossless picture as an address that holds it."""
-    return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
-
-
-def _sprite(views: NDArray[np.uint8], quality: int) -> str:
-    """All views of (v, u, y, x, c) in one JPEG, each padded to whole JPEG blocks.
-
-    Colour is kept at full resolution: half-resolution chroma bleeds from view to view.
-    """
-    rows, columns, height, width, colours = views.shape
-    padding = [(0, -height % TILE_MULTIPLE_PX), (0, -width % TILE_MULTIPLE_PX)]
-    padded = np.pad(views, [(0, 0), (0, 0), *padding, (0, 0)], mode="edge")
-    tiled = padded.transpose(0, 2, 1, 3, 4).reshape(
-        rows * padded.shape[2], columns * padded.shape[3], colours
-    )
-    if colours == 3:
-        tiled = np.ascontiguousarray(tiled[..., ::-1])  # OpenCV's channel order
-    return _data_uri(
-        tiled,
-        ".jpg",
-        cv2.IMWRITE_JPEG_QUALITY,
-        quality,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-    )
-
-
-def _reduced(views: Array) -> Array:
-    """Views small enough for one sprite; the same array when they already are."""
-    rows, columns, height, width, colours = views.shape
-    shrink = math.sqrt(SPRITE_PIXELS / (rows * columns * height * width))
-    if shrink >= 1:
-        return views
-    size = (max(1, int(width * shrink)), max(1, int(height * shrink)))
-    small = [
-        cv2.resize(_finite(view), size, interpolation=cv2.INTER_AREA)
-        for view in views.reshape(-1, height, width, colours)
-    ]
-    shape = (rows, columns, size[1], size[0], colours)
-    return np.asarray(small, np.float32).reshape(shape)
-
-
-def _three_colours(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.repeat(views, 3, axis=-1) if views.shape[-1] == 1 else views
-
-
-def _round_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 5, 7 times a power of ten: a readable end of a scale."""
-    if not math.isfinite(value) or value <= 0:
-        return 1.0
-    decade = 10.0 ** math.floor(math.log10(value))
-    end = next(step * decade for step in (1, 1.5, 2, 3, 5, 7, 10) if step * decade >= value)
-    return float(f"{end:.2g}")  # 0.15, not 0.15000000000000002
-
-
-def _page_data(content: ReportContent, curve: DisplayCurve, errors: "Errors | None") -> str:
-    estimate = _reduced(content.estimate)
+def _page_data(
+    content: ReportContent, estimate: Array, curve: DisplayCurve, errors: Errors | None
+) -> dict[str, object]:
+    """Return what report.js draws; estimate: the views, small enough for one picture."""
     rows, columns, height, width, _ = estimate.shape
     shots_curve = DisplayCurve.fitted_to(content.frames)  # one for all, so that shots compare
     data = {
@@ -253,7 +163,7 @@ def _page_data(content: ReportContent, curve: DisplayCurve, errors: "Errors | No
         "gamma": curve.gamma,
         "disparity": _slider_range(content.disparity_range_px),
         "heat": HEAT,
-        "estimate": _sprite(_three_colours(curve.encode(estimate)), JPEG_QUALITY),
+        "estimate": sprite(three_colours(curve.encode(estimate)), JPEG_QUALITY),
         "truth": None,
         "error": None,
         "shots": [
@@ -266,20 +176,20 @@ def _page_data(content: ReportContent, curve: DisplayCurve, errors: "Errors | No
         "cfaTile": None if content.cfa_tile is None else _cfa_colours(content.cfa_tile),
     }
     if content.truth is not None and errors is not None:
-        truth = _reduced(content.truth)
-        data["truth"] = _sprite(_three_colours(curve.encode(truth)), JPEG_QUALITY)
+        truth = reduced(content.truth)
+        data["truth"] = sprite(three_colours(curve.encode(truth)), JPEG_QUALITY)
         data["error"] = _error_data(errors)
-    return json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+    return data
 
 
-def _error_data(errors: "Errors") -> dict[str, object]:
+def _error_data(errors: Errors) -> dict[str, object]:
     """Pictures of the error per view, and averaged over views, on one scale."""
-    views = _reduced(errors.absolute[..., None])
-    scale = _round_up(float(np.percentile(views, 99.5)))
+    views = reduced(errors.absolute[..., None])
+    scale = round_up(float(np.percentile(views, 99.5)))
     encode = DisplayCurve(1 / scale, 1.0).encode
     return {
         "scale": scale,
-        "views": _sprite(encode(views), ERROR_JPEG_QUALITY),
+        "views": sprite(encode(views), ERROR_JPEG_QUALITY),
         "mean": png_of(encode(views[..., 0].mean(axis=(0, 1)))),
     }
 
@@ -295,7 +205,7 @@ def _frame(label: str, frame: Array, curve: DisplayCurve) -> dict[str, object]:
 
 
 def _cfa_colours(tile: Array) -> list[object]:
-    rgb = _finite(tile)
+    rgb = finite(tile)
     brightest = np.maximum(rgb.max(axis=-1, keepdims=True), 1e-6)
     return (rgb / brightest).round(3).tolist()
 
@@ -309,17 +219,13 @@ def _slider_range(disparity_px: tuple[float, float] | None) -> list[float]:
     return [round(low - margin, 2), round(high + margin, 2)]
 
 
-# Figures as text
-
-
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """How one metric is written: label, format, unit, and what it means."""
 
     label: str
-    format: str
-    unit: str
-    meaning: str
+    format: str = ""
+    unit: str = ""
+    meaning: str = ""
 
 
 FIGURES = {
@@ -395,16 +301,7 @@ def _written(value: object, spec: str = "", unit: str = "") -> str:
     return f"{text or value} {unit}".rstrip()
 
 
-def card(label: str, value: str, note: str, tone: str = "") -> str:
-    """A figure in a frame: good, watch, bad or plain."""
-    words = "" if any(letter.isdigit() for letter in value) else "words"
-    return (
-        f'<div class="card {words} {tone}"><h3>{text_of(label)}</h3>'
-        f'<p class="value">{text_of(value)}</p><p class="note">{text_of(note)}</p></div>'
-    )
-
-
-def _cards(content: ReportContent) -> str:
+def _cards(content: ReportContent) -> list[Card]:
     metrics = content.metrics
     compared = content.truth is not None
     no_truth = "" if compared else "no true light field to compare with"
@@ -412,60 +309,58 @@ def _cards(content: ReportContent) -> str:
     exact, cost = metrics.get("exact_psi_psnr_db"), metrics.get("calibration_cost_db")
     if psnr is not None and replicate is not None:
         gain = psnr - replicate
-        versus = card(
+        versus = Card(
             "Over centre view",
             f"{gain:+.2f} dB",
             f"copying the true centre view gives {replicate:.2f} dB",
             "good" if gain > 0 else "bad",
         )
     else:
-        versus = card("Over centre view", "not measured", no_truth)
+        versus = Card("Over centre view", "not measured", no_truth)
     psi_error = _number(metrics.get("psi_relative_error"))
     known_psi = "not measured" if psi_error is None else f"{100 * psi_error:.2f} %"
     status = str(metrics.get("status") or "not measured")
     total_s = sum(seconds for seconds in content.stage_s.values() if math.isfinite(seconds))
     stages = {name: s for name, s in content.stage_s.items() if math.isfinite(s)}
     longest = max(stages, key=lambda name: stages[name], default=None)
-    return "".join(
-        (
-            card(
-                "PSNR",
-                _written(metrics.get("psnr_db"), ".2f", "dB"),
-                "peak 1, all views, pixels and colours" if compared else no_truth,
-            ),
-            versus,
-            card("SSIM", _written(metrics.get("ssim"), ".4f"), "1 is identical"),
-            card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
-            card(
-                "Calibration costs",
-                _written(cost, "z.2f", "dB"),
-                f"with the exact Psi: {_written(exact, '.2f', 'dB')}"
-                if _number(exact) is not None
-                else "needs a run with the exact Psi",
-            ),
-            card(
-                "Time",
-                f"{total_s:.1f} s" if stages else "not measured",
-                "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
-            ),
-            _verdict_card(metrics.get("verdict")),
-            card(
-                "Solver",
-                status,
-                str(metrics.get("advice") or metrics.get("method") or ""),
-                "good" if status.startswith("converged") else "watch",
-            ),
-        )
-    )
+    return [
+        Card(
+            "PSNR",
+            _written(metrics.get("psnr_db"), ".2f", "dB"),
+            "peak 1, all views, pixels and colours" if compared else no_truth,
+        ),
+        versus,
+        Card("SSIM", _written(metrics.get("ssim"), ".4f"), "1 is identical"),
+        Card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
+        Card(
+            "Calibration costs",
+            _written(cost, "z.2f", "dB"),
+            f"with the exact Psi: {_written(exact, '.2f', 'dB')}"
+            if _number(exact) is not None
+            else "needs a run with the exact Psi",
+        ),
+        Card(
+            "Time",
+            f"{total_s:.1f} s" if stages else "not measured",
+            "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
+        ),
+        _verdict_card(metrics.get("verdict")),
+        Card(
+            "Solver",
+            status,
+            str(metrics.get("advice") or metrics.get("method") or ""),
+            "good" if status.startswith("converged") else "watch",
+        ),
+    ]
 
 
-def _verdict_card(verdict: object) -> str:
+def _verdict_card(verdict: object) -> Card:
     """Return whether to trust the light field, with the gravest reason."""
     if not isinstance(verdict, dict):
-        return card("Verdict", "not judged", "")
+        return Card("Verdict", "not judged", "")
     told = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
     level = verdict["level"]
-    return card(
+    return Card(
         "Verdict",
         level,
         told[0] if told else "nothing in frames, Psi and light field speaks against it",
@@ -473,295 +368,112 @@ def _verdict_card(verdict: object) -> str:
     )
 
 
-def _warnings(content: ReportContent) -> str:
+def _warnings(content: ReportContent) -> list[str]:
     warnings = list(content.warnings)
     broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
     if broken:
         warnings.append(f"The estimate holds {broken} values that are not finite; drawn black.")
-    if not warnings:
-        return ""
-    items = "".join(f"<li>{text_of(warning)}</li>" for warning in warnings)
-    return (
-        f'<aside class="warnings" aria-label="Warnings"><h2>Warnings</h2><ul>{items}</ul></aside>'
-    )
+    return warnings
 
 
-def _capture_note(content: ReportContent) -> str:
-    shots, height, width = content.frames.shape
-    values = _finite(content.frames)
-    plural = "shot" if shots == 1 else "shots"
-    return (
-        f"{shots} {plural} of {width} × {height} pixels, colour filter {text_of(content.cfa)}. "
-        f"Normalised values: least {values.min():.3f}, mean {values.mean():.3f}, "
-        f"greatest {values.max():.3f} (1 is an open camera before a white scene)."
-    )
-
-
-def _display_note(content: ReportContent, curve: DisplayCurve) -> str:
-    rows, columns, height, width, _ = content.estimate.shape
-    shown = _reduced(content.estimate).shape
-    small = "" if shown[3] == width else f" Shown at {shown[3]} × {shown[2]} pixels."
-    brightness = f"{curve.gain:.2f} × linear value"
-    if curve.gamma > 1:
-        brightness = f"({brightness})<sup>1/{curve.gamma:.2f}</sup>"
-    return (
-        f"{rows} × {columns} views of {width} × {height} pixels.{small} "
-        f"Screen value = {brightness}, "
-        f"the same for both sides; pictures are JPEG at quality {JPEG_QUALITY}. "
-        "Every figure is computed on the linear values, not on these pictures."
-    )
-
-
-def _view_psnr(errors: Errors) -> str:
-    """PSNR of each view as a grid of buttons that choose the view."""
+def _view_psnr(errors: Errors) -> list[dict[str, object]]:
+    """Return the PSNR of each view, and how light its button is."""
     with np.errstate(divide="ignore"):
         psnr_db = -10 * np.log10(errors.squared.mean(axis=(2, 3)))
-    finite = psnr_db[np.isfinite(psnr_db)]
-    low, span = (float(finite.min()), float(np.ptp(finite))) if finite.size else (0.0, 0.0)
-    buttons = []
+    known = psnr_db[np.isfinite(psnr_db)]
+    low, span = (float(known.min()), float(np.ptp(known))) if known.size else (0.0, 0.0)
+    views = []
     for (v, u), value in np.ndenumerate(psnr_db):
         share = 1.0 if not math.isfinite(value) else (value - low) / span if span > 0 else 0.5
-        shade = f"background:hsl(212 60% {96 - 26 * share:.0f}%)"
-        figure = f"{value:.1f}" if math.isfinite(value) else "exact"
-        buttons.append(
-            f'<button type="button" data-v="{v}" data-u="{u}" style="{shade}" '
-            f'aria-label="View row {v}, column {u}: {figure} dB">{figure}</button>'
-        )
-    return "".join(buttons)
+        words = f"{value:.1f}" if math.isfinite(value) else "exact"
+        views.append({"v": v, "u": u, "words": words, "lightness": f"{96 - 26 * share:.0f}"})
+    return views
 
 
-def _error_figures(errors: Errors) -> str:
-    """How the error is spread, as the rows of a table."""
+def _error_figures(errors: Errors) -> dict[str, str]:
+    """Return how the error is spread."""
     squared = errors.squared.reshape(-1)
     worst = max(1, squared.size // 20)
     worst_sum = float(np.partition(squared, -worst)[-worst:].sum(dtype=np.float64))
     total = float(squared.sum(dtype=np.float64))
     mean = float(errors.absolute.mean(dtype=np.float64))
     median, high, highest = np.percentile(errors.absolute, [50, 95, 99])
-    rows = (
-        ("Mean", f"{mean:.4f}"),
-        ("Median", f"{median:.4f}"),
-        ("95 % of pixels below", f"{high:.4f}"),
-        ("99 % of pixels below", f"{highest:.4f}"),
-        (
-            "Squared error in the worst 5 % of pixels",
-            f"{100 * worst_sum / total:.0f} %" if total > 0 else "no error",
+    return {
+        "Mean": f"{mean:.4f}",
+        "Median": f"{median:.4f}",
+        "95 % of pixels below": f"{high:.4f}",
+        "99 % of pixels below": f"{highest:.4f}",
+        "Squared error in the worst 5 % of pixels": (
+            f"{100 * worst_sum / total:.0f} %" if total > 0 else "no error"
         ),
-    )
-    return "".join(f'<tr><th scope="row">{name}</th><td>{value}</td></tr>' for name, value in rows)
+    }
 
 
-# Psi
+class Curve(NamedTuple):
+    """A line over the solver's steps: what it is, its ends in words, its picture's address."""
+
+    name: str
+    ends: str
+    picture: str
 
 
-def _montage(tiles: NDArray[np.uint8], gap_px: int) -> NDArray[np.uint8]:
-    """(v, u, y, x) or (v, u, y, x, c) as one picture with white gaps."""
-    around = [(0, 0)] * tiles.ndim
-    around[2] = around[3] = (0, gap_px)
-    padded = np.pad(tiles, around, constant_values=255)
-    order = (0, 2, 1, 3, *range(4, tiles.ndim))
-    rows, columns, height, width = padded.shape[:4]
-    sheet = padded.transpose(order).reshape(rows * height, columns * width, *tiles.shape[4:])
-    return np.ascontiguousarray(sheet[:-gap_px, :-gap_px])
-
-
-def _heat(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey levels through the heat colours, in OpenCV's channel order."""
-    at = np.linspace(0, 255, len(HEAT))
-    table = [np.interp(np.arange(256), at, channel) for channel in zip(*HEAT, strict=True)]
-    return np.stack(table[::-1], axis=-1).round().astype(np.uint8)[levels]
-
-
-def _centre(slices: Array) -> Array:
-    height, width = slices.shape[2:]
-    top, left = max((height - DETAIL_PX) // 2, 0), max((width - DETAIL_PX) // 2, 0)
-    return slices[:, :, top : top + DETAIL_PX, left : left + DETAIL_PX]
-
-
-def _thumbnails(slices: Array) -> Array:
-    rows, columns, height, width = slices.shape
-    shrink = min(1.0, THUMBNAIL_PX / max(height, width))
-    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-    small = [
-        cv2.resize(_finite(one), size, interpolation=cv2.INTER_AREA)
-        for one in slices.reshape(-1, height, width)
-    ]
-    return np.asarray(small, np.float32).reshape(rows, columns, size[1], size[0])
-
-
-def _psi_panel(name: str, note: str, picture: str, scale: float, ramp: str) -> str:
-    return (
-        f"<figure><figcaption><strong>{text_of(name)}</strong> {text_of(note)}</figcaption>"
-        f'<img class="pixels" src="{picture}" alt="{text_of(name)}: {text_of(note)}">'
-        f'<div class="bar"><span>0</span><i class="{ramp}"></i><span>{scale:.3g}</span></div>'
-        "</figure>"
-    )
-
-
-def _psi(content: ReportContent) -> str:
-    if content.psi is None:
-        return '<p class="quiet">No imaging matrix was handed to this report.</p>'
-    return psi_panels(content.psi, content.psi_std)
-
-
-def psi_panels(psi: Array, psi_std: Array | None) -> str:
-    """Slices of Psi, and of its standard deviation, both (v, u, y, x), as figures of a page."""
-    rows, columns = psi.shape[:2]
-    layout = f"rows are v 0 to {rows - 1} downwards, columns u 0 to {columns - 1}"
-    whole = _thumbnails(psi)
-    whole_scale = _round_up(float(np.percentile(whole, 99.9)))
-    piece = _finite(_centre(psi))
-    piece_scale = _round_up(float(np.percentile(piece, 99.9)))
-    side = f"{piece.shape[3]} × {piece.shape[2]}"
-    panels = [
-        _psi_panel(
-            "Whole field",
-            f"one tile per view, averaged down; {layout}",
-            png_of(_montage(DisplayCurve(1 / whole_scale, 1.0).encode(whole), 3)),
-            whole_scale,
-            "grey",
-        ),
-        _psi_panel(
-            "Centre, pixel for pixel",
-            f"the middle {side} pixels of each view's weights",
-            png_of(_montage(DisplayCurve(1 / piece_scale, 1.0).encode(piece), 2)),
-            piece_scale,
-            "grey",
-        ),
-    ]
-    if psi_std is not None:
-        std = _finite(_centre(psi_std))
-        std_scale = _round_up(float(np.percentile(std, 99.9)))
-        typical = float(np.median(_finite(psi_std)))
-        panels.append(
-            _psi_panel(
-                "Its standard deviation",
-                f"same pixels; median over all coefficients {typical:.2g}",
-                png_of(_montage(_heat(DisplayCurve(1 / std_scale, 1.0).encode(std)), 2)),
-                std_scale,
-                "heat",
-            )
-        )
-    return f'<div class="psi">{"".join(panels)}</div>'
-
-
-# Charts
-
-
-def _ticks(low: float, high: float, about: int) -> list[float]:
-    if high <= low:
-        return [low]
-    raw = (high - low) / about
-    decade = 10.0 ** math.floor(math.log10(raw))
-    step = next(s * decade for s in (1, 2, 2.5, 5, 10) if s * decade >= raw * 0.999)
-    first = math.ceil(low / step - 1e-9)
-    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
-
-
-def _log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten between, thinned to at most seven."""
-    powers = list(range(math.ceil(low - 1e-9), math.floor(high + 1e-9) + 1))
-    return [float(power) for power in powers[:: max(1, math.ceil(len(powers) / 7))]]
-
-
-def _curve_chart(name: str, first_step: int, values: Sequence[float], logarithmic: bool) -> str:
-    """A line over the solver's steps as inline SVG; values that cannot be drawn are left out."""
+def _curve(name: str, first_step: int, values: Sequence[float], logarithmic: bool) -> list[Curve]:
+    """Return a line; values that cannot be drawn are left out, and none is where few can."""
     points = [
-        (first_step + i, math.log10(value) if logarithmic else value)
+        (first_step + i, value)
         for i, value in enumerate(values)
         if math.isfinite(value) and (value > 0 or not logarithmic)
     ]
     if len(points) < 2:
-        return ""
-    width, height, left, right, top, bottom = 620, 270, 74, 14, 14, 44
-    steps, levels = [p[0] for p in points], [p[1] for p in points]
-    low, high = min(levels), max(levels)
-    span = (high - low) or max(abs(high), 1.0) * 0.1
-    low, high = low - 0.05 * span, high + 0.05 * span
-    last_step = max(steps[-1], steps[0] + 1)
-
-    def across(step: float) -> float:
-        return left + (step - steps[0]) / (last_step - steps[0]) * (width - left - right)
-
-    def up(level: float) -> float:
-        return top + (high - level) / (high - low) * (height - top - bottom)
-
-    marks = _log_ticks(low, high) if logarithmic else _ticks(low, high, 5)
-    if logarithmic and len(marks) < 2:
-        marks = _ticks(low, high, 4)
-    grid = []
-    for mark in marks:
-        text = f"{10**mark:.3g}" if logarithmic else f"{mark:.6g}"
-        grid.append(
-            f'<line class="grid" x1="{left}" x2="{width - right}" y1="{up(mark):.1f}" '
-            f'y2="{up(mark):.1f}"/><text x="{left - 8}" y="{up(mark) + 4:.1f}" '
-            f'text-anchor="end">{text}</text>'
-        )
-    for mark in _ticks(steps[0], last_step, 6):
-        if mark == int(mark):
-            grid.append(
-                f'<text x="{across(mark):.1f}" y="{height - bottom + 20}" '
-                f'text-anchor="middle">{int(mark)}</text>'
-            )
-    path = " ".join(f"{across(step):.1f},{up(level):.1f}" for step, level in points)
+        return []
+    figure, (axes,) = sheet(1, 6.2, 2.7, "")
+    axes.plot(*zip(*points, strict=True), color=ACCENT, linewidth=2)
+    if logarithmic:
+        axes.set_yscale("log")
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    titled(axes, "", "recorded step")
     ends = f"{values[0]:.4g} to {values[-1]:.4g} over {len(values)} values"
-    return (
-        f"<figure><figcaption><strong>{text_of(name)}</strong> {text_of(ends)}</figcaption>"
-        f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" '
-        f'aria-label="{text_of(name)}, {text_of(ends)}">{"".join(grid)}'
-        f'<line class="axis" x1="{left}" x2="{width - right}" y1="{height - bottom}" '
-        f'y2="{height - bottom}"/><polyline class="curve" points="{path}"/>'
-        f'<text x="{(left + width - right) / 2}" y="{height - 6}" '
-        f'text-anchor="middle">recorded step</text></svg></figure>'
-    )
+    return [Curve(name, ends, data_address(svg_of(figure), ".svg"))]
 
 
-def _convergence(objective: Sequence[float]) -> str:
+def _convergence(objective: Sequence[float]) -> list[Curve]:
     values = [float(value) for value in objective]
     drawable = [value for value in values if math.isfinite(value)]
     if len(drawable) < 2:
-        return '<p class="quiet">The solver recorded fewer than two objective values.</p>'
+        return []
     wide = min(drawable) > 0 and max(drawable) / min(drawable) > 20
     scale = ", logarithmic" if wide else ""
     change = [
         abs(b - a) / abs(b) if math.isfinite(a) and math.isfinite(b) and b != 0 else math.nan
         for a, b in itertools.pairwise(values)
     ]
-    return (
-        '<div class="two">'
-        + _curve_chart(f"Objective{scale}:", 1, values, wide)
-        + _curve_chart("Relative change:", 2, change, True)
-        + "</div>"
-    )
+    return [
+        *_curve(f"Objective{scale}:", 1, values, wide),
+        *_curve("Relative change:", 2, change, True),
+    ]
 
 
-def _timings(stage_s: Mapping[str, float]) -> str:
-    stages = [(name, float(s)) for name, s in stage_s.items()]
-    if not stages:
-        return '<p class="quiet">No stage was timed.</p>'
-    total_s = sum(s for _, s in stages if math.isfinite(s))
-    longest_s = max((s for _, s in stages if math.isfinite(s)), default=0.0) or 1.0
-    left, room, row = 190, 560, 30
-    bars = []
-    for i, (name, s) in enumerate(stages):
-        middle = i * row + row / 2
-        length = room * s / longest_s if math.isfinite(s) and s > 0 else 0.0
-        share = f" ({100 * s / total_s:.0f} %)" if math.isfinite(s) and total_s > 0 else ""
-        figure = f"{s:.2f} s{share}" if math.isfinite(s) else "not a number"
-        bars.append(
-            f'<text x="{left - 12}" y="{middle + 4}" text-anchor="end">{text_of(name)}</text>'
-            f'<rect x="{left}" y="{middle - 9}" width="{max(length, 1.5):.1f}" height="18" rx="3"/>'
-            f'<text x="{left + max(length, 1.5) + 8:.1f}" y="{middle + 4}">{figure}</text>'
-        )
-    spoken = ", ".join(f"{name} {_written(s, '.2f', 's')}" for name, s in stages)
-    return (
-        f'<svg class="chart timings" viewBox="0 0 {left + room + 120} {row * len(stages)}" '
-        f'role="img" aria-label="Seconds per stage: {text_of(spoken)}">{"".join(bars)}</svg>'
-        f'<p class="quiet">{total_s:.2f} s in all.</p>'
-    )
-
-
-# Tables
+def _timings(stage_s: Mapping[str, float]) -> dict[str, object] | None:
+    """Return the seconds of each stage in words and drawn, and their sum; None without any."""
+    if not stage_s:
+        return None
+    stages = {name: float(s) if math.isfinite(s) else math.nan for name, s in stage_s.items()}
+    total_s = sum(s for s in stages.values() if not math.isnan(s))
+    figure, (axes,) = sheet(1, 10, 0.6 + 0.3 * len(stages), "")
+    bars = axes.barh(list(stages), np.nan_to_num(list(stages.values())), color=ACCENT)
+    labels = [
+        "not a number" if math.isnan(s) else f"{s:.2f} s ({s / max(total_s, 1e-12):.0%})"
+        for s in stages.values()
+    ]
+    axes.bar_label(bars, labels, padding=6, color=INK, fontsize=9)
+    axes.margins(x=0.15)
+    axes.invert_yaxis()
+    axes.grid(visible=False)
+    axes.set_xticks([])
+    axes.spines["bottom"].set_visible(False)
+    axes.tick_params(axis="y", colors=INK, length=0)
+    words = ", ".join(f"{name} {_written(s, '.2f', 's')}" for name, s in stages.items())
+    return {"words": words, "picture": data_address(svg_of(figure), ".svg"), "total_s": total_s}
 
 
 def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:
@@ -776,36 +488,27 @@ def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, ob
     return rows
 
 
-def _metrics_table(metrics: Mapping[str, object]) -> str:
+def _figures(metrics: Mapping[str, object]) -> list[dict[str, str]]:
+    """Return the rows of the table of metrics."""
     rows = []
     for key, value in _flat(metrics):
-        figure = FIGURES.get(key, Figure(key, "", "", ""))
-        written = text_of(_written(value, figure.format, figure.unit))
+        figure = FIGURES.get(key, Figure(key))
+        written = _written(value, figure.format, figure.unit)
         rows.append(
-            f'<tr><th scope="row">{text_of(figure.label)}</th><td class="figure">{written}</td>'
-            f"<td>{text_of(figure.meaning)}</td><td><code>{text_of(key)}</code></td></tr>"
+            {"key": key, "label": figure.label, "value": written, "meaning": figure.meaning}
         )
-    return (
-        '<table><thead><tr><th scope="col">Figure</th><th scope="col">Value</th>'
-        '<th scope="col">What it is</th><th scope="col">Name in metrics.json</th></tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table>"
-    )
+    return rows
 
 
-def _provenance(content: ReportContent) -> str:
+def _provenance(content: ReportContent) -> dict[str, object]:
     versions = content.metrics.get("versions")
-    rows: list[tuple[str, object]] = [
-        ("Command line", content.command or "not recorded"),
-        ("Seed", _written(content.metrics.get("seed"))),
-        ("Scene", content.scene),
-        ("Camera", f"{content.camera}: {content.camera_line}"),
-        ("Reference", content.camera_reference),
-        ("Colour filter", content.cfa),
-    ]
-    if isinstance(versions, Mapping):
-        rows += [(f"Version of {name}", version) for name, version in versions.items()]
-    body = "".join(
-        f'<tr><th scope="row">{text_of(name)}</th><td><code>{text_of(value)}</code></td></tr>'
-        for name, value in rows
-    )
-    return f'<table class="narrow"><tbody>{body}</tbody></table>'
+    named = versions if isinstance(versions, Mapping) else {}
+    return {
+        "Command line": content.command or "not recorded",
+        "Seed": _written(content.metrics.get("seed")),
+        "Scene": content.scene,
+        "Camera": f"{content.camera}: {content.camera_line}",
+        "Reference": content.camera_reference,
+        "Colour filter": content.cfa,
+        **{f"Version of {name}": version for name, version in named.items()},
+    }

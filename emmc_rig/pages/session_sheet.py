@@ -5,19 +5,27 @@ The page is one file that opens offline and asks for nothing.
 
 from __future__ import annotations
 
-import base64
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 
 import cv2
 
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import metrics_text, shown_bytes
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import shown_bytes, write_metrics
+from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import preview, thinned
-from emmc_rig.pages.page import Section, framed, provenance_table, table_head, text
+from emmc_rig.pages.page import (
+    Card,
+    Section,
+    data_address,
+    fragment,
+    framed,
+    provenance_section,
+)
 from emmc_rig.pages.timeline import (
     COLOURS,
     LEGEND,
@@ -31,8 +39,7 @@ from emmc_rig.session.decisions import decided_words, decisions, ended
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
-from emmc_rig.session.session import METRICS, Session
-from emmc_rig.session.storage import write_whole
+from emmc_rig.session.session import REPORT, Session
 from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
@@ -50,15 +57,12 @@ HEADINGS = {
 }
 
 
-def write_sheet(session: Session, path: Path, pictures: int = MOST_PICTURES) -> None:
-    """Write the page, and metrics.json beside it, each whole or not at all; raises AppError."""
-    page = sheet(session, pictures)
-    figures = metrics_text(session_metrics(session))
-    try:
-        write_whole(session.disk, path.with_name(METRICS), figures.encode())
-        write_whole(session.disk, path, page.encode())
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
+def write_sheet(session: Session, out: Path, pictures: int = MOST_PICTURES) -> None:
+    """Write report.html and metrics.json into the session, or another folder; raises AppError."""
+    own = Path(os.path.realpath(out)) == Path(os.path.realpath(session.folder))
+    with result_folder(out, "session sheet", belongs_to=session.folder, adds=own) as folder:
+        write_text(folder / REPORT, sheet(session, pictures))
+        write_metrics(folder, session_metrics(session))
 
 
 def quick_pictures(session: Session) -> int:
@@ -69,20 +73,24 @@ def quick_pictures(session: Session) -> int:
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
-    sections = [*_frames(session, pictures), ("timeline", "Timeline", _timeline(session))]
-    if decisions(session.journal.entries):
-        sections.append(("decisions", "Shots: what they gave, and which was next", _shots(session)))
-    sections.append(("events", "Events", _events(session)))
-    sections.append(("provenance", "Provenance", _provenance(session)))
-    style = resources.files("emmc_rig.pages").joinpath("session.css").read_text("utf-8")
-    return framed(
-        session.header["title"],
-        [_about(session)],
-        (),
-        [Section(key, name.partition(":")[0], name, body) for key, name, body in sections],
-        style,
-        lead=f'<div class="cards">{"".join(_cards(session))}</div>',
-    )
+    sections = [*_frames(session, pictures), Section("timeline", "Timeline", _timeline(session))]
+    taken = decisions(session.journal.entries)
+    if taken:
+        last = ended(session.journal.entries)
+        body = fragment("session_shots.html", decisions=taken, spared=last and last["spared"])
+        title = "Shots: what they gave, and which was next"
+        sections.append(Section("decisions", title, body, "Shots"))
+    body = fragment("session_events.html", events=events(session))
+    sections.append(Section("events", "Events", body))
+    sources = {
+        "command": session.header["command"],
+        **session.header["versions"],
+        **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
+    }
+    sections.append(provenance_section(sources))
+    lead = fragment("cards.html", cards=_cards(session))
+    about = [_about(session)]
+    return framed(session.header["title"], about, (), sections, ["session.css"], lead=lead)
 
 
 def _about(session: Session) -> str:
@@ -95,40 +103,29 @@ def _about(session: Session) -> str:
     return f"Session {session.folder.name}, begun {session.header['created']}{by}."
 
 
-def _cards(session: Session) -> Iterator[str]:
+def _cards(session: Session) -> list[Card]:
     stored, planned = len(session.stored), len(session.needed)
-    tone, state = ("good", "complete") if session.is_complete else ("watch", "not complete")
-    yield _card(
-        tone, "State", state, "every frame verified" if session.is_complete else "resume it"
-    )
-    yield _card("", "Frames", f"{stored} of {planned}", _kinds(session))
     size = sum(entry["bytes"] for entry in session.stored.values())
-    yield _card("", "Size", shown_bytes(size), "the camera's own bytes")
     retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
-    yield _card("watch" if retries else "", "Retries", str(retries), f"in {session.runs} run(s)")
+    state = Card("State", "not complete", "resume it", "watch")
+    if session.is_complete:
+        state = Card("State", "complete", "every frame verified", "good")
+    kinds = ", ".join(f"{done} {kind}" for kind, (done, _) in counts(session).items())
+    cards = [
+        state,
+        Card("Frames", f"{stored} of {planned}", kinds),
+        Card("Size", shown_bytes(size), "the camera's own bytes"),
+        Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
+    ]
     runs = run_entries(session.journal.entries)
     if runs:
         last = overlap(runs[-1])
-        yield _card(
-            "",
-            "Hidden writing",
-            f"{last.hidden_share:.0%}",
-            f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked",
-        )
+        note = f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked"
+        cards.append(Card("Hidden writing", f"{last.hidden_share:.0%}", note))
+    return cards
 
 
-def _card(tone: str, name: str, value: str, note: str) -> str:
-    return (
-        f'<div class="card {tone}"><h3>{text(name)}</h3><p class="value">{text(value)}</p>'
-        f'<p class="note">{text(note)}</p></div>'
-    )
-
-
-def _kinds(session: Session) -> str:
-    return ", ".join(f"{done} {kind}" for kind, (done, _) in counts(session).items())
-
-
-def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
+def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
     left = pictures
     for kind in reversed(KINDS):
@@ -137,13 +134,13 @@ def _frames(session: Session, pictures: int) -> Iterator[tuple[str, str, str]]:
             continue
         shown = _chosen(frames, left)
         left -= len(shown)
-        more = (
-            ""
-            if len(shown) == len(frames)
-            else f'<p class="quiet">{len(shown)} of {len(frames)} are shown.</p>'
+        body = fragment(
+            "session_frames.html",
+            pictures=[_picture(session, frame) for frame in shown],
+            total=len(frames),
         )
-        body = "".join(_picture(session, frame) for frame in shown)
-        yield kind, HEADINGS[kind], f'<div class="sheet">{body}</div>{more}'
+        title = HEADINGS[kind]
+        yield Section(kind, title, body, title.partition(":")[0])
 
 
 def _place_in_plan(frame: PlannedFrame) -> tuple:
@@ -158,28 +155,15 @@ def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
     return [frames[i * len(frames) // max(most, 1)] for i in range(most)]
 
 
-def _picture(session: Session, planned: PlannedFrame) -> str:
+def _picture(session: Session, planned: PlannedFrame) -> dict[str, object]:
+    """Return what the page shows of a frame: its picture, or why there is none."""
     entry = session.stored.get(planned.id)
     if entry is None:
-        return _absent(planned, "not captured")
+        return {"id": planned.id, "why": "not captured"}
     try:
-        data = _jpeg(session, planned, entry)
+        return {**entry, "why": "", "picture": _jpeg(session, planned, entry)}
     except (AppError, DriverError) as fault:
-        return _absent(planned, str(fault))
-    figures = entry["figures"]
-    saturated = f", {figures['saturated']:.1%} saturated" if figures["saturated"] >= 0.001 else ""
-    return (
-        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{text(planned.id)}">'
-        f"<figcaption><strong>{text(planned.id)}</strong><br>{entry['exposure_s']:.4g} s"
-        f"{saturated}</figcaption></figure>"
-    )
-
-
-def _absent(planned: PlannedFrame, why: str) -> str:
-    return (
-        f'<figure class="absent"><p>{text(why)}</p>'
-        f"<figcaption>{text(planned.id)}</figcaption></figure>"
-    )
+        return {"id": planned.id, "why": str(fault)}
 
 
 def _jpeg(session: Session, planned: PlannedFrame, entry: Entry) -> str:
@@ -188,58 +172,32 @@ def _jpeg(session: Session, planned: PlannedFrame, entry: Entry) -> str:
     scale = LONGEST_PX / max(picture.shape[:2])
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return base64.b64encode(
-        cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    ).decode()
+    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    return data_address(data.tobytes(), ".jpg")
 
 
 def _timeline(session: Session) -> str:
     runs = run_entries(session.journal.entries)
     if not runs:
-        return '<p class="lead">No frame was taken yet.</p>'
+        return fragment("session_timeline.html", run=None)
     longest = max(runs, key=len)
-    told = overlap(longest)
     run = longest[0]["run"]
     decided = [one for one in decisions(session.journal.entries) if one["run"] == run]
-    legend = "".join(
-        f'<li><i style="background:{COLOURS[name]}"></i>{text(meaning)}</li>'
-        for name, meaning in LEGEND.items()
-        if decided or name != "decide"
-    )
     # Shots, and what is decided between them, come last.
     shown = longest[-SHOWN_FRAMES:] if decided else longest[:SHOWN_FRAMES]
-    which = "last" if decided else "first"
-    return (
-        f'<p class="lead">Run {run}, its {which} {len(shown)} of {len(longest)} frames. '
-        f"In all {told.seconds:.1f} s: {told.moving_s:.1f} s moving and settling, "
-        f"{told.exposing_s:.1f} s exposing and downloading, {told.writing_s:.1f} s hashing and "
-        f"writing, of which {told.hidden_share:.0%} while the bench worked.</p>"
-        f'<ul class="legend">{legend}</ul>'
-        f'<div class="scroll">{timeline_svg(shown, decided)}</div>'
-    )
-
-
-def _shots(session: Session) -> str:
-    """Return a table of what was decided after each shot."""
-    rows = "".join(
-        f"<tr><td>{text(', '.join(map(str, one['shots'])))}</td>"
-        f"<td>{one['stated_db']:.2f}</td><td>{one['target_db']:g}</td>"
-        f"<td>{text('none' if one['next'] is None else one['next'])}</td>"
-        f"<td>{text('; '.join(filter(None, (one['why'], one['advice']))))}</td></tr>"
-        for one in decisions(session.journal.entries)
-    )
-    names = ("shots taken", "stated PSNR, dB", "wanted, dB", "next shot", "why")
-    last = ended(session.journal.entries)
-    spared = (
-        f" Of the plan, shots {', '.join(map(str, last['spared']))} were not needed."
-        if last is not None and last["spared"]
-        else ""
-    )
-    return (
-        '<p class="lead">After each shot the light field was reconstructed; its own standard '
-        "deviation, checked on readings kept from the fit, stands for the PSNR stated. Shots count "
-        f"from 0, as in the plan.{spared}</p>"
-        f"<table>{table_head(names)}<tbody>{rows}</tbody></table>"
+    return fragment(
+        "session_timeline.html",
+        run=run,
+        which="last" if decided else "first",
+        shown=len(shown),
+        frames=len(longest),
+        overlap=overlap(longest),
+        legend=[
+            (COLOURS[name], meaning)
+            for name, meaning in LEGEND.items()
+            if decided or name != "decide"
+        ],
+        drawing=timeline_svg(shown, decided),
     )
 
 
@@ -251,14 +209,6 @@ def events(session: Session) -> Iterator[tuple[str, str]]:
             yield entry["kind"], told
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
-
-
-def _events(session: Session) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{text(kind)}</th><td>{text(told)}</td></tr>'
-        for kind, told in events(session)
-    )
-    return f'<table class="narrow"><tbody>{rows}</tbody></table>'
 
 
 def _told(entry: Entry) -> str:
@@ -284,12 +234,3 @@ def _told(entry: Entry) -> str:
     if kind == "amended":
         return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
-
-
-def _provenance(session: Session) -> str:
-    rows = {
-        "command": session.header["command"],
-        **session.header["versions"],
-        **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
-    }
-    return provenance_table(rows)

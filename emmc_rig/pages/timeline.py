@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
+from matplotlib.ticker import MaxNLocator
+
+from emmc_rig.pages.page import fragment
 from emmc_rig.session.decisions import decisions
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.session import Session
@@ -122,6 +124,17 @@ def _common(ones: Sequence[Span], others: Sequence[Span]) -> float:
     return total
 
 
+@dataclass(frozen=True)
+class _Bar:
+    """A span as the chart shows it, in pixels."""
+
+    lane: int
+    x: float
+    width: float
+    colour: str
+    words: str
+
+
 def timeline_svg(entries: Sequence[Entry], decided: Sequence[Entry] = ()) -> str:
     """Return a chart of frames of a run as SVG: the bench above, the disk below.
 
@@ -140,42 +153,23 @@ def timeline_svg(entries: Sequence[Entry], decided: Sequence[Entry] = ()) -> str
     start_s = min(span[1] for span in spans)
     length_s = max(max(span[2] for span in spans) - start_s, 1e-9)
     scale = (WIDTH_PX - LEFT_PX - 10) / length_s
-    height = 2 * LANE_PX + AXIS_PX + 14
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH_PX} {height}" width="{WIDTH_PX}" height="{height}" role="img" '
-        'aria-label="What bench and disk did over time" font-size="12" font-family="inherit">'
+    bars = [
+        _Bar(
+            int(name == "write"),
+            LEFT_PX + (first_s - start_s) * scale,
+            max(0.6, (last_s - first_s) * scale),
+            COLOURS[name],
+            f"{frame_id}: {LEGEND.get(name, name)}, {(last_s - first_s) * 1e3:.1f} ms",
+        )
+        for name, first_s, last_s, frame_id in spans
     ]
-    for lane, name in enumerate(("bench", "disk")):
-        y = 4 + lane * (LANE_PX + 4)
-        parts.append(f'<text x="0" y="{y + LANE_PX / 2 + 4}" fill="#5b6776">{name}</text>')
-        parts.append(
-            f'<rect x="{LEFT_PX}" y="{y}" width="{WIDTH_PX - LEFT_PX - 10}" height="{LANE_PX}" '
-            'fill="#f3f5f8"/>'
-        )
-    for name, begin_s, end_s, frame_id in spans:
-        y = 4 + (name == "write") * (LANE_PX + 4)
-        x = LEFT_PX + (begin_s - start_s) * scale
-        width = max(0.6, (end_s - begin_s) * scale)
-        told = html.escape(
-            f"{frame_id}: {LEGEND.get(name, name)}, {(end_s - begin_s) * 1e3:.1f} ms"
-        )
-        parts.append(
-            f'<rect x="{x:.2f}" y="{y}" width="{width:.2f}" height="{LANE_PX}" '
-            f'fill="{COLOURS[name]}"><title>{told}</title></rect>'
-        )
-    step_s = _round_step(length_s / 8)
-    ticks = int(length_s / step_s) + 1
-    for tick in range(ticks):
-        x = LEFT_PX + tick * step_s * scale
-        parts.append(
-            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="4" y2="{height - AXIS_PX}" stroke="#0002"/>'
-            f'<text x="{x:.1f}" y="{height - 6}" fill="#5b6776" text-anchor="middle">'
-            f"{tick * step_s:g} s</text>"
-        )
-    return "".join((*parts, "</svg>"))
-
-
-def _round_step(step: float) -> float:
-    """Return the next larger of 1, 2, 5, 10, ... times a power of ten."""
-    power = 10.0 ** int(f"{step:e}".partition("e")[2])
-    return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= step)
+    ticks = [at for at in MaxNLocator(8).tick_values(0, length_s) if 0 <= at <= length_s]
+    return fragment(
+        "timeline.html",
+        bars=bars,
+        ticks=[(LEFT_PX + at * scale, at) for at in ticks],
+        width=WIDTH_PX,
+        left=LEFT_PX,
+        lane=LANE_PX,
+        axis=AXIS_PX,
+    )

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
 from emmc_rig.files.frames import PSI, read_frames
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import validated
 from emmc_rig.session.readings import session_readings
-from emmc_rig.session.session import Session, is_session
+from emmc_rig.session.session import Session
 from reconstruction.methods import MethodSettings
 
 

@@ -15,7 +15,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emmc_rig.files.results import command_line, result_folder, versions, write_metrics
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import (
     export_pictures,
@@ -129,7 +130,7 @@ class Result:
 
         An earlier result of that name is replaced; raises AppError where something else is there.
         """
-        with result_folder(Path(out)) as folder:
+        with result_folder(Path(out), "reconstruct") as folder:
             self.write(folder, self.metrics())
 
     def write(self, folder: Path, metrics: Mapping[str, Any]) -> None:

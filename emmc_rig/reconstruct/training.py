@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.folders import new_file, refuse_inside_session, refuse_new_file
 from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.files.results import command_line, versions
 from emmc_rig.files.scenes import open_scene
@@ -23,7 +24,6 @@ from emmc_rig.model.settings import validated
 from emmc_rig.progress import Watcher
 from reconstruction.checkpoint import State, load_checkpoint, save_checkpoint
 from reconstruction.dictionary import Dictionary
-from reconstruction.errors import DictionaryError
 from reconstruction.learning import LearningSettings, LearningState, fixed_atoms, learn_ksvd
 from reconstruction.online import OnlineState, learn_online
 from reconstruction.separable import (
@@ -256,10 +256,10 @@ def train(
         "versions": versions(),
     }
     dictionary = _dictionary(settings, final, rows, shape, json.dumps(provenance, indent=1))
-    dictionary.save(out)
-    picture = draw_atoms(dictionary)
-    if not cv2.imwrite(str(picture_path(out)), picture):
-        raise AppError(f"{picture_path(out)}: cannot be written")
+    with new_file(out) as written, new_file(picture_path(out)) as drawn:
+        dictionary.save(written)
+        if not cv2.imwrite(str(drawn), draw_atoms(dictionary)):
+            raise AppError(f"{picture_path(out)}: cannot be written")
     kept.unlink(missing_ok=True)
     return dictionary, provenance
 
@@ -297,18 +297,13 @@ def _check_out(out: Path) -> None:
     """Raise AppError when the dictionary could not be written there, before hours of training."""
     if out.suffix.lower() not in (".h5", ".hdf5"):
         raise AppError(f"--out {out}: a dictionary's file ends in .h5")
-    if out.exists():
-        try:
-            Dictionary.load(out)
-        except DictionaryError as fault:
-            raise AppError(f"--out {out}: is there and no dictionary; choose another") from fault
+    refuse_inside_session(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        probe = out.with_name(f".{out.name}.probe")
-        probe.touch()
-        probe.unlink()
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+    for path in (out, picture_path(out)):
+        refuse_new_file(path)
 
 
 def _dictionary(

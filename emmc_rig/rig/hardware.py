@@ -37,11 +37,22 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
 from emmc_rig.model.masks import cfa_tile
+from emmc_rig.model.settings import validated
+from emmc_rig.rig import plugins
+from emmc_rig.rig.camera_config import (
+    CameraChoice,
+    GphotoCameraConfig,
+    MicroManagerCameraConfig,
+    parse_camera,
+)
+from emmc_rig.rig.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.rig.stage_config import (
     USUAL_MICROSTEP_UM,
     AptConfig,
     GrblConfig,
-    StageConfig,
+    MicroManagerConfig,
+    PluginConfig,
+    SerialConfig,
     ZaberConfig,
     parse_stage,
 )
@@ -216,10 +227,11 @@ def simulated_rig(
     return rig, bench
 
 
-def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStage:
+def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
     """Return the stage that `spec` names, connected; it must be closed.
 
-    spec: `PROTOCOL:PORT` (zaber, grbl, apt) or a YAML file, see `emmc_rig.rig.stage_config`;
+    spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
+    `emmc_rig.rig.stage_config`;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
     once. settings: single settings that replace those of the file. Raises AppError or a
     `DriverError`.
@@ -228,6 +240,13 @@ def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStag
     if name == SIMULATED:
         return open_simulated(protocol or "zaber", settings)[0]
     config = parse_stage(spec, settings)
+    if isinstance(config, PluginConfig):
+        care = config.stage_settings()
+        return open_plug_in(
+            STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
+        )
+    if isinstance(config, MicroManagerConfig):
+        return _open_micromanager_stage(config)
     transports: dict[str, Transport] = {}
     with ExitStack() as opened:
 
@@ -243,6 +262,20 @@ def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> HostStag
     return stage
 
 
+def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
+    from drivers.micromanager import MicroManagerStage, StageSetup, load_core
+
+    setup = StageSetup(
+        config.axes,
+        config.travel_um,
+        config.homes,
+        config.speed_property,
+        config.speed_unit_um_s,
+        config.speed_um_s,
+    )
+    return MicroManagerStage(load_core(config.port), setup, SYSTEM_CLOCK, config.stage_settings())
+
+
 def open_simulated(
     protocol: str, settings: Mapping[str, Any] | None = None
 ) -> tuple[HostStage, SimulatedController]:
@@ -251,6 +284,7 @@ def open_simulated(
     firmware = simulated_firmware(protocol, clock)
     wire = firmware.transport()
     config = parse_stage(f"{protocol}:{SIMULATED}", settings)
+    assert isinstance(config, SerialConfig)
     return _stage(config, lambda port: wire, clock), firmware
 
 
@@ -307,7 +341,7 @@ _PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
 """In this order: half a line of text would leave an APT controller in the middle of a message."""
 
 
-def _stage(config: StageConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
+def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
     """Return the stage of a configuration over transports opened by port."""
     try:
         settings = config.stage_settings()
@@ -351,14 +385,24 @@ def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]
 def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
     """Open the camera that `spec` names: a kind, a colon and what tells it from others.
 
-    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `folder:DIR`, `simulated`. `backend`: of
-    pyusb, for a simulated bus.
+    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `mm:CONFIG.cfg`, `folder:DIR`, `simulated`,
+    that of a plug-in, or a YAML file (`emmc_rig.rig.camera_config`). `backend`: of pyusb, for a
+    simulated bus.
     Raises AppError for any other kind, or an error of the driver.
     """
-    kind, _, rest = spec.partition(":")
-    if kind not in CAMERAS:
-        raise AppError(f"--camera {spec}: no such kind of camera; use {CAMERA_KINDS}")
-    return CAMERAS[kind](rest, clock, backend)
+    choice = parse_camera(spec)
+    if choice.kind in CAMERAS:
+        return CAMERAS[choice.kind](choice, clock, backend)
+    others = camera_kinds() - CAMERAS.keys()
+    if choice.kind not in others:
+        kinds = ", ".join((CAMERA_KINDS, *(f"{name}:" for name in sorted(others))))
+        raise AppError(f"{choice.source}: no such kind of camera; use {kinds}")
+    return open_plug_in(plugins.CAMERAS, choice.kind, choice.address, clock, **choice.options)
+
+
+def camera_kinds() -> set[str]:
+    """Return every kind of camera that `--camera` takes; a plug-in replaces none of ours."""
+    return {*CAMERAS, *plug_ins(plugins.CAMERAS)}
 
 
 def _ptp_camera(
@@ -373,21 +417,44 @@ def _ptp_camera(
     return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
 
 
-def _open_ptp(serial: str, clock: Clock, backend: Any) -> CameraDevice:
-    return _ptp_camera(clock, backend, serial)
+def _no_options(choice: CameraChoice) -> str:
+    """Return the address of a camera that takes no further settings; AppError where some are."""
+    if choice.options:
+        extra = ", ".join(choice.options)
+        raise AppError(f"{choice.source}: {choice.kind} takes only an address, not {extra}")
+    return choice.address
 
 
-def _open_u3v(serial: str, clock: Clock, backend: Any) -> CameraDevice:
-    return open_u3v(serial, backend=backend, clock=clock)
+def _open_ptp(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return _ptp_camera(clock, backend, _no_options(choice))
 
 
-def _open_folder(folder: str, clock: Clock, backend: Any) -> CameraDevice:
-    return FolderCamera(folder or ".", clock)
+def _open_u3v(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return open_u3v(_no_options(choice), backend=backend, clock=clock)
 
 
-def _open_simulated(rest: str, clock: Clock, backend: Any) -> CameraDevice:
+def _open_folder(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return FolderCamera(_no_options(choice) or ".", clock)
+
+
+def _open_simulated(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
     """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
     return _ptp_camera(clock, simulated_bus(clock), from_card=True)
+
+
+def _open_micromanager(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    from drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
+
+    config = validated(MicroManagerCameraConfig, choice.options, choice.source, AppError)
+    setup = CameraSetup(**config.model_dump())
+    return MicroManagerCamera(load_core(choice.address), setup, clock)
+
+
+def _open_gphoto(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    from drivers.gphoto import GphotoCamera
+
+    config = validated(GphotoCameraConfig, choice.options, choice.source, AppError)
+    return GphotoCamera(choice.address, clock=clock, **config.model_dump())
 
 
 def simulated_bus(clock: Clock) -> SimulatedUsb:
@@ -395,13 +462,18 @@ def simulated_bus(clock: Clock) -> SimulatedUsb:
     return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
 
 
-CAMERAS: dict[str, Callable[[str, Clock, Any], CameraDevice]] = {
+CAMERAS: dict[str, Callable[[CameraChoice, Clock, Any], CameraDevice]] = {
     "ptp": _open_ptp,
     "u3v": _open_u3v,
     "folder": _open_folder,
     "simulated": _open_simulated,
+    "gphoto2": _open_gphoto,
+    "mm": _open_micromanager,
 }
-CAMERA_KINDS = "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, folder:DIR or simulated"
+CAMERA_KINDS = (
+    "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, gphoto2:, gphoto2:PORT, mm:CONFIG.cfg, folder:DIR, "
+    "simulated"
+)
 SCENE_SIZE = (240, 320)
 
 

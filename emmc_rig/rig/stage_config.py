@@ -13,6 +13,7 @@ from drivers.stage import StageSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, explain
+from emmc_rig.rig.plugins import STAGES, plug_ins
 
 Positive = Annotated[float, Field(gt=0)]
 USUAL_MICROSTEP_UM = 0.047625
@@ -74,12 +75,45 @@ class AptConfig(_Common):
     axes: dict[str, AptAxisConfig]
 
 
-StageConfig = ZaberConfig | GrblConfig | AptConfig
-PROTOCOLS: Mapping[str, type[ZaberConfig | GrblConfig | AptConfig]] = {
+class MicroManagerConfig(_Common):
+    """Stages of a Micro-Manager configuration; see `drivers.micromanager.StageSetup`.
+
+    port: the configuration file. axes: `XY.x`, `XY.y` or a label, by our names; all where left
+    out.
+    """
+
+    protocol: Literal["mm"] = "mm"
+    port: str
+    axes: dict[str, str] | None = None
+    travel_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    homes: bool = True
+    speed_property: str = ""
+    speed_unit_um_s: Positive = 1.0
+    speed_um_s: Positive = 100.0
+
+
+class PluginConfig(_Common):
+    """A stage of a plug-in: `options` go to its factory as they are."""
+
+    protocol: str
+    port: str = ""
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+SerialConfig = ZaberConfig | GrblConfig | AptConfig
+StageConfig = SerialConfig | MicroManagerConfig | PluginConfig
+PROTOCOLS: Mapping[str, type[SerialConfig]] = {
     "zaber": ZaberConfig,
     "grbl": GrblConfig,
     "apt": AptConfig,
 }
+"""Those with simulated firmware."""
+
+
+def stage_protocols() -> dict[str, type[StageConfig]]:
+    """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
+    known: dict[str, type[StageConfig]] = {**PROTOCOLS, "mm": MicroManagerConfig}
+    return known | dict.fromkeys(sorted(plug_ins(STAGES) - known.keys()), PluginConfig)
 
 
 def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:
@@ -88,7 +122,8 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     `overrides` replace single settings. Raises AppError with one line.
     """
     protocol, colon, port = spec.partition(":")
-    if colon and protocol in PROTOCOLS and port:
+    known = stage_protocols()
+    if colon and protocol in known and (port or known[protocol] is PluginConfig):
         data: dict[str, Any] = {"protocol": protocol, "port": port}
         if protocol == "apt":
             data = {"protocol": protocol, "axes": {"x": {"port": port}}}
@@ -99,7 +134,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
         data = dict(read)
     else:
         raise AppError(
-            f"--stage {spec}: write PROTOCOL:PORT with one of {', '.join(PROTOCOLS)}, such as "
+            f"--stage {spec}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
             "zaber:/dev/ttyUSB0, or the name of a YAML file"
         )
     return _validated(data | dict(overrides or {}), spec)
@@ -107,9 +142,10 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
 def _validated(data: dict[str, Any], source: str) -> StageConfig:
     protocol = str(data.get("protocol", ""))
-    if protocol not in PROTOCOLS:
-        raise AppError(f"{source}: protocol must be one of {', '.join(PROTOCOLS)}")
-    cls = PROTOCOLS[protocol]
+    known = stage_protocols()
+    if protocol not in known:
+        raise AppError(f"{source}: protocol must be one of {', '.join(known)}")
+    cls = known[protocol]
     try:
         config: StageConfig = TypeAdapter(cls).validate_python(data)
     except ValidationError as fault:

@@ -25,7 +25,7 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
-from emmc_rig.model.files import whole_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.session.readings import decoded, fused_shot, mean_dark, shot_frames, whiteboards
 from emmc_rig.session.session import CAMERA, RIG, Session
 
@@ -42,7 +42,7 @@ def export_hdf5(
     """Write a session to an HDF5 file: whole, or not at all.
 
     Every frame's digest is checked on the way. Raises AppError for a session that is not
-    complete or not good, and where the file cannot be written.
+    complete or not good, where a file of that name is there, and where it cannot be written.
     """
     missing = session.missing()
     if missing:
@@ -50,11 +50,8 @@ def export_hdf5(
             f"{session.folder}: {len(missing)} of {len(session.needed)} frames are missing; "
             "resume it with `emmc-rig capture` first"
         )
-    try:
-        with whole_file(path) as part, h5py.File(part, "w") as file:
-            _write(session, file, compress, on_frame)
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+    with new_file(path) as part, h5py.File(part, "w") as file:
+        _write(session, file, compress, on_frame)
 
 
 def _write(

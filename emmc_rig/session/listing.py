@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
 from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import ended
 from emmc_rig.session.journal import heads
-from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete, is_session
+from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete
 
 
 @dataclass(frozen=True)

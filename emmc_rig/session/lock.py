@@ -18,8 +18,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
 from emmc_rig.files.results import command_line
-from emmc_rig.session.session import KNOWN, LOCK, is_session, wall_time
+from emmc_rig.session.session import KNOWN, LOCK, wall_time
 from emmc_rig.session.storage import PART
 
 OURS = re.compile(r"\.?(\d{5}|amended-\d+)-")

@@ -11,6 +11,8 @@
         amended-1-plan.yaml, ...camera.json, ...rig.json, ...frames.json
                        the plan as edited meanwhile, and what follows from it: these hold now
         session.lock   while a program writes the session: which one (see `lock`)
+        report.html    pictures, timeline, events; with metrics.json and files.json
+        calibration/, reconstruction/   what `calibrate` and `reconstruct` made of it
 
 Where a capture ends when the scene needs no more shots, the journal says which are spared: these
 count as not planned (see `decisions`).
@@ -40,6 +42,8 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import FILES, PARTIAL, SESSION_HEADER, SESSION_JOURNAL
+from emmc_rig.files.results import METRICS
 from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
@@ -55,18 +59,15 @@ from emmc_rig.session.storage import (
     write_whole,
 )
 
-HEADER, PLAN, CAMERA, RIG, ORDER = (
-    "session.json",
-    "plan.yaml",
-    "camera.json",
-    "rig.json",
-    "frames.json",
-)
+HEADER, JOURNAL = SESSION_HEADER, SESSION_JOURNAL
+PLAN, CAMERA, RIG, ORDER = "plan.yaml", "camera.json", "rig.json", "frames.json"
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
 AMENDED = (PLAN, CAMERA, RIG, ORDER)
-JOURNAL, FRAMES, REPORT, METRICS = "journal.jsonl", "frames", "report.html", "metrics.json"
-LOCK = "session.lock"
-KNOWN = {*FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK}
+FRAMES, REPORT, LOCK = "frames", "report.html", "session.lock"
+CALIBRATION, RECONSTRUCTION = "calibration", "reconstruction"
+KNOWN = {
+    *FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK, CALIBRATION, RECONSTRUCTION, FILES, PARTIAL
+}  # fmt: skip
 FORMAT = 1
 
 
@@ -410,11 +411,6 @@ def found_complete(entries: Sequence[Entry]) -> bool:
 def amended_name(name: str, number: int) -> str:
     """Return the file name of a frozen file by the amendment of that number; 0: as begun with."""
     return f"amended-{number}-{name}" if number else name
-
-
-def is_session(folder: Path) -> bool:
-    """Return whether a folder is a session."""
-    return (folder / JOURNAL).is_file() and (folder / HEADER).is_file()
 
 
 def wall_time() -> str:

@@ -7,12 +7,13 @@ with, on the same frames.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
@@ -34,7 +35,7 @@ RIVALS = ("adaptive-fast", "tv", "tv-dict")
 
 
 @dataclass(frozen=True)
-class Ablation:
+class Ablation(Figures):
     """One row: what was left out, its PSNR and seconds, and both less those of the whole."""
 
     name: str
@@ -42,10 +43,6 @@ class Ablation:
     seconds: float
     buys_db: float
     costs_s: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
 
 def ablations(scene: str, camera: Camera, size: tuple[int, int], seed: int) -> Iterator[Ablation]:

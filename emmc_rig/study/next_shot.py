@@ -25,15 +25,16 @@ from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
-from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.progress import Watcher
 from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
-from emmc_rig.study.points import Journal, digest_of
-from emmc_rig.version import __version__
+from emmc_rig.study.benchmarks.timing import Figures
+from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
 
@@ -41,7 +42,6 @@ ROWS, SESSIONS = "next_shots.jsonl", "sessions"
 PLANNED, MOST = 6, 5
 """Shots to choose from, and to take at most."""
 RAYS = 512
-REVISION = 1
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class SceneRows:
 
 
 @dataclass(frozen=True)
-class Saving:
+class Saving(Figures):
     """For a scene and a target: where `--until` stops, and how many shots in order reach it.
 
     stopped: the last row taken; reached: whether it states the target. fixed: shots in order until
@@ -95,10 +95,6 @@ class Saving:
     stopped: ShotRow
     reached: bool
     fixed: int | None
-
-    def as_dict(self) -> dict[str, object]:
-        """Return plain data."""
-        return asdict(self)
 
 
 def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> Plan:
@@ -181,6 +177,65 @@ def rows_of(
     return SceneRows(scene, rows, in_order, psnr_db(replicate_centre(truth), truth))
 
 
+@dataclass
+class ShotSweep(Sweep[str]):
+    """Scenes, each with its planned shots; settings: the Plan.
+
+    The first session captured gives Psi to all, as the bench is the same.
+    """
+
+    camera: Camera
+    size: tuple[int, int]
+    seed: int
+    rays: int
+    most: int
+    scale: Scale | None = None
+    journal = ROWS
+    noun = "scenes"
+    stage = "capture and judge"
+    revision = 1
+
+    def rig(self, scene: str) -> ImagedRig:
+        """Return the simulated rig before a scene."""
+        return ImagedRig(scene=scene, size=self.size, seed=self.seed, rays=self.rays)
+
+    def seen(self, scene: str) -> Scene:
+        """Return a scene as the truth has it."""
+        return fine_scene(
+            scene, APERTURE_FACTOR, PIXEL_FACTOR, size=self.size, views=self.camera.views,
+            seed=self.seed,
+        ).scene  # fmt: skip
+
+    def inputs(self, point: str) -> dict[str, object]:
+        """Return everything that a scene's rows depend on, as plain data."""
+        return {
+            "plan": self.settings.model_dump(mode="json"),
+            "camera": self.camera.model_dump(mode="json"),
+            "rig": self.rig(point).model_dump(mode="json"),
+            "most": self.most,
+            "method": METHOD,
+            "sum": float(np.sum(self.seen(point).light_field, dtype=np.float64)),
+        }
+
+    def measured(self, points: Sequence[str], watcher: Watcher) -> Results:
+        """Yield the rows of each scene, its shots captured by the simulated rig."""
+        (self.folder / SESSIONS).mkdir(exist_ok=True)
+        for point in points:
+            scene = self.seen(point)
+            watcher.begin(f"capture {scene.name}", None)
+            place = self.folder / SESSIONS / f"{scene.name}-{self.digest(point)[:8]}"
+            if self.scale is None:
+                session = captured(self.settings, self.rig(point), place)
+                self.scale = session_scale(session)
+            else:
+                shots_alone = self.settings.model_copy(update={"whiteboards": None})
+                place = place.with_name(f"{place.name}-shots")
+                session = captured(shots_alone, self.rig(point), place)
+            watcher.begin(f"judge {scene.name}", None)
+            truth = scene.light_field
+            yield asdict(rows_of(session, self.scale, truth, scene.name, self.most, watcher.step))
+
+
 def next_shots(
     scenes: Sequence[str],
     camera_name: str,
@@ -188,48 +243,17 @@ def next_shots(
     size: tuple[int, int],
     seed: int,
     folder: Path,
-    on_row: Callable[[str], None] = lambda told: None,
+    watcher: Watcher,
     rays: int = RAYS,
     most: int = MOST,
-) -> Iterator[SceneRows]:
-    """Yield each scene's rows; those that the folder holds are not measured again.
+) -> list[SceneRows]:
+    """Return each scene's rows; those that the folder holds are not measured again.
 
-    folder: see `emmc_rig.study.points.open_folder`. Raises what the layers below do.
+    folder: see `emmc_rig.study.sweep.open_folder`. Raises what the layers below do.
     """
-    journal = Journal(folder / ROWS)
     plan = candidate_plan(camera_name, camera, size)
-    scale: Scale | None = None
-    for spec in scenes:
-        imaged = ImagedRig(scene=spec, size=size, seed=seed, rays=rays)
-        fine = fine_scene(
-            spec, APERTURE_FACTOR, PIXEL_FACTOR, size=size, views=camera.views, seed=seed
-        )
-        truth = fine.scene.light_field
-        inputs: dict[str, object] = {
-            "version": __version__,
-            "revision": REVISION,
-            "plan": plan.model_dump(mode="json"),
-            "camera": camera.model_dump(mode="json"),
-            "rig": imaged.model_dump(mode="json"),
-            "most": most,
-            "method": METHOD,
-            "sum": float(np.sum(truth, dtype=np.float64)),
-        }
-        digest = digest_of(inputs)
-        result = journal.get(digest)
-        if result is None:
-            (folder / SESSIONS).mkdir(exist_ok=True)
-            place = folder / SESSIONS / f"{fine.scene.name}-{digest[:8]}"
-            if scale is None:
-                session = captured(plan, imaged, place)
-                scale = session_scale(session)
-            else:
-                shots_alone = plan.model_copy(update={"whiteboards": None})
-                session = captured(shots_alone, imaged, place.with_name(f"{place.name}-shots"))
-            on_row(f"{fine.scene.name}, captured")
-            result = asdict(rows_of(session, scale, truth, fine.scene.name, most, on_row))
-            journal.add(digest, inputs, result)
-        yield SceneRows.from_dict(result)
+    results = ShotSweep(plan, folder, camera, size, seed, rays, most).run(scenes, watcher)
+    return [SceneRows.from_dict(result) for result in results.values()]
 
 
 def savings(rows: SceneRows, targets_db: Sequence[float]) -> list[Saving]:

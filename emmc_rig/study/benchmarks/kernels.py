@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numba import get_num_threads, njit, prange
@@ -23,7 +23,7 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
-from emmc_rig.study.benchmarks.timing import median_s
+from emmc_rig.study.benchmarks.timing import Figures, median_s
 from reconstruction import kernels as tv_kernels
 from reconstruction.problem import colour_metric
 from reconstruction.tv import reconstruct_tv, row_bands
@@ -32,7 +32,7 @@ TRIAD_VALUES = 40_000_000
 
 
 @dataclass(frozen=True)
-class Timing:
+class Timing(Figures):
     """One kernel: the bytes counted, median seconds, and the ratio to its bound."""
 
     name: str
@@ -44,10 +44,6 @@ class Timing:
     def ratio(self) -> float:
         """Seconds over bound; 1 is as fast as memory allows."""
         return self.seconds / self.bound_s
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row with its ratio."""
-        return {**asdict(self), "ratio": self.ratio}
 
 
 @njit(parallel=True, cache=True)

@@ -6,7 +6,7 @@ import io
 import statistics
 import time
 import tracemalloc
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import rawpy
@@ -16,6 +16,7 @@ from drivers.ptp import PtpSession, is_raw
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import RawFrame, decode_raw
 from drivers.usb import open_device
+from emmc_rig.study.benchmarks.timing import Figures
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb
@@ -25,7 +26,7 @@ SHAPE = (4000, 6000)
 
 
 @dataclass(frozen=True)
-class PictureTiming:
+class PictureTiming(Figures):
     """Median seconds from a picture on the simulated bus to its mosaic, and rawpy's alone.
 
     download_s: USB transfers to bytes. decode_s: bytes to a checked and hashed `RawFrame`.
@@ -39,10 +40,6 @@ class PictureTiming:
     rawpy_s: float
     ratio: float
     peak_pictures: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
 
 
 def picture_timing(shape: tuple[int, int] = SHAPE, repeats: int = 9) -> PictureTiming:

@@ -13,19 +13,21 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivers.clock import SYSTEM_CLOCK
+from drivers.dng import encode_dng
 from drivers.raw import RawFrame, decode_raw
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.pages.timeline import overlap, run_entries
 from emmc_rig.rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line
@@ -34,8 +36,8 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import JOURNAL, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
 from emmc_rig.session.verify import PIECE_BYTES, THREADS, verify
+from emmc_rig.study.benchmarks.timing import Figures
 from simulators.disk import SimulatedDisk
-from simulators.dng import encode_dng
 from simulators.still import PreparedCamera, StillStage
 
 LARGE_SHAPE = (4000, 6000)
@@ -47,7 +49,7 @@ MOVE_S = 0.3
 
 
 @dataclass(frozen=True)
-class Overhead:
+class Overhead(Figures):
     """Milliseconds of the program for each shot, the time in the devices not counted.
 
     sequencing_ms: all but handing_over_ms, which includes waiting for a disk that is behind.
@@ -61,13 +63,9 @@ class Overhead:
     handing_over_ms: float
     hidden_share: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data, for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
-class Verification:
+class Verification(Figures):
     """Rates in MB/s of SHA-256 alone, of reading alone and of both, with as many threads."""
 
     shots: int
@@ -81,10 +79,6 @@ class Verification:
     def share(self) -> float:
         """Of the slower of the two alone."""
         return self.verify_mb_s / min(self.sha256_mb_s, self.disk_mb_s)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data, for JSON."""
-        return {**asdict(self), "share": self.share}
 
 
 class _Idle:
@@ -317,6 +311,7 @@ def _forget(paths: list[Path]) -> None:
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
+    refuse_inside_session(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix="emmc-bench-") as scratch:

@@ -12,7 +12,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -23,6 +23,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction import bpdn
 from reconstruction.dictionary import Dictionary
 from reconstruction.patches import (
@@ -42,7 +43,7 @@ STEP_LIMIT = 500
 
 
 @dataclass(frozen=True)
-class SolverTiming:
+class SolverTiming(Figures):
     """One solver: median milliseconds a patch, passes over the atoms, and what they cost.
 
     gigaflops: operations done a second. ratio: milliseconds over those at the machine's rate.
@@ -56,10 +57,6 @@ class SolverTiming:
     ratio: float
     gap: float
     psnr_db: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -192,7 +189,7 @@ def _timed(call: Callable[[int], Any], patches: int) -> tuple[float, list[Any]]:
 
 
 @dataclass(frozen=True)
-class PeerTiming:
+class PeerTiming(Figures):
     """Ours against theirs: median milliseconds a patch, their ratio, how far the codes differ."""
 
     name: str
@@ -204,10 +201,6 @@ class PeerTiming:
     def ratio(self) -> float:
         """How many times faster ours is."""
         return self.theirs_ms / self.ours_ms
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row with its ratio."""
-        return {**asdict(self), "ratio": self.ratio}
 
 
 def peer_timings(

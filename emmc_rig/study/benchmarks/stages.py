@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
 from emmc_rig.rig.hardware import open_simulated
 from emmc_rig.rig.stage_config import PROTOCOLS
+from emmc_rig.study.benchmarks.timing import Figures
 from simulators.firmware import SimulatedController
 
 
 @dataclass(frozen=True)
-class StageTiming:
+class StageTiming(Figures):
     """Median time of one command, the simulated firmware's part included.
 
     exchanges: how often the command wrote to the wire.
@@ -24,10 +25,6 @@ class StageTiming:
     command: str
     exchanges: float
     milliseconds: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the figures as they are written to metrics.json."""
-        return asdict(self)
 
 
 def stage_timings(repeats: int) -> list[StageTiming]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from drivers.pixel_formats import BY_NAME, KERNELS, image_bytes, unpack
 from drivers.u3v import open_u3v
-from emmc_rig.study.benchmarks.timing import median_s
+from emmc_rig.study.benchmarks.timing import Figures, median_s
 from simulators.clock import ManualClock
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
@@ -26,7 +26,7 @@ UNPACKED = ("BayerRG12p", "BayerRG12Packed", "BayerRG10p", "BayerRG10Packed", "M
 
 
 @dataclass(frozen=True)
-class U3vTiming:
+class U3vTiming(Figures):
     """What was timed, the camera's bytes in it, and the median of its seconds."""
 
     name: str
@@ -37,10 +37,6 @@ class U3vTiming:
     def gigabytes_per_s(self) -> float:
         """Camera bytes per second."""
         return self.gigabytes / self.seconds
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row with its rate."""
-        return {**asdict(self), "gigabytes_per_s": self.gigabytes_per_s}
 
 
 def unpacking_timings(size: tuple[int, int] = SIZE_24MP, repeats: int = 9) -> Iterator[U3vTiming]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,25 +20,23 @@ from emmc_rig.errors import AppError
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
+
 OURS = "fused step"
 MU, PRIMAL_STEP, DUAL_STEP = 1e-5, 1000.0, 1 / 16000
 """The settings that both take; they do not change the time of a step."""
 
 
 @dataclass(frozen=True)
-class StepTiming:
+class StepTiming(Figures):
     """Seconds of one primal-dual iteration, and how many times ours that is."""
 
     name: str
     seconds: float
     times_ours: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
 
 def peer_module(name: str) -> Any:

@@ -19,7 +19,7 @@ from emmc_rig.files.scenes import zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.points import digest_of
+from emmc_rig.study.sweep import digest_of
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]

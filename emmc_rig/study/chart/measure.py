@@ -7,7 +7,6 @@ runs, the peak of memory; only then the truth is read and compared. Each job's p
 from __future__ import annotations
 
 import json
-import math
 import os
 import statistics
 import sys
@@ -150,19 +149,14 @@ def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
             save_thumbnail(where, light_field, lines)
 
 
-def _plain(value: object) -> object:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def answered(job: dict) -> dict:
     """Return the figures of a job, or why there are none: these are not kept."""
     try:
-        figures = measured(job)
+        return measured(job)
     except KNOWN as fault:
         return {"failed": str(fault), "keep": False}
     except MemoryError:
         return {"failed": "not enough memory", "keep": False}
-    return {key: _plain(value) for key, value in figures.items()}
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emmc_rig.study.chart.plan import Point, Sweep
+from emmc_rig.study.chart.points import Point, Scaling
 
 PATCH_VALUES = 81 * 3
 NOISE_MIB = 8
@@ -15,7 +15,7 @@ NOISE_MIB = 8
 
 @dataclass(frozen=True)
 class Growth:
-    """A sweep measured. seconds, peak_mib: at each value of `at`.
+    """What was varied, measured. seconds, peak_mib: at each value of `at`.
 
     Seconds are those of all cores together, the work, as this is what methods count; against cores
     by the clock. Memory is that of the whole process; its exponent is fitted to what the runs
@@ -34,37 +34,33 @@ class Growth:
     memory_exponent: float | None
     expected_memory: float | None
 
-    def as_dict(self) -> dict[str, object]:
-        """Return it as plain data."""
-        return dict(vars(self))
 
-
-def growths(sweeps: Sequence[Sweep], results: Mapping[Point, dict]) -> list[Growth]:
-    """Return the sweeps of which two points or more were measured."""
+def growths(scalings: Sequence[Scaling], results: Mapping[Point, dict]) -> list[Growth]:
+    """Return those of which two points or more were measured."""
     found = []
-    for sweep in sweeps:
+    for scaling in scalings:
         done = [
             (at, results[point])
-            for at, point in zip(sweep.at, sweep.points, strict=True)
+            for at, point in zip(scaling.at, scaling.points, strict=True)
             if point in results and "failed" not in results[point]
         ]
         if len(done) < 2:
             continue
         at = tuple(at for at, _ in done)
         rows = [row for _, row in done]
-        clock = "seconds" if sweep.axis == "cores" else "cpu_seconds"
+        clock = "seconds" if scaling.axis == "cores" else "cpu_seconds"
         seconds = tuple(row[clock] for row in rows)
         found.append(
             Growth(
-                sweep.axis,
-                sweep.configuration.label,
+                scaling.axis,
+                scaling.configuration.label,
                 at,
                 seconds,
                 tuple(row["peak_mib"] for row in rows),
                 fitted_exponent(at, seconds),
-                expected_exponent(sweep, at, rows),
+                expected_exponent(scaling, at, rows),
                 _memory_exponent(at, rows),
-                expected_memory_exponent(sweep, at, rows),
+                expected_memory_exponent(scaling, at, rows),
             )
         )
     return found
@@ -81,21 +77,21 @@ def _memory_exponent(at: Sequence[float], rows: Sequence[dict]) -> float | None:
     return fitted_exponent(*zip(*told, strict=True)) if len(told) > 1 else None
 
 
-def expected_exponent(sweep: Sweep, at: Sequence[float], rows: Sequence[dict]) -> float | None:
+def expected_exponent(scaling: Scaling, at: Sequence[float], rows: Sequence[dict]) -> float | None:
     """Return the exponent of what is counted; -1 for cores, of which all work may be shared."""
-    if sweep.axis == "cores":
+    if scaling.axis == "cores":
         return -1.0
-    counted = COUNTED.get(sweep.configuration.method)
+    counted = COUNTED.get(scaling.configuration.method)
     return None if counted is None else _between(at, [counted(row) for row in rows])
 
 
 def expected_memory_exponent(
-    sweep: Sweep, at: Sequence[float], rows: Sequence[dict]
+    scaling: Scaling, at: Sequence[float], rows: Sequence[dict]
 ) -> float | None:
     """Return the exponent of the bytes that total variation holds; None for other methods."""
-    if sweep.configuration.method != "tv":
+    if scaling.configuration.method != "tv":
         return None
-    return 0.0 if sweep.axis == "cores" else _between(at, [_tv_memory(row) for row in rows])
+    return 0.0 if scaling.axis == "cores" else _between(at, [_tv_memory(row) for row in rows])
 
 
 def _between(at: Sequence[float], counts: Sequence[float]) -> float:

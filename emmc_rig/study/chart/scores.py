@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -64,15 +64,12 @@ def scored(
     own = None
     if own_disparity_px is not None and own_disparity_px.shape == disparity_px.shape:
         own = float(np.abs(own_disparity_px - disparity_px)[edge].mean())
-    return Scores(
-        scores.psnr_db,
-        scores.ssim,
-        scores.angular_db,
-        scores.replicate_psnr_db,
-        float(found.mean()),
-        float(floor.mean()),
-        float((found > BAD_PX).mean()),
-        own,
+    return replace(
+        scores,
+        disparity_mae_px=float(found.mean()),
+        floor_mae_px=float(floor.mean()),
+        bad_share=float((found > BAD_PX).mean()),
+        own_disparity_mae_px=own,
     )
 
 

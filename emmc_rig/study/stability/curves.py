@@ -1,4 +1,4 @@
-"""Measured points as curves: one per fault, method and screening, of a scene or of all together."""
+"""Measured points as curves, one per fault, method and screening; where each of them breaks."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.study.stability.breaking import Span, below_best, below_view
+from emmc_rig.study.stability.breaking import Span, below_best, below_view, strength_at, told
+from emmc_rig.study.stability.fault_points import Point
 from emmc_rig.study.stability.faults import FAULTS, Fault
-from emmc_rig.study.stability.plan import Point
 
 POOLED = "all scenes"
 
@@ -41,6 +41,10 @@ class Curve:
     def key(self) -> str:
         """Unique among the curves of one scene."""
         return f"{self.fault.name}-{self.method}{'' if self.screened else '-bare'}"
+
+    def mark_name(self, index: int) -> str:
+        """Return the name of a measured point in the drawing, unique on the page."""
+        return f"mark-{self.scene.replace(' ', '-')}-{self.key}-{index}"
 
     def below_best(self) -> Span | None:
         """Return where it breaks by the first measure: 3 dB below its best."""
@@ -96,3 +100,64 @@ def _curve(
         name, FAULTS[fault], method, screened, tuple(whole[0]), mean("psnr_db"), mean("view_db"),
         points,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BreakingRow:
+    """One line of the table "method x fault -> breaking point"; cells: one per method."""
+
+    fault: Fault
+    title: str
+    unit: str
+    cells: tuple[str, ...]
+
+
+def breaking_rows(curves: Sequence[Curve], scene: str) -> tuple[list[BreakingRow], tuple[str, ...]]:
+    """Return the table of one scene, or of all together, and the methods of its columns.
+
+    A fault that was measured with and without screening has two rows.
+    """
+    of_scene = [curve for curve in curves if curve.scene == scene]
+    methods = tuple(dict.fromkeys(curve.method for curve in of_scene))
+    rows = []
+    for fault in FAULTS.values():
+        kinds = {curve.screened for curve in of_scene if curve.fault == fault}
+        for screened in sorted(kinds, reverse=True):
+            some = {
+                curve.method: curve
+                for curve in of_scene
+                if curve.fault == fault and curve.screened is screened
+            }
+            title = fault.title + (", not screened" if len(kinds) > 1 and not screened else "")
+            cells = tuple(_cell(some[name]) if name in some else "-" for name in methods)
+            rows.append(BreakingRow(fault, title, fault.unit, cells))
+    return rows, methods
+
+
+def _cell(curve: Curve) -> str:
+    return " / ".join(
+        told(span, curve.strengths) for span in (curve.below_best(), curve.below_view())
+    )
+
+
+def break_row(curve: Curve) -> dict[str, object]:
+    """Return where a curve breaks, in its fault's unit."""
+    best, view = curve.below_best(), curve.below_view()
+    known = [level for level in curve.levels if level is not None]
+
+    def ends(name: str, span: Span | None) -> dict[str, object]:
+        places = (None, None) if span is None else (span.low, span.high)
+        low, high = (None if p is None else strength_at(curve.strengths, p) for p in places)
+        return {f"{name}_from": low, f"{name}_to": high, name: told(span, curve.strengths)}
+
+    return {
+        "scene": curve.scene,
+        "fault": curve.fault.name,
+        "unit": curve.fault.unit,
+        "repairable": curve.fault.repairable,
+        "method": curve.method,
+        "screened": curve.screened,
+        "best_db": max(known, default=None),
+        **ends("below_best", best),
+        **ends("below_view", view),
+    }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
-from emmc_rig.study.stability.trial import NotApplicableError, Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.sweep import NotApplicableError
 
 
 def _near_mask(camera: Camera) -> tuple[str, Mask]:

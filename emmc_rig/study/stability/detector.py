@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -21,18 +20,17 @@ from pydantic import Field
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import write_metrics
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.study.points import Journal, digest_of, open_folder
+from emmc_rig.study.stability.fault_sweep import open_dictionary_once
 from emmc_rig.study.stability.faults import FAULTS, MASK, SENSOR, SHOTS, Fault, find_fault, trial
-from emmc_rig.study.stability.trial import NotApplicableError, Trial
-from emmc_rig.version import __version__
-from reconstruction.dictionary import Dictionary
+from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.sweep import Results, Sweep, csv_text, recorded, sweep_folder
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, find_method
 from reconstruction.verdict.evidence import Evidence
@@ -40,9 +38,8 @@ from reconstruction.verdict.rules import Verdict, judged
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
 
-ROWS, CSV = "verdicts.jsonl", "verdicts.csv"
+CSV = "verdicts.csv"
 NONE, ALL = "none", "all"
-REVISION = 3
 BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
 KINDS = (SENSOR, MASK, SHOTS)
 """Of faults that befall a capture: a scene or a design that is hard is no fault of it."""
@@ -173,45 +170,33 @@ class Judged:
         return self.verdict.level != "trust"
 
 
-def measure(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
-    """Judge all cases into a folder that outlives interruptions.
+@dataclass
+class DetectorSweep(Sweep[Case]):
+    """The cases whose verdicts are judged; settings: DetectorSettings."""
 
-    Raises AppError for a folder that cannot be written, and what the layers below do.
-    """
-    folder = open_folder(out, ROWS, "earlier verdicts")
-    journal, rows = Journal(folder / ROWS), {}
-    wanted = cases(settings)
-    watcher.begin("judge", len(wanted))
-    made: tuple[object, Trial] | None = None
-    for case in wanted:
-        inputs = {"version": __version__, "revision": REVISION, **_inputs(case, settings)}
-        digest = digest_of(inputs)
-        row = journal.get(digest)
-        if row is None:
-            same = replace(case, method="")
-            try:
-                if made is None or made[0] != same:
-                    made = (same, _trial(case, settings))
-                row = _row(case.method, made[1])
-            except NotApplicableError:
-                watcher.step(f"left out: {case.label}")
-                continue
-            try:
-                journal.add(digest, inputs, row)
-            except OSError as fault:
-                raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
-        rows[case] = row
-        watcher.step(case.label)
-    return judged_rows(rows)
+    journal = "verdicts.jsonl"
+    noun = "cases"
+    stage = "judge"
+    revision = 3
 
+    def inputs(self, point: Case) -> dict[str, object]:
+        """Return everything that a case's evidence depends on, as plain data."""
+        return {
+            **asdict(point),
+            "camera": find_camera(point.camera).model_dump(mode="json"),
+            "size": self.settings.size,
+            "zoom": self.settings.zoom,
+        }
 
-def _inputs(case: Case, settings: DetectorSettings) -> dict[str, object]:
-    return {
-        **asdict(case),
-        "camera": find_camera(case.camera).model_dump(mode="json"),
-        "size": settings.size,
-        "zoom": settings.zoom,
-    }
+    def group(self, point: Case) -> Case:
+        """Return what all methods of one trial have in common."""
+        return replace(point, method="")
+
+    def measured(self, points: Sequence[Case], watcher: Watcher) -> Results:
+        """Yield the methods' evidence on one trial."""
+        made = _trial(points[0], self.settings)
+        for case in points:
+            yield _row(case.method, made)
 
 
 def _trial(case: Case, settings: DetectorSettings) -> Trial:
@@ -224,7 +209,8 @@ def _trial(case: Case, settings: DetectorSettings) -> Trial:
 def _row(method: str, given: Trial) -> dict:
     dictionary = None
     if METHODS[method].needs_dictionary:
-        dictionary = _dictionary(given.psi.light_field_shape[:2], given.psi.binning)
+        views = given.psi.light_field_shape[:2]
+        dictionary = open_dictionary_once(None, views, given.psi.binning)
     try:
         found, verdict = reconstruct_judged(
             method, given.psi, given.readings, given.noise_sigma, dictionary, None, given.usable
@@ -235,11 +221,6 @@ def _row(method: str, given: Trial) -> dict:
     even = np.broadcast_to(given.truth.mean(axis=(0, 1, 2, 3)), given.truth.shape)
     even_db = psnr_db(even, given.truth) + 20 * math.log10(given.peak)
     return {"psnr_db": level, "even_db": even_db, "evidence": verdict.evidence.as_dict()}
-
-
-@lru_cache(maxsize=4)
-def _dictionary(views: tuple[int, int], binning: int) -> Dictionary:
-    return open_dictionary(None, views, binning)
 
 
 def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
@@ -322,42 +303,49 @@ def told(one: Judged) -> str:
     return f"{one.case.label}: lost {one.lost_db:.1f} dB, {one.verdict.level} ({reasons})"
 
 
-def csv_text(results: Iterable[Judged]) -> str:
-    """Return one line for each result."""
-    lines = ["scene,camera,seed,method,fault,strength,psnr_db,lost_db,kind,verdict,reasons"]
-    for one in results:
-        case = one.case
-        reasons = " | ".join(reason.what for reason in one.verdict.reasons).replace('"', "'")
-        lines.append(
-            f"{Path(case.scene).stem},{Path(case.camera).stem},{case.seed},{case.method},"
-            f"{case.fault or NONE},{case.strength:g},{one.psnr_db:.3f},{one.lost_db:.3f},"
-            f'{one.kind},{one.verdict.level},"{reasons}"'
-        )
-    return "\n".join(lines) + "\n"
-
-
 def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
     """Judge all cases; write verdicts.csv and metrics.json beside the rows.
 
-    Raises what `measure` does.
+    Raises SweepStopped at Ctrl-C, AppError for a folder that cannot be written, and what the
+    layers below do.
     """
-    results = measure(settings, out, watcher)
-    if not results:
-        raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
-    write_text(out / CSV, csv_text(results))
-    found = {
-        f"{fault}, {method}": {**asdict(tally), "found": tally.found, "alarms": tally.false_alarms}
-        for (fault, method), tally in tables(results).items()
-    }
-    write_metrics(
-        out,
-        {
+    with sweep_folder(out, DetectorSweep.journal, "stability --verdicts") as folder:
+        results = judged_rows(DetectorSweep(settings, folder).run(cases(settings), watcher))
+        if not results:
+            raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
+        rows = [_csv_row(one) for one in results]
+        tallies = {
+            f"{fault}, {method}": {
+                **asdict(tally),
+                "found": tally.found,
+                "alarms": tally.false_alarms,
+            }
+            for (fault, method), tally in tables(results).items()
+        }
+        metrics = {
             "results": len(results),
-            "tallies": found,
+            "tallies": tallies,
             "wrong": [told(one) for one in wrong(results)],
-            "settings": settings.model_dump(mode="json"),
-            "command": command_line(),
-            "versions": versions(),
-        },
-    )
+            **recorded(settings),
+        }
+        with result_folder(folder, "stability --verdicts", adds=True) as new:
+            write_text(new / CSV, csv_text(rows, form=".3f", forms={"strength": "g"}))
+            write_metrics(new, metrics)
     return results
+
+
+def _csv_row(one: Judged) -> dict[str, object]:
+    case = one.case
+    return {
+        "scene": Path(case.scene).stem,
+        "camera": Path(case.camera).stem,
+        "seed": case.seed,
+        "method": case.method,
+        "fault": case.fault or NONE,
+        "strength": float(case.strength),
+        "psnr_db": one.psnr_db,
+        "lost_db": one.lost_db,
+        "kind": one.kind,
+        "verdict": one.verdict.level,
+        "reasons": " | ".join(reason.what for reason in one.verdict.reasons),
+    }

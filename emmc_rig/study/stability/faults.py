@@ -16,7 +16,8 @@ from emmc_rig.study.stability import (
     sensor_faults,
     shot_faults,
 )
-from emmc_rig.study.stability.trial import NotApplicableError, Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.sweep import NotApplicableError
 
 SEVERAL = 3
 """Shots that a camera is given where a fault needs several."""

@@ -11,8 +11,8 @@ mask being a worse code for this scene, not by not knowing it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from calibration.drift import DriftSettings, find_drift
@@ -21,20 +21,17 @@ from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
-from emmc_rig.study.points import Journal, digest_of
-from emmc_rig.study.stability.faults import find_fault, trial
-from emmc_rig.study.stability.trial import NotApplicableError, Trial
-from emmc_rig.version import __version__
+from emmc_rig.study.stability.checks import solved
+from emmc_rig.study.stability.fault_points import StabilitySettings
+from emmc_rig.study.stability.faults import find_fault
+from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, reconstruct
 
-POINTS = "mismatch.jsonl"
-REVISION = 1
 SCENARIOS = ("ideal", "mismatched", "oracle", "blind")
 ERRORS = (
     ("mask-shift", 0.5),
@@ -43,35 +40,13 @@ ERRORS = (
     ("mask-scale", 0.5),
     ("mask-distance-error", 25.0),
 )
+UNMOVED = ("mask-shift", 0.0)
 QUICK_ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 25.0))
 QUICK_DRIFT = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)
 METHODS_JUDGED = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 QUICK_METHODS = ("tv", "dict-omp", "adaptive-fast")
 LEAST_DB = 0.2
 """Loss below which a recovered share would be that of noise."""
-
-
-@dataclass(frozen=True)
-class MismatchSettings:
-    """What to measure. size: rows and columns of the crop."""
-
-    fast: bool = False
-    scenes: tuple[str, ...] = ("deep-occlusions",)
-    camera: str = "rgbw-bayer-1shot"
-    size: tuple[int, int] = (64, 80)
-    zoom: int = 3
-    methods: tuple[str, ...] = METHODS_JUDGED
-    seed: int = 0
-
-    @property
-    def errors(self) -> tuple[tuple[str, float], ...]:
-        """Faults and their strengths."""
-        return QUICK_ERRORS if self.fast else ERRORS
-
-    @property
-    def drift(self) -> DriftSettings:
-        """Of the blind search."""
-        return QUICK_DRIFT if self.fast else DriftSettings()
 
 
 @dataclass(frozen=True)
@@ -139,108 +114,118 @@ def mended(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, bool]:
 
 
 def _psnr(taken: Trial, psi: ImagingMatrix, method: str) -> float:
-    dictionary = None
-    if METHODS[method].needs_dictionary:
-        dictionary = open_dictionary(None, psi.light_field_shape[:2], psi.binning)
     try:
-        found = reconstruct(
-            method, psi, taken.readings, taken.noise_sigma, dictionary, usable=taken.usable
-        )
+        found = solved(replace(taken, psi=psi), method)
     except ReconstructionError:
         return math.nan
     return psnr_db(found.light_field, taken.truth)
 
 
-def measure_mismatch(settings: MismatchSettings, folder: Path, watcher: Watcher) -> list[Mismatch]:
+@dataclass(frozen=True)
+class MismatchPoint:
+    """A method on a capture with an error: a fault's name, and its strength (0: nothing moved)."""
+
+    scene: str
+    error: str
+    strength: float
+    method: str
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        return f"{self.method}, {Path(self.scene).stem}"
+
+
+@dataclass
+class MismatchSweep(Sweep[MismatchPoint]):
+    """The points of the protocol; settings: StabilitySettings."""
+
+    journal = "mismatch.jsonl"
+    stage = "mismatch of Psi"
+    revision = 2
+
+    def inputs(self, point: MismatchPoint) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        settings = self.settings
+        return {
+            **asdict(point),
+            "camera": find_camera(settings.camera).model_dump(mode="json"),
+            "size": settings.size,
+            "zoom": settings.zoom,
+            "drift": drift_settings(settings.fast).model_dump(),
+            "seed": settings.seed,
+        }
+
+    def group(self, point: MismatchPoint) -> MismatchPoint:
+        """Return what all methods on one capture have in common."""
+        return replace(point, method="")
+
+    def measured(self, points: Sequence[MismatchPoint], watcher: Watcher) -> Results:
+        """Yield the methods' PSNRs by scenario, and what became of Psi."""
+        settings, one = self.settings, points[0]
+        moved = settings.trial(one.error, one.strength, one.scene)
+        blind, told = mended(moved, drift_settings(settings.fast))
+        for point in points:
+            mismatched = _psnr(moved, moved.psi, point.method)
+            if point.strength == 0:
+                yield {"mismatched": mismatched}
+                continue
+            yield {
+                "mismatched": mismatched,
+                "oracle": _psnr(moved, moved.true_psi, point.method),
+                "blind": _psnr(moved, blind, point.method) if told else mismatched,
+                "told": told,
+                "psi_error": moved.psi.relative_difference(moved.true_psi),
+                "psi_left": blind.relative_difference(moved.true_psi),
+            }
+
+
+def drift_settings(fast: bool) -> DriftSettings:
+    """Return the settings of the blind search."""
+    return QUICK_DRIFT if fast else DriftSettings()
+
+
+def measure_mismatch(
+    settings: StabilitySettings,
+    folder: Path,
+    watcher: Watcher,
+    methods: Sequence[str] = (),
+) -> list[Mismatch]:
     """Return every row, those that the folder does not hold measured and kept there.
 
-    Raises what scenes and cameras do for wrong input, NotApplicableError for cameras without a
-    mask that can sit otherwise.
+    methods: none takes those of the protocol. Raises what scenes and cameras do for wrong input,
+    NotApplicableError for cameras without a mask that can sit otherwise.
     """
-    path = folder / POINTS
-    path.touch()
-    journal, camera = Journal(path), find_camera(settings.camera)
-    count = len(settings.scenes) * (1 + len(settings.errors)) * len(settings.methods)
-    watcher.begin("mismatch of Psi", count)
-    rows = []
-    for scene in settings.scenes:
-
-        def done(method: str, scene: str = scene) -> None:
-            watcher.step(f"{method}, {Path(scene).stem}")
-
-        ideal = _kept(settings, camera, scene, ("mask-shift", 0.0), journal, done)
-        for error in settings.errors:
-            found = _kept(settings, camera, scene, error, journal, done)
-            rows += _rows(settings, scene, error, ideal, found)
-    return rows
-
-
-def _kept(
-    settings: MismatchSettings,
-    camera: Camera,
-    scene: str,
-    error: tuple[str, float],
-    journal: Journal,
-    done: Callable[[str], None],
-) -> dict:
-    """Return the PSNRs of one error, scenario -> method, and what became of Psi."""
-    name, strength = error
-    inputs: dict[str, object] = {
-        "revision": REVISION,
-        "version": __version__,
-        "camera": camera.model_dump(mode="json"),
-        "error": error,
-        "scene": scene,
-        "size": settings.size,
-        "zoom": settings.zoom,
-        "methods": settings.methods,
-        "drift": settings.drift.model_dump(),
-        "seed": settings.seed,
-    }
-    digest = digest_of(inputs)
-    known = journal.get(digest)
-    if known is not None:
-        return known
-    fault = find_fault(name)
-    moved = trial(fault, strength, scene, camera, settings.size, settings.seed, settings.zoom)
-    blind, told = mended(moved, settings.drift)
-    scenarios = {"mismatched": moved.psi, "oracle": moved.true_psi, "blind": blind}
-    if strength == 0:
-        scenarios = {"mismatched": moved.psi, "blind": blind}
-    found: dict = {kind: {} for kind in scenarios}
-    for method in settings.methods:
-        for kind, psi in scenarios.items():
-            same = kind == "blind" and not told
-            db = found["mismatched"][method] if same else _psnr(moved, psi, method)
-            found[kind][method] = db if db is not None and math.isfinite(db) else None
-        done(method)
-    found["told"] = told
-    found["psi_error"] = moved.psi.relative_difference(moved.true_psi)
-    found["psi_left"] = blind.relative_difference(moved.true_psi)
-    journal.add(digest, inputs, found)
-    return found
-
-
-def _rows(
-    settings: MismatchSettings, scene: str, error: tuple[str, float], ideal: dict, found: dict
-) -> list[Mismatch]:
-    fault = find_fault(error[0])
-
-    def db(value: float | None) -> float:
-        return math.nan if value is None else value
-
+    methods = methods or (QUICK_METHODS if settings.fast else METHODS_JUDGED)
+    errors = QUICK_ERRORS if settings.fast else ERRORS
+    sweep = MismatchSweep(settings, folder)
+    sweep.run(
+        (
+            MismatchPoint(scene, *error, method)
+            for scene in settings.scenes
+            for error in (UNMOVED, *errors)
+            for method in methods
+        ),
+        watcher,
+    )
+    for why in sweep.left_out.values():
+        raise NotApplicableError(why)
     return [
-        Mismatch(
-            Path(scene).stem,
-            f"{fault.title} {error[1]:g} {fault.unit}",
-            method,
-            db(ideal["mismatched"][method]),
-            db(found["mismatched"][method]),
-            db(found["oracle"][method]),
-            db(found["blind"][method]),
-            bool(found["told"]),
-            float(found["psi_error"]),
-            float(found["psi_left"]),
-        )
-        for method in settings.methods
+        _mismatch(point, result, sweep.results[replace(point, error=UNMOVED[0], strength=0.0)])
+        for point, result in sweep.results.items()
+        if point.strength
     ]
+
+
+def _mismatch(point: MismatchPoint, result: dict, ideal: dict) -> Mismatch:
+    fault = find_fault(point.error)
+    dbs = {"ideal": ideal["mismatched"], **{kind: result[kind] for kind in SCENARIOS[1:]}}
+    return Mismatch(
+        Path(point.scene).stem,
+        f"{fault.title} {point.strength:g} {fault.unit}",
+        point.method,
+        **{kind: math.nan if db is None else db for kind, db in dbs.items()},
+        told=result["told"],
+        psi_error=result["psi_error"],
+        psi_left=result["psi_left"],
+    )

@@ -22,10 +22,10 @@ from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import swept_disparity
-from emmc_rig.study.points import Journal, digest_of
-from emmc_rig.study.stability.faults import FAULTS, Fault, trial
-from emmc_rig.study.stability.trial import NotApplicableError, Trial
-from emmc_rig.version import __version__
+from emmc_rig.study.stability.fault_points import StabilitySettings, strengths
+from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct
@@ -42,10 +42,9 @@ from reconstruction.theory.conditioning import (
 from reconstruction.theory.patch import SIDE, PatchModel, Texture
 
 Array = NDArray[np.floating]
-POINTS = "theory.jsonl"
-REVISION = 2
-"""Of what a point's figures are."""
-CAMERA, SCENE = "rgbw-bayer-3shots", "deep-occlusions"
+METHODS_COMPARED = ("tv", "adaptive-fast")
+PATCHES, QUICK_PATCHES = (24, 4), (8, 2)
+"""That theory looks at, and those whose conditioning it looks at."""
 SWEPT = (
     "exposure", "read-noise", "masked-pixels", "contrast", "disparity-range", "mask-distance",
     "mask-cell", "shots", "r",
@@ -64,25 +63,6 @@ WIDEST_PX = 10.0
 """Disparities swept to both sides where a scene does not tell its own."""
 NOT_USED = 1e6
 """Variance of a reading that is not to be used."""
-
-
-@dataclass(frozen=True)
-class TheorySettings:
-    """What to measure. size: rows and columns of the crop. patches: that theory looks at."""
-
-    fast: bool = False
-    scenes: tuple[str, ...] = (SCENE,)
-    camera: str = CAMERA
-    size: tuple[int, int] = (64, 80)
-    zoom: int = 2
-    methods: tuple[str, ...] = ("tv", "adaptive-fast")
-    patches: int = 24
-    conditioned: int = 4
-    seed: int = 0
-
-    def strengths(self, fault: Fault) -> tuple[float, ...]:
-        """Return the points of a sweep."""
-        return fault.quick if self.fast else fault.strengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,72 +271,79 @@ class TheoryPoint:
     figures: Mapping[str, float | None]
 
 
-def measure_theory(settings: TheorySettings, folder: Path, watcher: Watcher) -> list[TheoryPoint]:
+@dataclass
+class TheorySweep(Sweep[tuple[str, str, float]]):
+    """The points of theory: scene, fault and strength; settings: StabilitySettings."""
+
+    methods: Sequence[str]
+    journal = "theory.jsonl"
+    stage = "theory beside the sweeps"
+    revision = 2
+
+    @property
+    def patches(self) -> tuple[int, int]:
+        """How many patches theory looks at, and at how many of these for conditioning."""
+        return QUICK_PATCHES if self.settings.fast else PATCHES
+
+    def inputs(self, point: tuple[str, str, float]) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        scene, fault, strength = point
+        settings = self.settings
+        return {
+            "camera": find_camera(settings.camera).model_dump(mode="json"),
+            "fault": (fault, strength),
+            "scene": scene,
+            "size": settings.size,
+            "zoom": settings.zoom,
+            "methods": self.methods,
+            "patches": self.patches,
+            "seed": settings.seed,
+        }
+
+    def measured(self, points: Sequence[tuple[str, str, float]], watcher: Watcher) -> Results:
+        """Yield the figures of theory and of the methods."""
+        for scene, fault, strength in points:
+            made = self.settings.trial(fault, strength, scene)
+            yield self._figures(Seen.of(made))
+
+    def _figures(self, seen: Seen) -> dict[str, float]:
+        count, conditioned_count = self.patches
+        places = seen.places(count)
+        figures = predicted(seen, places)
+        step = max(1, len(places) // conditioned_count)
+        figures |= conditioned(seen, places[step // 2 :: step])
+        for method in self.methods:
+            try:
+                found = measured(seen, places, method)
+            except ReconstructionError:
+                found = {"db": math.nan}
+            figures |= {f"{method}_{key}": value for key, value in found.items()}
+        return figures
+
+    def label(self, point: tuple[str, str, float]) -> str:
+        """Return a point in words."""
+        scene, fault, strength = point
+        return f"{FAULTS[fault].title} {strength:g} {FAULTS[fault].unit}, {Path(scene).stem}"
+
+
+def measure_theory(
+    settings: StabilitySettings,
+    folder: Path,
+    watcher: Watcher,
+    methods: Sequence[str] = METHODS_COMPARED,
+) -> list[TheoryPoint]:
     """Return every point, those that the folder does not hold measured and kept there.
 
     Raises what scenes and cameras do for wrong input.
     """
-    path = folder / POINTS
-    path.touch()
-    journal = Journal(path)
-    camera = find_camera(settings.camera)
-    wanted = [
-        (scene, FAULTS[name], strength)
+    wanted = (
+        (scene, name, strength)
         for scene in settings.scenes
         for name in (QUICK_SWEPT if settings.fast else SWEPT)
-        for strength in settings.strengths(FAULTS[name])
+        for strength in strengths(FAULTS[name], settings)
+    )
+    results = TheorySweep(settings, folder, methods).run(wanted, watcher)
+    return [
+        TheoryPoint(fault, Path(scene).stem, strength, figures)
+        for (scene, fault, strength), figures in results.items()
     ]
-    watcher.begin("theory beside the sweeps", len(wanted))
-    points = []
-    for scene, fault, strength in wanted:
-        try:
-            figures = _kept(settings, camera, scene, fault, strength, journal)
-            points.append(TheoryPoint(fault.name, Path(scene).stem, strength, figures))
-        except NotApplicableError:
-            pass
-        watcher.step(f"{fault.title} {strength:g} {fault.unit}, {Path(scene).stem}")
-    return points
-
-
-def _kept(
-    settings: TheorySettings,
-    camera: Camera,
-    scene: str,
-    fault: Fault,
-    strength: float,
-    journal: Journal,
-) -> Mapping[str, float | None]:
-    inputs: dict[str, object] = {
-        "revision": REVISION,
-        "version": __version__,
-        "camera": camera.model_dump(mode="json"),
-        "fault": (fault.name, strength),
-        "scene": scene,
-        "size": settings.size,
-        "zoom": settings.zoom,
-        "methods": settings.methods,
-        "patches": (settings.patches, settings.conditioned),
-        "seed": settings.seed,
-    }
-    digest = digest_of(inputs)
-    known = journal.get(digest)
-    if known is None:
-        taken = trial(fault, strength, scene, camera, settings.size, settings.seed, settings.zoom)
-        figures = _figures(settings, Seen.of(taken))
-        known = {key: one if math.isfinite(one) else None for key, one in figures.items()}
-        journal.add(digest, inputs, known)
-    return known
-
-
-def _figures(settings: TheorySettings, seen: Seen) -> dict[str, float]:
-    places = seen.places(settings.patches)
-    figures = predicted(seen, places)
-    step = max(1, len(places) // settings.conditioned)
-    figures |= conditioned(seen, places[step // 2 :: step])
-    for method in settings.methods:
-        try:
-            found = measured(seen, places, method)
-        except ReconstructionError:
-            found = {"db": math.nan}
-        figures |= {f"{method}_{key}": value for key, value in found.items()}
-    return figures

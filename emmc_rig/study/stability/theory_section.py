@@ -12,11 +12,18 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from scipy.stats import spearmanr
 
-from emmc_rig.pages.drawing import FAINT, INK, save_svg, sheet, titled
-from emmc_rig.pages.page import Section, embedded, table_head, text
-from emmc_rig.study.chart.draw import COLOURS
+from emmc_rig.pages.drawing import (
+    COLOURS,
+    FAINT,
+    INK,
+    legend_below,
+    save_drawing,
+    sheet,
+    titled,
+)
+from emmc_rig.pages.page import Section, embedded, fragment, number
 from emmc_rig.study.stability.breaking import Span, below_best, strength_at, told
-from emmc_rig.study.stability.draw import PNG_DPI, shown
+from emmc_rig.study.stability.curve_drawing import shown
 from emmc_rig.study.stability.faults import FAULTS, Fault
 from emmc_rig.study.stability.theory import TheoryPoint
 
@@ -130,12 +137,8 @@ def draw_theory(some: Sequence[Compared], path: Path) -> Path:
     ]
     lines += [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in colours]
     names = [*(name for name, _, _ in DRAWN_AS.values()), *colours]
-    figure.legend(
-        lines, names, loc="outside lower center", ncols=5, fontsize=8.5, frameon=False,
-        labelcolor=INK,
-    )  # fmt: skip
-    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
-    return save_svg(figure, path)
+    legend_below(figure, lines, names, 5)
+    return save_drawing(figure, path)
 
 
 def _panel(axes: Axes, one: Compared, colours: Mapping[str, str]) -> None:
@@ -147,8 +150,7 @@ def _panel(axes: Axes, one: Compared, colours: Mapping[str, str]) -> None:
         axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=3)
     axes.set_xticks(range(len(one.strengths)), [shown(strength) for strength in one.strengths])
     axes.tick_params(labelsize=7.5)
-    axes.set_xlabel(one.fault.unit, color=FAINT, fontsize=8.5)
-    titled(axes, one.fault.title)
+    titled(axes, one.fault.title, one.fault.unit)
 
 
 def _known(levels: Sequence[float | None]) -> tuple[list[int], list[float]]:
@@ -165,43 +167,25 @@ def theory_sections(
     for scene in dict.fromkeys(one.scene for one in every):
         some = [one for one in every if one.scene == scene]
         picture = draw_theory(some, folder / f"theory-{scene}.svg")
-        body = (
-            '<p class="lead">Bound: the expected error of the posterior mean of Gaussian textures '
-            "with each patch's own mean and variance, at its true disparity, from Psi and noise; "
-            "dotted: with an error of the disparity by the Cramer-Rao bound. Oracle: that "
-            "estimator on the noisy frames. Methods are told neither disparity nor variance, and "
-            "may know more of natural textures than their variance: they can exceed the bound. "
-            "All on the same samples.</p>"
-            f'<img class="shown" alt="Predicted and measured PSNR on {text(scene)}" '
-            f'src="{embedded(picture)}">'
-            f"<h3>Does theory predict the break?</h3>{_breaks_table(some)}"
-            f"{_summary(some)}"
-            f"<h3>Which figure of Psi tells how a method does?</h3>{_ranks_table(some)}"
-            f"<h3>Psi by its figures</h3>{_figures_table(some)}"
+        body = fragment(
+            "theory.html",
+            scene=scene,
+            picture=embedded(picture),
+            breaks=_breaks_table(some),
+            summary=_summary(some),
+            methods=methods,
+            ranks=_ranks_table(some),
+            figures=_figures_table(some),
         )
-        title = f"Theory beside it, {scene}"
-        sections.append(Section(f"theory-{scene}", title, title, body))
+        sections.append(Section(f"theory-{scene}", f"Theory beside it, {scene}", body))
     return sections
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    body = "".join(
-        f'<tr><th scope="row">{text(row[0])}</th>'
-        + "".join(f"<td>{text(cell)}</td>" for cell in row[1:])
-        + "</tr>"
-        for row in rows
-    )
-    return (
-        f'<div class="scroll"><table class="breaks">{table_head(heads)}<tbody>{body}</tbody>'
-        "</table></div>"
-    )
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads of the columns, and rows."""
 
 
-def _rho(value: float | None) -> str:
-    return "–" if value is None else f"{value:+.2f}"
-
-
-def _breaks_table(some: Sequence[Compared]) -> str:
+def _breaks_table(some: Sequence[Compared]) -> Table:
     methods = some[0].methods
     heads = ["Fault", "Unit", "Bound", "Oracle"]
     for method in methods:
@@ -214,9 +198,12 @@ def _breaks_table(some: Sequence[Compared]) -> str:
         for method in methods:
             levels = one.levels[f"{method}_db"]
             row.append(told(below_best(levels, one.fault.whole), one.strengths))
-            row += [judged(one, method), _rho(rank_correlation(one.levels[BOUND], levels))]
+            row += [
+                judged(one, method),
+                number(rank_correlation(one.levels[BOUND], levels), "+.2f"),
+            ]
         rows.append(row)
-    return _table(heads, rows)
+    return heads, rows
 
 
 def oracle_offset(some: Sequence[Compared]) -> tuple[float, float]:
@@ -230,7 +217,7 @@ def oracle_offset(some: Sequence[Compared]) -> tuple[float, float]:
     return float(np.mean(apart)), float(np.sqrt(np.mean(np.square(apart))))
 
 
-def _summary(some: Sequence[Compared]) -> str:
+def _summary(some: Sequence[Compared]) -> list[str]:
     mean, root = oracle_offset(some)
     lines = [
         f"The oracle lies {mean:+.2f} dB from the bound on average (root mean square {root:.2f} "
@@ -249,7 +236,7 @@ def _summary(some: Sequence[Compared]) -> str:
             f"{method}: the bound says where it breaks, or that it does not, for {agreed} of "
             f"{len(verdicts)} faults; not for: {', '.join(missed) or 'none'}."
         )
-    return "".join(f"<p>{text(line)}</p>" for line in lines)
+    return lines
 
 
 def _ranks(some: Sequence[Compared], key: str, method: str) -> list[float | None]:
@@ -269,25 +256,21 @@ def _mean(ranks: Sequence[float | None], more: bool) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _ranks_table(some: Sequence[Compared]) -> str:
+def _ranks_table(some: Sequence[Compared]) -> Table:
     methods = some[0].methods
     heads = ["Figure", "better is", "on the whole", *(one.fault.title for one in some)]
     rows = []
     for key, (title, more) in FIGURES.items():
         ranks = [_ranks(some, key, method) for method in methods]
-        means = " / ".join(_rho(_mean(one, more)) for one in ranks)
-        cells = [" / ".join(_rho(rank) for rank in both) for both in zip(*ranks, strict=True)]
+        means = " / ".join(number(_mean(one, more), "+.2f") for one in ranks)
+        cells = [
+            " / ".join(number(rank, "+.2f") for rank in both) for both in zip(*ranks, strict=True)
+        ]
         rows.append([title, "more" if more else "less", means, *cells])
-    lead = (
-        f"<p>Rank correlation (Spearman) of the figure with the PSNR of {' / '.join(methods)} "
-        "over the strengths of each fault; –: it does not vary. On the whole: the mean, turned so "
-        "that +1 is a figure that orders all cameras as the method does, 0 one that says "
-        "nothing.</p>"
-    )
-    return lead + _table(heads, rows)
+    return heads, rows
 
 
-def _figures_table(some: Sequence[Compared]) -> str:
+def _figures_table(some: Sequence[Compared]) -> Table:
     names = [
         "told", "gain", "least_squares_gain", "condition", "condition_of_two", "unexplained",
         "spot_coherence", "ray_coherence", "crb_px", "zzb_px",
@@ -299,4 +282,4 @@ def _figures_table(some: Sequence[Compared]) -> str:
             values = [one.levels[name][i] for name in names]
             cells = ["∞" if value is None else f"{value:.3g}" for value in values]
             rows.append([one.fault.title, f"{strength:g} {one.fault.unit}", *cells])
-    return _table(heads, rows)
+    return heads, rows

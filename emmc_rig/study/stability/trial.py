@@ -10,18 +10,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.sweep import NotApplicableError
 from simulators.raycaster import World
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
-
-
-class NotApplicableError(AppError):
-    """This fault cannot befall this camera or scene; the message says why."""
 
 
 @dataclass(frozen=True)

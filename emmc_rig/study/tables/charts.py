@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from emmc_rig.pages.drawing import FAINT, INK, save_svg, sheet, titled
 from emmc_rig.study.tables import paper
-from emmc_rig.study.tables.findings import CHROMA, Measured, SceneFigures, printed_figures
-from emmc_rig.study.tables.plan import (
+from emmc_rig.study.tables.cells import (
     MASK_TITLES,
     METHOD_TITLES,
     METHODS,
@@ -20,6 +19,7 @@ from emmc_rig.study.tables.plan import (
     Capture,
     scenes_of,
 )
+from emmc_rig.study.tables.findings import CHROMA, Measured, SceneFigures, printed_figures
 
 COLOURS = {"i": "#1d5a9e", "ii": "#18794e", "iii": "#b45309"}
 METHOD_COLOURS = {"dict-admm": "#7a869a", "tv-dict": "#1d5a9e", "tv": "#18794e"}

@@ -8,10 +8,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
+from emmc_rig.study.tables.cells import METHOD_TITLES
 from emmc_rig.study.tables.findings import Finding
 from emmc_rig.study.tables.grids import Grid, Pair
-from emmc_rig.study.tables.page import CAVEAT
-from emmc_rig.study.tables.plan import METHOD_TITLES
+from emmc_rig.study.tables.tables_page import CAVEAT
 
 COLOURS = {"holds": "green", "does not hold": "red"}
 WIDE = 3
@@ -37,17 +37,14 @@ def _tables(grids: Sequence[Grid]) -> Iterator[Table]:
         table.caption = "PSNR in dB: ours" + (
             ", the paper's below" if stacked else " | the paper's"
         )
-        before: tuple[str, ...] = ()
+        before = None
         for line in grid.lines:
-            if before and line.heads[0] != before[0]:
+            if before and line.heads[0] != before.heads[0]:
                 table.add_section()
-            heads = [
-                "" if before[: i + 1] == line.heads[: i + 1] else head
-                for i, head in enumerate(line.heads[:-1])
-            ]
             pairs = [_shown(pair, stacked) for pair in line.pairs]
+            heads = line.shown_heads(before)[:-1]
             table.add_row(*heads, line.heads[-1], *pairs, style="bold" if line.mean else "")
-            before = line.heads
+            before = line
         yield table
 
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.study.points import digest_of
+from emmc_rig.study.sweep import digest_of
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.library import VIEWS, Cut, Library
 from reconstruction.dictionary import Dictionary, dct_dictionary, lambertian_dictionary

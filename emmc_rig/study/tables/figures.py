@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
+from emmc_rig.pages.display import DisplayCurve
 from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
-from emmc_rig.pages.report import DisplayCurve
-from emmc_rig.study.points import digest_of
 from emmc_rig.study.tables import paper
-from emmc_rig.study.tables.demosaic import demosaiced_rggb
-from emmc_rig.study.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
-from emmc_rig.study.tables.plan import (
+from emmc_rig.study.tables.cell_sweep import TablesSweep
+from emmc_rig.study.tables.cells import (
     MASK_TITLES,
     MASKS,
     METHOD_TITLES,
@@ -27,7 +25,8 @@ from emmc_rig.study.tables.plan import (
     cells_of,
     scenes_of,
 )
-from emmc_rig.study.tables.run import Run
+from emmc_rig.study.tables.demosaic import demosaiced_rggb
+from emmc_rig.study.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
 from emmc_rig.study.tables.shots import Sensors, Shots
 
 Array = NDArray[np.floating]
@@ -36,7 +35,7 @@ EPI_PX, EPI_ROW_PX = 80, 3
 MASK_CELLS = 24
 
 
-def draw_figures(folder: Path, run: Run, results: Mapping[Cell, dict]) -> dict[str, Path]:
+def draw_figures(folder: Path, run: TablesSweep, results: Mapping[Cell, dict]) -> dict[str, Path]:
     """Write the chosen figures as PNG; return the files by part. Those without cells are left out.
 
     folder: exists.
@@ -56,9 +55,9 @@ def _piece_side(picture: Array) -> int:
     return max(LEAST_PIECE_PX, round(PIECE_SHARE * picture.shape[1]))
 
 
-def _kept(run: Run, cell: Cell) -> Pictures:
-    found = Pictures.load(run.picture_path(digest_of(run.inputs(cell))))
-    assert found is not None, "do_cells leaves pictures for every cell of a figure"
+def _kept(run: TablesSweep, cell: Cell) -> Pictures:
+    found = Pictures.load(run.picture(cell))
+    assert found is not None, "the sweep leaves pictures for every cell of a figure"
     return found
 
 
@@ -73,7 +72,7 @@ def _db(result: Mapping, cell: Cell) -> str:
     return text if printed is None else f"{text} (paper: {printed:.2f})"
 
 
-def _figure_5(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_5(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     (scene,) = scenes_of(part, run.library.names)
     sensors = Sensors(run.settings.seed)
     truth = run.library.light_field(scene, run.settings.cut)
@@ -138,7 +137,7 @@ def _view_tile(title: str, pictures: Pictures, piece: Piece, curve: DisplayCurve
     return Tile(title, corner, (piece.of(corner), piece.of(centre)), (piece,))
 
 
-def _figure_6(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_6(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     (scene,) = scenes_of(part, run.library.names)
     truth = run.library.light_field(scene, run.settings.cut)
     true = pictures_of(truth, telling_lines(truth))
@@ -163,7 +162,7 @@ def _figure_6(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) ->
     )
 
 
-def _figure_7(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_7(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     (scene,) = scenes_of(part, run.library.names)
     (capture,) = part.captures
     truth = run.library.light_field(scene, run.settings.cut)
@@ -217,7 +216,7 @@ def _busiest(epi: Array, width: int) -> int:
     return int(sums.argmax())
 
 
-def _figure_8(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_8(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     scene = scenes_of(part, run.library.names)[0]
     (method,) = part.pictured
     truth = run.library.light_field(scene, run.settings.cut)
@@ -247,7 +246,7 @@ def _centre_tile(title: str, picture: Array, pieces: Sequence[Piece], curve: Dis
     return Tile(title, codes, tuple(piece.of(codes) for piece in pieces), tuple(pieces))
 
 
-def _figure_9(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_9(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     (scene,) = scenes_of(part, run.library.names)
     truth = run.library.light_field(scene, run.settings.cut)
     true = pictures_of(truth, telling_lines(truth)).centre
@@ -265,7 +264,7 @@ def _figure_9(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) ->
     write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=300)
 
 
-def _figure_10(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -> None:
+def _figure_10(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
     (scene,) = scenes_of(part, run.library.names)
     (method,) = part.methods
     truth = run.library.light_field(scene, run.settings.binned_cut)
@@ -291,7 +290,7 @@ def _figure_10(path: Path, part: Part, run: Run, results: Mapping[Cell, dict]) -
     write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=340)
 
 
-_DRAW: dict[str, Callable[[Path, Part, Run, Mapping[Cell, dict]], None]] = {
+_DRAW: dict[str, Callable[[Path, Part, TablesSweep, Mapping[Cell, dict]], None]] = {
     "figure5": _figure_5,
     "figure6": _figure_6,
     "figure7": _figure_7,

@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.cells import METHODS, PARTS, SCENARIOS, Capture, Cell, scenes_of
 from emmc_rig.study.tables.paper import Scenario
-from emmc_rig.study.tables.plan import METHODS, PARTS, SCENARIOS, Capture, Cell, scenes_of
 
 Measured = Mapping[Cell, Mapping[str, object]]
 """Figures of each cell by name, `psnr_db` among them."""

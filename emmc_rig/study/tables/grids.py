@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emmc_rig.study.tables import paper
-from emmc_rig.study.tables.plan import (
+from emmc_rig.study.tables.cells import (
     MASK_TITLES,
     METHOD_TITLES,
     PARTS,
@@ -41,6 +41,14 @@ class Line:
     heads: tuple[str, ...]
     pairs: tuple[Pair, ...]
     mean: bool = False
+
+    def shown_heads(self, before: Line | None) -> list[str]:
+        """Return the heads, empty where they are those of the line before."""
+        same = () if not before else before.heads
+        return [
+            "" if same[: i + 1] == self.heads[: i + 1] else head
+            for i, head in enumerate(self.heads)
+        ]
 
 
 @dataclass(frozen=True)

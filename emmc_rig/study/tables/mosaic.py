@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from emmc_rig.pages.report import DisplayCurve
+from emmc_rig.pages.display import DisplayCurve
 
 Array = NDArray[np.floating]
 Codes = NDArray[np.uint8]

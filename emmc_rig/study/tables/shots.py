@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from emmc_rig.model.camera import build_imaging_matrix, pixel_light
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.tables.cells import Capture
 from emmc_rig.study.tables.demosaic import demosaiced_rggb
-from emmc_rig.study.tables.plan import Capture
 
 Array = NDArray[np.floating]
 

@@ -1,0 +1,1 @@
+"""Cameras of GenTL producers, through harvesters: a plug-in of emmc-rig."""

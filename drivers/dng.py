@@ -1,0 +1,140 @@
+"""DNG files: a mosaic in, bytes out that LibRaw decodes exactly.
+
+Source: Adobe Digital Negative specification 1.4 (tags 50706 to 50829) and TIFF/EP (CFA tags).
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import tifffile
+
+from drivers.camera import CameraIdentity
+from drivers.plain_dng import SMALLEST_SIDE_PX
+from drivers.raw import CFA_TILE_PREFIX, RawFrame, decode_raw
+
+Array = np.ndarray
+
+BAYER_PATTERNS = {
+    "rggb": (0, 1, 1, 2),
+    "grbg": (1, 0, 2, 1),
+    "gbrg": (1, 2, 0, 1),
+    "bggr": (2, 1, 1, 0),
+}
+MONO = "mono"
+STAND_IN_PHASE = "rggb"
+"""Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
+BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
+PHOTOMETRIC_TAG, PHOTOMETRIC_CFA, PHOTOMETRIC_LINEAR_RAW = 262, 32803, 34892
+D65 = 21
+IDENTITY_MATRIX = tuple(
+    n for row in np.eye(3, dtype=int).tolist() for value in row for n in (value, 1)
+)
+SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
+
+
+def encode_dng(
+    mosaic: Array,
+    cfa: str,
+    black_level_dn: float | Array,
+    white_level_dn: int,
+    exposure_s: float | None,
+    identity: CameraIdentity = SIMULATED,
+) -> bytes:
+    """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
+
+    `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
+    LibRaw's sake and carries its name beside it. `black_level_dn` is a whole number, or `(2, 2)`
+    of them in mosaic order; a monochrome DNG has but one. `exposure_s`: None where it is not known.
+    Raises `ValueError`.
+    """
+    black = np.broadcast_to(np.asarray(black_level_dn), (2, 2))
+    _check(mosaic, cfa, black, exposure_s)
+    tags = [
+        (271, ASCII, 0, identity.maker, True),
+        (272, ASCII, 0, identity.model, True),
+        (274, SHORT, 1, 1, True),
+        (50706, BYTE, 4, (1, 4, 0, 0), True),
+        (50707, BYTE, 4, (1, 1, 0, 0), True),
+        (50708, ASCII, 0, identity.model, True),
+        (50717, LONG, 1, int(white_level_dn), True),
+    ]
+    if exposure_s is not None:
+        exposure = Fraction(exposure_s).limit_denominator(1_000_000)
+        tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
+    if cfa == MONO:
+        tags.append((50714, LONG, 1, int(black[0, 0]), True))
+    else:
+        pattern = BAYER_PATTERNS.get(cfa, BAYER_PATTERNS[STAND_IN_PHASE])
+        tags += [
+            (33421, SHORT, 2, (2, 2), True),
+            (33422, BYTE, 4, pattern, True),
+            (50710, BYTE, 3, (0, 1, 2), True),
+            (50711, SHORT, 1, 1, True),
+            (50713, SHORT, 2, (2, 2), True),
+            (50714, LONG, 4, tuple(int(level) for level in black.flat), True),
+            (50721, SRATIONAL, 9, IDENTITY_MATRIX, True),
+            (50728, RATIONAL, 3, (1, 1) * 3, True),
+            (50778, SHORT, 1, D65, True),
+        ]
+    named = cfa == MONO or cfa in BAYER_PATTERNS
+    file = io.BytesIO()
+    tifffile.imwrite(
+        file,
+        np.ascontiguousarray(mosaic),
+        photometric=PHOTOMETRIC_CFA,
+        planarconfig=1,
+        description=None if named else CFA_TILE_PREFIX + cfa,
+        metadata=None,
+        software=False,
+        extratags=tags,
+    )
+    if cfa == MONO:
+        # One linear sample per pixel is what a monochrome DNG is; tifffile writes it but would
+        # not label it so.
+        file.seek(0)
+        with tifffile.TiffFile(file) as tiff:
+            tiff.pages.first.tags[PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
+    return file.getvalue()
+
+
+def frame_of_array(
+    mosaic: Array,
+    cfa: str,
+    black_level_dn: float,
+    white_level_dn: int,
+    exposure_s: float | None,
+    identity: CameraIdentity,
+    host_time_s: float,
+    metadata: Mapping[str, str],
+) -> RawFrame:
+    """Return the frame of a camera that gives arrays, kept as the DNG that it decodes from."""
+    original = encode_dng(mosaic, cfa, black_level_dn, white_level_dn, exposure_s, identity)
+    frame = decode_raw(original, mosaic.shape)
+    return replace(
+        frame,
+        white_level_dn=white_level_dn,
+        exposure_s=exposure_s,
+        host_time_s=host_time_s,
+        metadata={**frame.metadata, **metadata},
+    )
+
+
+def _check(mosaic: Array, cfa: str, black: Array, exposure_s: float | None) -> None:
+    if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
+        raise ValueError(f"a mosaic is uint16 (y, x), not {mosaic.dtype} {mosaic.shape}")
+    if min(mosaic.shape) < SMALLEST_SIDE_PX:
+        raise ValueError(
+            f"a DNG of {mosaic.shape[0]}x{mosaic.shape[1]} pixels is too small for LibRaw: "
+            f"use at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}"
+        )
+    if not cfa.isascii() or not cfa:
+        raise ValueError(f"the tile name {cfa!r} is not plain text")
+    if np.any(black != np.round(black)) or np.any(black < 0):
+        raise ValueError(f"black levels {black.tolist()} are not whole numbers of DN")
+    if cfa == MONO and np.any(black != black[0, 0]):
+        raise ValueError(f"a monochrome DNG has one black level, not {black.tolist()}")
+    if exposure_s is not None and not exposure_s > 0:
+        raise ValueError(f"an exposure of {exposure_s:g} s is not positive")

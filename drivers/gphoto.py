@@ -1,0 +1,287 @@
+"""Still cameras through libgphoto2, which knows the release of some 2,500 models; extra `gphoto2`.
+
+Its settings have the same names for most makers (`shutterspeed`, `iso`) and values in words, such
+as 1/125 or 0.0080s. Source: python-gphoto2 2.5, libgphoto2 2.5.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import Any
+
+from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
+from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+
+PTP_IP = "PTP/IP Camera"
+PAIR_LIMIT_S = 2.0
+"""How long to wait for a RAW file once another file of the same exposure came."""
+SHUTTER, ISO = "shutterspeed", "iso"
+IDENTITY = ("manufacturer", "cameramodel", "serialnumber", "deviceversion")
+SECONDS = re.compile(r'(?:(\d+)/)?(\d+(?:\.\d+)?) ?(?:s|sec|")?')
+ADVICE = {
+    -1: "look at the camera's display",
+    -7: "check cable and power; switch the camera off and on",
+    -10: "check cable and power; switch the camera off and on",
+    -52: "plug it in and switch it on",
+    -53: "another program has the camera, often the desktop's file manager: eject it there",
+    -105: "plug it in and switch it on; or name its model as gphoto2 --list-cameras does",
+    -110: "wait until it is ready",
+}
+
+
+def seconds_of(choice: str) -> float | None:
+    """Return the exposure that a choice's words mean, None for bulb, auto and the like."""
+    match = SECONDS.fullmatch(choice.strip())
+    if match is None:
+        return None
+    over, under = match.groups()
+    value = float(under) if over is None else float(over) / float(under) if float(under) else 0.0
+    return value if value > 0 else None
+
+
+class GphotoCamera:
+    """A still camera set to RAW and manual exposure, found by libgphoto2.
+
+    address: a port such as `usb:001,007` or `ptpip:192.168.1.5`; "" takes the first camera found.
+    model: libgphoto2's name of it; "" where libgphoto2 finds that out. settings: by libgphoto2's
+    names, set at the start. delete: each RAW file from the card once it has arrived; a JPEG beside
+    it stays. The size of a frame is known from the first one, which asking for it takes. Raises
+    `GphotoError`, `CameraSettingError`.
+    """
+
+    def __init__(
+        self,
+        address: str = "",
+        model: str = "",
+        settings: Mapping[str, str | int | float] | None = None,
+        delete: bool = False,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        try:
+            import gphoto2
+        except ImportError as error:
+            raise GphotoError(
+                "be loaded", 0, "not installed", 'pip install "emmc-rig[gphoto2]"'
+            ) from error
+        self._gp: Any = gphoto2
+        self._clock = clock
+        self._delete = delete
+        self._lock = threading.RLock()
+        self._shape: tuple[int, int] | None = None
+        self._cfa: str | None = None
+        self._closed = False
+        with self._asking("open the camera"):
+            self._camera: Any = self._gp.Camera()
+            self._choose(address, model)
+            self._camera.init()
+        try:
+            for name, value in (settings or {}).items():
+                self._set(name, str(value))
+            self._shutters = self._numbers(SHUTTER, seconds_of)
+            self._isos = self._numbers(ISO, lambda word: float(word) if word.isdecimal() else None)
+            self.identity = CameraIdentity(*(self._text(name) for name in IDENTITY))
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame; exposes one if there was none yet."""
+        if self._shape is None:
+            self.snap()
+        assert self._shape is not None
+        return self._shape
+
+    @property
+    def cfa(self) -> str:
+        """Colour phase or tile name of a frame; exposes one if there was none yet."""
+        if self._cfa is None:
+            self.snap()
+        assert self._cfa is not None
+        return self._cfa
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of the next frame, as the camera states it."""
+        seconds = seconds_of(self._text(SHUTTER))
+        if seconds is None:
+            raise CameraSettingError("exposure", "is not known: turn its mode dial to M")
+        return seconds
+
+    @property
+    def exposure_limits_s(self) -> Limits:
+        """Shortest and longest exposure; equal where it cannot be chosen."""
+        if not self._shutters:
+            return self.exposure_s, self.exposure_s
+        return min(self._shutters), max(self._shutters)
+
+    @property
+    def gain(self) -> float:
+        """Gain of the next frame: ISO over the lowest ISO."""
+        text = self._text(ISO)
+        return float(text) / min(self._isos) if self._isos and text.isdecimal() else 1.0
+
+    @property
+    def gain_limits(self) -> Limits:
+        """Lowest and highest gain; equal where it cannot be chosen."""
+        if not self._isos:
+            return self.gain, self.gain
+        return 1.0, max(self._isos) / min(self._isos)
+
+    def details(self) -> dict[str, str]:
+        """Return the camera's settings by libgphoto2's names."""
+        with self._asking("read the settings"):
+            return dict(self._values(self._camera.get_config()))
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Choose the exposure of the frames that follow: the nearest that the camera has.
+
+        Raises `ValueError` unless positive, `CameraSettingError` outside the limits.
+        """
+        check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
+        if self._shutters:
+            nearest = min(self._shutters, key=lambda one: abs(one / exposure_s - 1))
+            self._set(SHUTTER, self._shutters[nearest])
+
+    def set_gain(self, gain: float) -> None:
+        """Choose the gain of the frames that follow: the nearest ISO; raises as the exposure."""
+        check_setting("gain", gain, self.gain_limits)
+        if self._isos:
+            wanted = gain * min(self._isos)
+            self._set(ISO, self._isos[min(self._isos, key=lambda one: abs(one / wanted - 1))])
+
+    def snap(self) -> RawFrame:
+        """Expose and return one frame; raises `GphotoError`, `CaptureError`, `RawFrameError`."""
+        with self._lock:
+            exposure_s, gain = self.exposure_s, self.gain
+            with self._asking("take a picture"):
+                self._forget_events()
+                first = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
+                name, data = self._raw_file(first)
+            arrived_s = self._clock.now_s()
+            frame = check_frame(decode_raw(data, self._shape), self._cfa, exposure_s, 1e-4)
+            self._shape, self._cfa = frame.mosaic.shape, frame.cfa
+        return replace(
+            frame,
+            exposure_s=frame.exposure_s or exposure_s,
+            gain=gain,
+            host_time_s=arrived_s,
+            metadata={**frame.metadata, "name": name},
+        )
+
+    def close(self) -> None:
+        """Let go of the camera; closing twice is allowed."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                # It may be unplugged or off: then there is nothing to let go of.
+                with suppress(self._gp.GPhoto2Error):
+                    self._camera.exit()
+
+    def _choose(self, address: str, model: str) -> None:
+        """Tell libgphoto2 which camera it is; one with no address is looked for by itself."""
+        gp = self._gp
+        if address.startswith("ptpip:"):
+            model = model or PTP_IP
+        if model:
+            known = gp.CameraAbilitiesList()
+            known.load()
+            self._camera.set_abilities(known[known.lookup_model(model)])
+        if address:
+            ports = gp.PortInfoList()
+            ports.load()
+            self._camera.set_port_info(ports[ports.lookup_path(address)])
+
+    def _raw_file(self, first: Any) -> tuple[str, bytes]:
+        """Return name and bytes of the RAW file of an exposure, the first file or a later one."""
+        gp, camera = self._gp, self._camera
+        paths = [first]
+        deadline_s = self._clock.now_s() + PAIR_LIMIT_S
+        while not (raw := [one for one in paths if _is_raw(one.name)]):
+            left_s = deadline_s - self._clock.now_s()
+            if left_s <= 0:
+                names = ", ".join(one.name for one in paths)
+                raise CaptureError(
+                    f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
+                )
+            kind, path = camera.wait_for_event(max(1, round(1e3 * left_s)))
+            if kind == gp.GP_EVENT_FILE_ADDED:
+                paths.append(path)
+        (path,) = raw
+        # The file's memory goes with the object: it must outlive the copy.
+        file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
+        data = bytes(file.get_data_and_size())
+        if self._delete:
+            camera.file_delete(path.folder, path.name)
+        return path.name, data
+
+    def _forget_events(self) -> None:
+        """Read away what an earlier exposure left, so that no file of it passes for the next."""
+        while self._camera.wait_for_event(1)[0] != self._gp.GP_EVENT_TIMEOUT:
+            pass
+
+    def _numbers(self, name: str, number: Any) -> dict[float, str]:
+        """Return the choices of a setting that are numbers above 0, {} where it has none."""
+        with self._lock:
+            try:
+                widget = self._camera.get_single_config(name)
+                words = list(widget.get_choices())
+            except self._gp.GPhoto2Error:
+                return {}
+            if widget.get_readonly():
+                return {}
+        found = {number(word): word for word in words}
+        return {value: word for value, word in found.items() if value}
+
+    def _text(self, name: str) -> str:
+        """Return a setting's value, "" where the camera has none such."""
+        with self._lock:
+            if self._closed:
+                raise CameraClosedError(self.identity.model)
+            try:
+                return str(self._camera.get_single_config(name).get_value())
+            except self._gp.GPhoto2Error:
+                return ""
+
+    def _set(self, name: str, word: str) -> None:
+        """Set a setting; raises `CameraSettingError`."""
+        with self._lock:
+            if self._closed:
+                raise CameraClosedError(self.identity.model)
+            try:
+                widget = self._camera.get_single_config(name)
+                widget.set_value(word)
+                self._camera.set_single_config(name, widget)
+            except self._gp.GPhoto2Error as error:
+                raise CameraSettingError(name, f"cannot become {word} ({error.string})") from error
+
+    def _values(self, widget: Any) -> Iterator[tuple[str, str]]:
+        """Yield name and value of every setting below a widget; buttons have no value."""
+        for child in widget.get_children():
+            yield from self._values(child)
+            with suppress(self._gp.GPhoto2Error):
+                if not child.count_children():
+                    yield child.get_name(), str(child.get_value())
+
+    @contextmanager
+    def _asking(self, what: str) -> Iterator[None]:
+        """Hold the lock, and turn libgphoto2's errors into a `GphotoError` about `what`."""
+        with self._lock:
+            if self._closed:
+                raise CameraClosedError(self.identity.model)
+            try:
+                yield
+            except self._gp.GPhoto2Error as error:
+                advice = ADVICE.get(error.code, "switch the camera off and on, then try again")
+                raise GphotoError(what, error.code, error.string, advice) from error
+
+
+def _is_raw(name: str) -> bool:
+    return PurePosixPath(name.lower()).suffix in RAW_SUFFIXES

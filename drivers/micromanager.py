@@ -1,0 +1,621 @@
+"""A Micro-Manager configuration as our camera and stage: any device that has an adapter there.
+
+Needs the extra `micromanager`, and Micro-Manager's adapters for real devices. One core is loaded
+for each configuration file, whoever opens camera or stage of it. Source: MMCore API (CMMCore) and
+MMDevice, interface version 75: exposures in ms, places in um.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drivers.camera import CameraIdentity, Limits, check_setting
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.dng import frame_of_array
+from drivers.errors import (
+    CameraClosedError,
+    CameraSettingError,
+    FrameLostError,
+    MicroManagerError,
+    PortGoneError,
+    SpeedFixedError,
+)
+from drivers.plain_dng import SMALLEST_SIDE_PX
+from drivers.raw import RawFrame
+from drivers.stage import (
+    DEFAULT_SETTINGS,
+    HostStage,
+    Reading,
+    StageSettings,
+    check_within_limits,
+)
+
+if TYPE_CHECKING:
+    from pymmcore_plus import CMMCorePlus
+
+SHORTEST_S, LONGEST_S = 1e-6, 3600.0
+FRAME_GRACE_S = 2.0
+POLL_S = 0.001
+BAYER_ROWS = {
+    "rggb": ("rg", "gb"),
+    "grbg": ("gr", "bg"),
+    "gbrg": ("gb", "rg"),
+    "bggr": ("bg", "gr"),
+}
+SPEED_UM_S = 100.0
+"""Of a stage that does not tell: slow, so that no time limit is too short."""
+
+PropertyValue = str | int | float
+
+
+class LoadedCore:
+    """A core with a configuration loaded; `lock` is held for what takes several calls.
+
+    Raises `MicroManagerError` when the configuration cannot be loaded.
+    """
+
+    def __init__(self, core: CMMCorePlus, config: str) -> None:
+        self.port = config
+        self.lock = threading.RLock()
+        self.users = 0
+        self._on_load: list[Callable[[], None]] = []
+        self._core: CMMCorePlus | None = core
+        try:
+            self._load()
+        except BaseException:
+            core.unloadAllDevices()
+            raise
+
+    @property
+    def core(self) -> CMMCorePlus:
+        """The core; raises `PortGoneError` once it is closed."""
+        if self._core is None:
+            raise PortGoneError(self.port)
+        return self._core
+
+    def whenever_loaded(self, apply: Callable[[], None]) -> None:
+        """Apply settings now, and again after every reload until `forget`."""
+        with self.lock:
+            apply()
+            self._on_load.append(apply)
+
+    def forget(self, apply: Callable[[], None]) -> None:
+        """Apply these settings no more."""
+        with self.lock:
+            self._on_load.remove(apply)
+
+    def reopen(self) -> None:
+        """Load the configuration again: devices that were unplugged are looked for anew."""
+        with self.lock:
+            self._load()
+            for apply in self._on_load:
+                apply()
+
+    def close(self) -> None:
+        """Let go; the last user unloads the devices."""
+        with _loading:
+            self.users -= 1
+            if self.users <= 0 and self._core is not None:
+                _loaded.pop(self.port, None)
+                with self.lock, calling("unload"):
+                    core, self._core = self._core, None
+                    core.unloadAllDevices()
+
+    def _load(self) -> None:
+        try:
+            with calling("load the configuration"):
+                # Not every file begins by unloading what an earlier one left.
+                self.core.unloadAllDevices()
+                self.core.loadSystemConfiguration(self.port)
+        except OSError as error:
+            raise MicroManagerError(
+                f"{self.port} cannot be loaded ({_one_line(error)})",
+                "name a configuration that Micro-Manager itself loads; its adapters are looked "
+                "for where MICROMANAGER_PATH says",
+            ) from error
+
+
+_loaded: dict[str, LoadedCore] = {}
+_loading = threading.Lock()
+
+
+def load_core(config: str) -> LoadedCore:
+    """Return the core of a configuration file, loading it for the first who asks.
+
+    Whoever gets it must close it. Raises `MicroManagerError`, also when the extra is missing.
+    """
+    try:
+        from pymmcore_plus import CMMCorePlus
+    except ImportError as error:
+        raise MicroManagerError(
+            "pymmcore-plus is not installed", 'pip install "emmc-rig[micromanager]"'
+        ) from error
+    logging.getLogger("pymmcore-plus").setLevel(logging.WARNING)
+    with _loading:
+        if config not in _loaded:
+            _loaded[config] = LoadedCore(CMMCorePlus(), config)
+        _loaded[config].users += 1
+        return _loaded[config]
+
+
+@contextmanager
+def calling(what: str) -> Iterator[None]:
+    """Turn the core's `RuntimeError` into a `MicroManagerError` about `what`."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise MicroManagerError(f"Micro-Manager could not {what} ({_one_line(error)})") from error
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+@dataclass(frozen=True)
+class CameraSetup:
+    """What a Micro-Manager camera cannot say of its frames, and how it is to be set.
+
+    label: of the camera; "" takes the configuration's. cfa: a Bayer phase of the whole sensor, or
+    "mono". black_level_dn: a whole number. bit_depth, binning: None leaves them. roi: left, top,
+    width and height in pixels after binning. properties: by name, set in this order.
+    """
+
+    label: str = ""
+    cfa: str = "mono"
+    black_level_dn: int = 0
+    bit_depth: int | None = None
+    binning: int | None = None
+    roi: tuple[int, int, int, int] | None = None
+    properties: Mapping[str, PropertyValue] | None = None
+
+
+class MicroManagerCamera:
+    """A `drivers.camera.StreamingCamera` of a loaded core, which it closes.
+
+    The frame is kept as a DNG, since what comes from the core is an array. Gain has no common
+    unit among adapters: it is 1 here, and set as a property. The constructor raises
+    `CameraSettingError` for what the camera cannot be set to.
+    """
+
+    gain: float = 1.0
+    gain_limits: Limits = (1.0, 1.0)
+
+    def __init__(
+        self,
+        loaded: LoadedCore,
+        setup: CameraSetup | None = None,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self._loaded = loaded
+        self._clock = clock
+        self._setup = setup = setup or CameraSetup()
+        self._exposure_s: float | None = None
+        self._closed = False
+        try:
+            self.label = setup.label or loaded.core.getCameraDevice()
+            if self.label not in loaded.core.getLoadedDevices():
+                raise MicroManagerError(
+                    f"{loaded.port} has no camera {self.label!r}",
+                    f"name one of {', '.join(loaded.core.getLoadedDevices())}",
+                )
+            loaded.whenever_loaded(self._apply)
+        except BaseException:
+            loaded.close()
+            raise
+
+    @property
+    def identity(self) -> CameraIdentity:
+        """The adapter, the camera's name and number as far as it tells them."""
+        core = self._loaded.core
+        with calling("tell about the camera"):
+            known = {
+                name: core.getProperty(self.label, name)
+                for name in ("CameraName", "CameraID")
+                if core.hasProperty(self.label, name)
+            }
+            maker = core.getDeviceLibrary(self.label)
+            model = known.get("CameraName") or core.getDeviceName(self.label)
+            return CameraIdentity(maker, model, known.get("CameraID", ""))
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of the next frame, read from the core."""
+        with calling("tell the exposure"):
+            return self._loaded.core.getExposure(self.label) / 1e3
+
+    @property
+    def exposure_limits_s(self) -> Limits:
+        """Shortest and longest exposure: of the property Exposure where it has limits."""
+        core = self._loaded.core
+        with calling("tell the limits of the exposure"):
+            has = core.hasProperty(self.label, "Exposure")
+            if not (has and core.hasPropertyLimits(self.label, "Exposure")):
+                return SHORTEST_S, LONGEST_S
+            low = core.getPropertyLowerLimit(self.label, "Exposure")
+            high = core.getPropertyUpperLimit(self.label, "Exposure")
+        return max(low / 1e3, SHORTEST_S), min(high / 1e3, LONGEST_S)
+
+    def details(self) -> dict[str, str]:
+        """Return every property of the camera, by name."""
+        core = self._loaded.core
+        with calling("tell the properties"):
+            return {
+                name: core.getProperty(self.label, name)
+                for name in core.getDevicePropertyNames(self.label)
+            }
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Choose the exposure of the frames that follow.
+
+        Raises `ValueError` unless positive, `CameraSettingError` outside the limits,
+        `MicroManagerError` when the device refuses.
+        """
+        check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
+        with calling("set the exposure"):
+            self._loaded.core.setExposure(self.label, 1e3 * exposure_s)
+        self._exposure_s = exposure_s
+
+    def set_gain(self, gain: float) -> None:
+        """Accept a gain of 1; raises as `set_exposure_s`."""
+        check_setting("gain", gain, self.gain_limits)
+
+    def snap(self) -> RawFrame:
+        """Expose and return one frame; raises `MicroManagerError` or `CameraClosedError`."""
+        with self._alone() as core, calling("take a frame"):
+            core.snapImage()
+            return self._frame(core.getImage(), {})
+
+    def stream(self) -> Generator[RawFrame, None, None]:
+        """Yield frames as they come; closing the generator stops the acquisition.
+
+        Raises `FrameLostError` when the core's buffer ran over or no frame comes.
+        """
+        with calling("stream frames"):
+            with self._alone() as core:
+                core.startContinuousSequenceAcquisition(0)
+            try:
+                while True:
+                    yield self._next(core)
+            finally:
+                core.stopSequenceAcquisition()
+
+    def triggered(
+        self, stage: MicroManagerStage, axis: str, places_um: Sequence[float]
+    ) -> Generator[RawFrame, None, None]:
+        """Yield a frame at each of the ascending places: the camera's trigger steps the stage.
+
+        Only for devices of one configuration that say that they can, and are wired so. Raises
+        `CameraSettingError` when the stage cannot hold so many places, `ValueError` unless they
+        ascend, and what a move and `stream` raise.
+        """
+        most = stage.sequence_length(axis)
+        if len(places_um) > most:
+            raise CameraSettingError("hardware sequence", f"takes {most} places along {axis}")
+        if any(b <= a for a, b in pairwise(places_um)):
+            raise ValueError("the places of a hardware sequence must ascend")
+        with stage.stepping(axis, places_um), calling("run a hardware sequence"):
+            with self._alone() as core:
+                core.startSequenceAcquisition(len(places_um), 0, True)
+            try:
+                for _ in places_um:
+                    yield self._next(core)
+            finally:
+                core.stopSequenceAcquisition()
+
+    def close(self) -> None:
+        """Let go of the core; closing twice is allowed."""
+        if not self._closed:
+            self._closed = True
+            self._loaded.forget(self._apply)
+            self._loaded.close()
+
+    def _apply(self) -> None:
+        """Set the camera as the configuration says, and read what frames it gives now."""
+        core, setup = self._loaded.core, self._setup
+        wanted: dict[str, PropertyValue] = dict(setup.properties or {})
+        if setup.bit_depth is not None:
+            wanted["BitDepth"] = setup.bit_depth
+        if setup.binning is not None:
+            wanted["Binning"] = setup.binning
+        with calling("set the camera"):
+            for name, value in wanted.items():
+                self._set_property(name, value)
+            core.setCameraDevice(self.label)
+            core.clearROI()
+            if setup.roi is not None:
+                core.setROI(self.label, *setup.roi)
+            if self._exposure_s is not None:
+                core.setExposure(self.label, 1e3 * self._exposure_s)
+            left, top, width, height = core.getROI(self.label)
+            components, depth = core.getNumberOfComponents(), core.getImageBitDepth()
+        if setup.roi is not None and setup.roi != (left, top, width, height):
+            raise CameraSettingError("ROI", f"became {left}, {top}, {width}, {height}")
+        if components != 1 or depth > 16:
+            raise CameraSettingError(
+                "pixels", f"are {components} x {depth} bits: set PixelType to 8 or 16 bits of grey"
+            )
+        if min(width, height) < SMALLEST_SIDE_PX:
+            raise CameraSettingError("frame", f"is smaller than {SMALLEST_SIDE_PX} pixels")
+        if setup.cfa != "mono" and wanted.get("Binning", 1) != 1:
+            raise CameraSettingError("binning", "would add pixels of different colours")
+        self.shape = (height, width)
+        self.cfa = _shifted(setup.cfa, top, left)
+        self.white_level_dn = (1 << depth) - 1
+
+    def _set_property(self, name: str, value: PropertyValue) -> None:
+        core = self._loaded.core
+        if not core.hasProperty(self.label, name):
+            known = ", ".join(core.getDevicePropertyNames(self.label))
+            raise CameraSettingError(name, f"does not exist; it has {known}")
+        try:
+            core.setProperty(self.label, name, value)
+        except RuntimeError as error:
+            allowed = ", ".join(core.getAllowedPropertyValues(self.label, name))
+            hint = f"; it takes {allowed}" if allowed else ""
+            raise CameraSettingError(
+                name, f"cannot become {value} ({_one_line(error)}){hint}"
+            ) from error
+
+    @contextmanager
+    def _alone(self) -> Iterator[CMMCorePlus]:
+        """Yield the core, made to use this camera, which nobody else exposes meanwhile."""
+        if self._closed:
+            raise CameraClosedError(self.label)
+        with self._loaded.lock:
+            core = self._loaded.core
+            with calling("choose the camera"):
+                if core.isSequenceRunning():
+                    raise CameraSettingError("acquisition", "runs already: close its stream first")
+                if core.getCameraDevice() != self.label:
+                    core.setCameraDevice(self.label)
+            yield core
+
+    def _next(self, core: CMMCorePlus) -> RawFrame:
+        deadline_s = self._clock.now_s() + self.exposure_s + FRAME_GRACE_S
+        while not core.getRemainingImageCount():
+            if core.isBufferOverflowed():
+                raise FrameLostError("the core's buffer ran over", "take frames more slowly")
+            if self._clock.now_s() > deadline_s:
+                raise FrameLostError("no frame came from the camera")
+            self._clock.sleep(POLL_S)
+        image, tags = core.popNextImageAndMD()
+        metadata = {str(name): str(value) for name, value in dict(tags).items()}
+        return self._frame(image, metadata)
+
+    def _frame(self, image: np.ndarray, metadata: Mapping[str, str]) -> RawFrame:
+        mosaic = np.asarray(image, dtype=np.uint16)
+        if mosaic.shape != self.shape:
+            raise FrameLostError(f"it has {mosaic.shape} pixels instead of {self.shape}")
+        return frame_of_array(
+            mosaic,
+            self.cfa,
+            self._setup.black_level_dn,
+            self.white_level_dn,
+            self.exposure_s,
+            self.identity,
+            self._clock.now_s(),
+            metadata,
+        )
+
+
+def _shifted(cfa: str, top: int, left: int) -> str:
+    """Return the Bayer phase of a frame that begins at that row and column of the sensor."""
+    if cfa not in BAYER_ROWS:
+        return cfa
+    rows = BAYER_ROWS[cfa]
+    return "".join(rows[(top + i) % 2][(left + j) % 2] for i in (0, 1) for j in (0, 1))
+
+
+@dataclass(frozen=True)
+class StageSetup:
+    """What a Micro-Manager stage cannot say of itself.
+
+    axes: our names, and where they are: `XY.x`, `XY.y`, or the label of a one-axis stage; None
+    takes all, by those names. travel_um: lowest and highest place, by our names. homes: True homes
+    by the adapter; False is for an encoder that always knows where it is, or a stage that was
+    homed in Micro-Manager: homing it, after an unplug, moves nothing. speed_property,
+    speed_unit_um_s: the property that holds the speed, and its unit. speed_um_s: what the axes
+    move at where there is none, for time limits.
+    """
+
+    axes: Mapping[str, str] | None
+    travel_um: Mapping[str, tuple[float, float]]
+    homes: bool = True
+    speed_property: str = ""
+    speed_unit_um_s: float = 1.0
+    speed_um_s: float = SPEED_UM_S
+
+
+class MicroManagerStage(HostStage):
+    """Stages of a loaded core, which it closes; raises `MicroManagerError` for a wrong axis.
+
+    An adapter tells neither whether it was homed nor how far it may go: homing is done once after
+    every connection, and the limits are those of the configuration.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedCore,
+        setup: StageSetup,
+        clock: Clock = SYSTEM_CLOCK,
+        settings: StageSettings = DEFAULT_SETTINGS,
+    ) -> None:
+        self._closed = False
+        try:
+            found = stage_axes(loaded)
+            self._places = setup.axes or {place: place for place in found}
+            super().__init__(self._places, (loaded,), clock, settings)
+            self._loaded = loaded
+            self._setup = setup
+            self._homed: set[str] = set()
+            for axis, place in self._places.items():
+                if place not in found:
+                    raise MicroManagerError(
+                        f"{loaded.port} has no axis {place!r} for {axis}",
+                        f"name one of {', '.join(found)}",
+                    )
+                if axis not in setup.travel_um:
+                    raise MicroManagerError(
+                        f"Micro-Manager does not tell how far {axis} may go",
+                        f"state travel_um: {{{axis}: [LOWEST, HIGHEST]}} in a YAML file",
+                    )
+            self._start_up()
+        except BaseException:
+            loaded.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the core; closing twice is allowed."""
+        if not self._closed:
+            self._closed = True
+            super().close()
+
+    def sequence_length(self, axis: str) -> int:
+        """Return how many places the axis can step through by itself; 0 where it cannot."""
+        self._require_axis(axis)
+        label, coordinate = self._place(axis)
+        core = self._loaded.core
+        with calling("tell about hardware sequences"):
+            if coordinate is None and core.isStageSequenceable(label):
+                return core.getStageSequenceMaxLength(label)
+            if coordinate is not None and core.isXYStageSequenceable(label):
+                return core.getXYStageSequenceMaxLength(label)
+        return 0
+
+    @contextmanager
+    def stepping(self, axis: str, places_um: Sequence[float]) -> Iterator[None]:
+        """Let the axis step from place to place at each trigger while the block lasts.
+
+        It begins at the first place, and stays where the last trigger brought it. Raises
+        `LimitExceededError` before anything moves, and what `move_to_um` raises.
+        """
+        for place_um in places_um:
+            check_within_limits(axis, place_um, self.limits_um(axis))
+        self.move_to_um({axis: places_um[0]})
+        label, coordinate = self._place(axis)
+        core = self._loaded.core
+        with calling("load a hardware sequence"):
+            if coordinate is None:
+                core.loadStageSequence(label, list(places_um))
+                start, stop = core.startStageSequence, core.stopStageSequence
+            else:
+                still = [core.getXYPosition(label)[1 - coordinate]] * len(places_um)
+                pair = (list(places_um), still) if coordinate == 0 else (still, list(places_um))
+                core.loadXYStageSequence(label, *pair)
+                start, stop = core.startXYStageSequence, core.stopXYStageSequence
+            start(label)
+        try:
+            yield
+        finally:
+            with calling("end a hardware sequence"):
+                stop(label)
+
+    def speed_um_s(self, axis: str) -> float:
+        """Return the speed of a move: the device's where a property holds it."""
+        label, _ = self._place(axis)
+        setup = self._setup
+        if not setup.speed_property:
+            return setup.speed_um_s
+        with calling(f"read {setup.speed_property}"):
+            shown = self._loaded.core.getProperty(label, setup.speed_property)
+        return float(shown) * setup.speed_unit_um_s
+
+    def _apply_speed(self, axis: str, speed_um_s: float) -> None:
+        setup = self._setup
+        if not setup.speed_property:
+            raise SpeedFixedError(axis, "name the property that holds it: speed_property")
+        label, _ = self._place(axis)
+        with calling(f"set {setup.speed_property}"):
+            shown = speed_um_s / setup.speed_unit_um_s
+            self._loaded.core.setProperty(label, setup.speed_property, shown)
+
+    def _configure(self) -> None:
+        self._homed.clear()
+
+    def _read(self, axis: str) -> Reading:
+        label, coordinate = self._place(axis)
+        core = self._loaded.core
+        with calling(f"read the place of {axis}"):
+            if coordinate is None:
+                place_um = core.getPosition(label)
+            else:
+                place_um = core.getXYPosition(label)[coordinate]
+            moving = core.deviceBusy(label)
+        return Reading(place_um, not self._setup.homes or axis in self._homed, moving)
+
+    def _readings_are_checked(self, axis: str) -> bool:
+        return True
+
+    def _start_home(self, axes: tuple[str, ...]) -> None:
+        if not self._setup.homes:
+            return
+        labels = {self._place(axis)[0] for axis in axes}
+        together = {axis for axis in self._axes if self._place(axis)[0] in labels}
+        if together != set(axes):
+            raise MicroManagerError(
+                f"{', '.join(sorted(labels))} homes both its axes",
+                f"home {' and '.join(sorted(together))} together",
+            )
+        for label in sorted(labels):
+            with calling(f"home {label}: set homes: false if it always knows where it is"):
+                self._loaded.core.home(label)
+        self._homed.update(axes)
+
+    def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
+        core = self._loaded.core
+        pairs: dict[str, list[float]] = {}
+        with calling("move"):
+            for axis, target_um in targets_um.items():
+                label, coordinate = self._place(axis)
+                if coordinate is None:
+                    core.setPosition(label, target_um)
+                else:
+                    pairs.setdefault(label, list(core.getXYPosition(label)))[coordinate] = target_um
+            for label, (x_um, y_um) in pairs.items():
+                core.setXYPosition(label, x_um, y_um)
+
+    def _stop_axis(self, axis: str) -> None:
+        label, _ = self._place(axis)
+        try:
+            with calling(f"stop {axis}"):
+                self._loaded.core.stop(label)
+        except MicroManagerError:
+            # Many one-axis adapters cannot: their moves are over when the call returns.
+            if self._is_moving(axis):
+                raise
+
+    def _is_moving(self, axis: str) -> bool:
+        label, _ = self._place(axis)
+        with calling(f"ask whether {axis} moves"):
+            return self._loaded.core.deviceBusy(label)
+
+    def _travel_um(self, axis: str) -> tuple[float, float]:
+        return self._setup.travel_um[axis]
+
+    def _place(self, axis: str) -> tuple[str, int | None]:
+        """Return the device's label, and the coordinate of a stage with two."""
+        self._require_axis(axis)
+        place = self._places[axis]
+        for coordinate, ending in enumerate((".x", ".y")):
+            if place.endswith(ending):
+                return place.removesuffix(ending), coordinate
+        return place, None
+
+
+def stage_axes(loaded: LoadedCore) -> tuple[str, ...]:
+    """Return the axes of a configuration: `XY.x` and `XY.y` of a stage with two, else its label."""
+    from pymmcore_plus import DeviceType
+
+    core = loaded.core
+    two = [
+        f"{label}.{c}" for label in core.getLoadedDevicesOfType(DeviceType.XYStage) for c in "xy"
+    ]
+    return (*two, *core.getLoadedDevicesOfType(DeviceType.Stage))

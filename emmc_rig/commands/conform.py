@@ -1,0 +1,86 @@
+"""`emmc-rig devices conform`: whether a device does what every stage or camera must do."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.errors import AppError
+
+SUITES = {"stage": "stages.py", "camera": "cameras.py"}
+
+
+def conform(
+    device: Annotated[
+        str, typer.Argument(metavar="NAME", help="as --stage or --camera take it; or simulated")
+    ],
+    only: Annotated[
+        str | None, typer.Option("--as", help="stage or camera, where the name is of both")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="move the stage without asking")] = False,
+) -> None:
+    """Check that a stage or camera does what every one must do; exit code 1 unless it does.
+
+    A stage is homed again and again, and moved through the middle of its travel, after a question;
+    a camera is exposed some twenty times. Needs pytest: pip install "emmc-rig[test]".
+    """
+    if find_spec("pytest") is None:
+        raise AppError('conform needs pytest: pip install "emmc-rig[test]"')
+    import pytest
+
+    suites = _suites(device)
+    if only is not None:
+        if only not in suites:
+            raise AppError(f"--as {only}: {device} is a {' or a '.join(suites)}")
+        suites = [only]
+    if "stage" in suites and not yes and not device.startswith("simulated"):
+        question = (
+            f"Every axis of {device} will be homed and moved through the middle of its travel. "
+            "Is the way free?"
+        )
+        if not typer.confirm(question):
+            raise AppError("nothing was moved")
+    from emmc_rig import conformance
+
+    here = Path(conformance.__file__).parent
+    code = pytest.main(
+        [
+            *(str(here / SUITES[suite]) for suite in suites),
+            *("-p", "emmc_rig.conformance.named", "--device", device),
+            *("-c", os.devnull, "--rootdir", str(here), "-p", "no:cacheprovider"),
+            *("--import-mode=importlib", "-v", "--no-header", "--tb=short"),
+        ]
+    )
+    if code != pytest.ExitCode.OK:
+        raise AppError(f"{device} does not do what every {' and '.join(suites)} must do: see above")
+
+
+def _suites(device: str) -> list[str]:
+    """Return which suites a name asks for; raises AppError for one that names nothing."""
+    from emmc_rig.model.reading import read_yaml
+    from emmc_rig.rig.hardware import camera_kinds
+    from emmc_rig.rig.stage_config import stage_protocols
+
+    if device.endswith((".yaml", ".yml")):
+        read = read_yaml(Path(device), AppError)
+        settings = read if isinstance(read, dict) else {}
+        found = [
+            suite for suite, key in (("stage", "protocol"), ("camera", "kind")) if key in settings
+        ]
+    else:
+        name = device.partition(":")[0]
+        stages = {*stage_protocols(), "simulated"}
+        known = {"stage": stages, "camera": camera_kinds()}
+        found = [suite for suite, names in known.items() if name in names]
+        if device.startswith("simulated:"):
+            found = ["stage"]
+    if not found:
+        raise AppError(
+            f"{device}: name a stage or a camera as --stage and --camera take it, such as "
+            "zaber:/dev/ttyUSB0, or a YAML file with its protocol or kind"
+        )
+    return found

@@ -1,0 +1,439 @@
+"""Results on the disk: a result knows the files it wrote, and only these are ever replaced.
+
+    OUT/
+        metrics.json, ...    what a command wrote
+        files.json           the command, and the SHA-256 of every file it wrote
+        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json
+
+A command writes into `new`. When it is done, the files of the earlier result move to `earlier`,
+the new ones take their places, and the hidden folder goes. `moves.json` is there from before the
+first move until after the last: moves that were interrupted are undone, by the command itself after
+an error or Ctrl-C, by the next command into the folder where the program was killed.
+
+Nothing is written where a session of `emmc-rig capture` lies: see `refuse_inside_session`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from emmc_rig.errors import AppError
+
+FILES = "files.json"
+PARTIAL = ".emmc-rig.partial"
+NEW, EARLIER, MOVES = "new", "earlier", "moves.json"
+SESSION_HEADER, SESSION_JOURNAL = "session.json", "journal.jsonl"
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What a result knows of itself: the command that wrote it, and its files' SHA-256 by name.
+
+    Names are relative to the folder, with slashes.
+    """
+
+    command: str
+    files: Mapping[str, str] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """Return files.json: the digest at its end tells whether somebody edited it."""
+        body = {"command": self.command, "files": dict(sorted(self.files.items()))}
+        digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
+        return json.dumps({**body, "sha256": digest}, indent=1) + "\n"
+
+    @classmethod
+    def read(cls, folder: Path) -> Listing | None:
+        """Return what a folder's files.json says; None where there is none.
+
+        Raises AppError for one that no command wrote like that.
+        """
+        path = folder / FILES
+        try:
+            text = path.read_bytes().decode()
+            data = json.loads(text)
+            listing = cls(data["command"], data["files"])
+            whole = listing.text() == text and all(map(_stays_inside, listing.files))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            whole = False
+        if not whole:
+            raise AppError(
+                f"{path}: was edited, so it does not tell which files may be replaced; choose "
+                "another folder"
+            )
+        return listing
+
+
+def _stays_inside(name: str) -> bool:
+    parts = PurePosixPath(name).parts
+    return bool(parts) and not name.startswith("/") and ".." not in parts and parts[0] != PARTIAL
+
+
+@contextmanager
+def result_folder(
+    out: Path, command: str, *, belongs_to: Path | None = None, adds: bool = False
+) -> Iterator[Path]:
+    """Yield a folder to write into; its files appear in `out` together when the block succeeds.
+
+    The files of an earlier result of the same command are replaced; whatever else is in the folder
+    stays. After a failure everything is as it was.
+
+    Args:
+        out: the folder; made where missing.
+        command: as typed, such as "calibrate --plan".
+        belongs_to: the one folder in a session, or the session itself, where this may be written.
+        adds: the folder may hold other things too, and files of the earlier result that are not
+            written again stay.
+
+    Raises:
+        AppError: `out` is, holds or lies inside a session; the folder holds what no earlier
+            result of this command wrote, or a file that was edited since; another program writes
+            there, or nothing can be written.
+    """
+    folder = Path(os.path.realpath(out))
+    made: list[Path] = []
+    try:
+        refuse_inside_session(out, belongs_to)
+        made = _make_folders(folder, out)
+        with _workplace(folder / PARTIAL):
+            _undo(folder)
+            earlier = _replaceable(folder, out, command, adds)
+            if not adds:
+                _refuse_holding(folder, out)
+            new = folder / PARTIAL / NEW
+            new.mkdir()
+            yield new
+            _take_place(folder, out, earlier, command, adds)
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
+    finally:
+        for one in made:
+            with suppress(OSError):
+                one.rmdir()
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yield a name to write to; the file becomes `path`, which must be free, when the block ends.
+
+    After a failure nothing is left. Raises AppError where something of that name is there, also
+    when it came meanwhile, where a session is, and where nothing can be written.
+    """
+    path = _free(path)
+    place = _place_beside(path)
+    try:
+        with _workplace(place):
+            yield place / path.name
+            _sync(place / path.name)
+            try:
+                os.link(place / path.name, path)
+            except OSError:
+                # It came meanwhile, or the file system has no links, as on a memory stick.
+                os.rename(place / path.name, _free(path))
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+
+
+def refuse_new_file(path: Path) -> None:
+    """Raise what `new_file` would, before the work is done."""
+    try:
+        with _workplace(_place_beside(_free(path))):
+            pass
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+
+
+def _free(path: Path) -> Path:
+    refuse_inside_session(path)
+    if os.path.lexists(path):
+        raise AppError(f"{path}: exists already; choose another name, or move it away first")
+    return Path(os.path.abspath(path))
+
+
+def _place_beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}{PARTIAL}")
+
+
+def is_session(folder: Path) -> bool:
+    """Return whether a folder is a session."""
+    return (folder / SESSION_JOURNAL).is_file() and (folder / SESSION_HEADER).is_file()
+
+
+def refuse_inside_session(out: Path, belongs_to: Path | None = None) -> None:
+    """Raise AppError where `out` is a session or lies inside one, also through links.
+
+    A damaged session is one too. belongs_to: see `result_folder`.
+    """
+    real = Path(os.path.realpath(out))
+    if belongs_to is not None and real == Path(os.path.realpath(belongs_to)):
+        return
+    for one in (real, *real.parents):
+        if _like_session(one):
+            where = "is" if one == real else "lies inside"
+            raise AppError(
+                f"{out}: {where} the session {one}, where nothing else is written; choose another "
+                "place"
+            )
+
+
+def _like_session(folder: Path) -> bool:
+    return any(os.path.isfile(folder / name) for name in (SESSION_JOURNAL, SESSION_HEADER))
+
+
+def _refuse_holding(folder: Path, out: Path) -> None:
+    for place, _, names in os.walk(folder):
+        if SESSION_JOURNAL in names or SESSION_HEADER in names:
+            raise AppError(
+                f"--out {out}: holds the session {os.path.relpath(place, folder)}; choose another "
+                "folder"
+            )
+
+
+def _make_folders(folder: Path, out: Path) -> list[Path]:
+    """Make a folder and those above it; return those that were missing, the innermost first."""
+    if os.path.isfile(folder):
+        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+    missing = []
+    for one in (folder, *folder.parents):
+        if os.path.exists(one):
+            break
+        missing.append(one)
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+@contextmanager
+def _workplace(place: Path) -> Iterator[None]:
+    """Make a hidden folder that is this program's alone; it goes at the end with all in it.
+
+    What a killed program left in it goes too, but for interrupted moves. Raises AppError where
+    another program works in it, and OSError.
+    """
+    descriptor = _held(place)
+    try:
+        if not (place / MOVES).exists():
+            _clear(place)
+        yield
+    finally:
+        try:
+            with suppress(OSError):
+                if not (place / MOVES).exists():
+                    _clear(place)
+                    place.rmdir()
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
+
+
+def _held(place: Path) -> int | None:
+    """Make a folder and lock it; the lock goes with the program, however that ends.
+
+    Returns what to close, None where folders cannot be locked (Windows).
+    """
+    try:
+        import fcntl
+    except ImportError:
+        place.mkdir(exist_ok=True)
+        return None
+    while True:
+        place.mkdir(exist_ok=True)
+        try:
+            descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            continue
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as fault:
+            os.close(descriptor)
+            raise AppError(
+                f"{place.parent}: another emmc-rig command writes there; wait for its end"
+            ) from fault
+        except OSError:
+            return descriptor  # a disk that knows no locks, as some in the network
+        if place.exists() and os.path.samestat(os.fstat(descriptor), place.stat()):
+            return descriptor
+        os.close(descriptor)  # whoever held it has removed it meanwhile
+
+
+def _clear(place: Path) -> None:
+    """Empty a hidden folder of this program; nothing behind a link is touched."""
+    for folder, inner, names in os.walk(place, topdown=False):
+        for name in names:
+            os.unlink(os.path.join(folder, name))
+        for name in inner:
+            path = os.path.join(folder, name)
+            os.unlink(path) if os.path.islink(path) else os.rmdir(path)
+
+
+def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
+    """Return the earlier result, empty where there is none; raises AppError."""
+    earlier = Listing.read(folder)
+    if earlier is None:
+        if not adds and any(one.name != PARTIAL for one in folder.iterdir()):
+            raise AppError(
+                f"--out {out}: the folder holds something else than an earlier result; choose "
+                "another folder or empty it"
+            )
+        return Listing(command)
+    if earlier.command != command:
+        raise AppError(
+            f"--out {out}: holds the result of `emmc-rig {earlier.command}`; choose another folder"
+        )
+    _refuse_edited(folder, out, earlier)
+    return earlier
+
+
+def refuse_edited(out: Path, command: str) -> None:
+    """Raise what `result_folder` would of an earlier result, where it adds to a folder."""
+    if out.is_dir():
+        _replaceable(Path(os.path.realpath(out)), out, command, adds=True)
+
+
+def _refuse_edited(folder: Path, out: Path, earlier: Listing) -> None:
+    for name, sha256 in earlier.files.items():
+        path = folder / name
+        if os.path.lexists(path) and (_behind_link(folder, name) or _digest(path) != sha256):
+            raise AppError(
+                f"--out {out}: {name} is not what `emmc-rig {earlier.command}` wrote; move it away "
+                "or choose another folder"
+            )
+
+
+def _behind_link(folder: Path, name: str) -> bool:
+    path = folder / name
+    above = [one for one in path.parents if folder in one.parents]
+    return any(one.is_symlink() for one in (path, *above))
+
+
+def _digest(path: Path) -> str:
+    """Return a file's SHA-256, "" for what is no file."""
+    if not path.is_file():
+        return ""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _take_place(folder: Path, out: Path, earlier: Listing, command: str, adds: bool) -> None:
+    """Replace the earlier result by what lies in `new`: all of it or, after an error, nothing."""
+    partial = folder / PARTIAL
+    new = dict(_synced(partial / NEW))
+    kept = {name: sha for name, sha in earlier.files.items() if adds and name not in new}
+    listing = Listing(command, {**kept, **new}).text()
+    new[FILES] = _write_synced(partial / NEW / FILES, listing)
+    # Somebody may have edited it since the command began.
+    _refuse_edited(folder, out, earlier)
+    leaving = [
+        name
+        for name in (FILES, *earlier.files)
+        if name not in kept and os.path.lexists(folder / name)
+    ]
+    for name in new:
+        above = [one for one in (folder / name).parents if folder in one.parents]
+        in_the_way = [one for one in above if one.is_symlink() or one.is_file()]
+        if name not in leaving and os.path.lexists(folder / name):
+            in_the_way.append(folder / name)
+        if in_the_way:
+            raise AppError(
+                f"--out {out}: {in_the_way[0].relative_to(folder)} is there and of no earlier "
+                "result; move it away or choose another folder"
+            )
+    _write_synced(partial / "moves", json.dumps({"earlier": leaving, "new": new}))
+    os.replace(partial / "moves", partial / MOVES)
+    try:
+        for name in leaving:
+            _move(folder / name, partial / EARLIER / name)
+        for name in new:
+            _move(partial / NEW / name, folder / name)
+        _sync_folders(folder, [*leaving, *new])
+        (partial / MOVES).unlink()
+    except BaseException:
+        _undo(folder)
+        raise
+    _remove_empty(folder, leaving)
+
+
+def _undo(folder: Path) -> None:
+    """Undo moves that were interrupted, so that the earlier result is whole; else do nothing."""
+    partial = folder / PARTIAL
+    try:
+        moves = json.loads((partial / MOVES).read_bytes())
+    except FileNotFoundError:
+        return
+    for name, sha256 in moves["new"].items():
+        path = folder / name
+        # What still lies in `new` was not moved, so that the name is the earlier file's yet.
+        still_new = (partial / NEW / name).exists()
+        restored = name in moves["earlier"] and not (partial / EARLIER / name).exists()
+        if not still_new and not restored and os.path.lexists(path):
+            if _digest(path) != sha256:
+                raise AppError(
+                    f"{path}: was edited after a command was killed here; move it away, and the "
+                    f"earlier result comes back from {partial}"
+                )
+            path.unlink()
+    for name in moves["earlier"]:
+        if (partial / EARLIER / name).exists():
+            if os.path.lexists(folder / name):
+                raise AppError(
+                    f"{folder / name}: came after a command was killed here; move it away, and the "
+                    f"earlier result comes back from {partial}"
+                )
+            _move(partial / EARLIER / name, folder / name)
+    _remove_empty(folder, moves["new"])
+    (partial / MOVES).unlink()
+    _clear(partial)
+
+
+def _move(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    os.rename(source, target)
+
+
+def _synced(new: Path) -> Iterator[tuple[str, str]]:
+    """Yield name and SHA-256 of every file in a folder; its bytes are then on the disk."""
+    for path in sorted(new.rglob("*")):
+        if not path.is_dir():
+            _sync(path)
+            yield path.relative_to(new).as_posix(), _digest(path)
+
+
+def _sync(path: Path) -> None:
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _write_synced(path: Path, text: str) -> str:
+    """Write a file to the disk; return its SHA-256."""
+    with open(path, "xb") as file:
+        file.write(text.encode())
+        file.flush()
+        os.fsync(file.fileno())
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _sync_folders(folder: Path, names: Iterable[str]) -> None:
+    """Return when the names are on the disk; Windows cannot say."""
+    if os.name == "nt":
+        return
+    for place in {folder, *((folder / name).parent for name in names)}:
+        with suppress(FileNotFoundError):
+            descriptor = os.open(place, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+
+def _remove_empty(folder: Path, names: Iterable[str]) -> None:
+    """Remove the folders inside `folder` that these files leave empty."""
+    above = {one for name in names for one in (folder / name).parents if folder in one.parents}
+    for one in sorted(above, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):
+            one.rmdir()

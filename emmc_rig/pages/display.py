@@ -1,0 +1,138 @@
+"""Linear pictures as screen codes, and codes as pictures in a page: sprites, montages, heat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.pages.page import data_address
+
+Array = NDArray[np.floating]
+
+JPEG_QUALITY = 88
+TILE_MULTIPLE_PX = 16  # a JPEG block never straddles two views
+SPRITE_PIXELS = 24_000_000  # canvases above this fail on small machines; larger views are reduced
+HEAT = (
+    (13, 16, 38),
+    (62, 46, 128),
+    (160, 56, 132),
+    (234, 104, 80),
+    (250, 206, 104),
+    (255, 252, 232),
+)
+
+
+@dataclass(frozen=True)
+class DisplayCurve:
+    """How linear values become screen values: (gain x value) ^ (1 / gamma), 8 bits."""
+
+    gain: float
+    gamma: float
+
+    @classmethod
+    def fitted_to(cls, picture: Array) -> DisplayCurve:
+        """Highlights at white, and the median of a dark scene lifted towards middle grey."""
+        sample = finite(picture.reshape(-1)[::7])
+        white = max(float(np.percentile(sample, 99.7)), 1e-6)
+        median = min(max(float(np.median(sample)) / white, 1e-3), 0.99)
+        return cls(1 / white, min(max(math.log(median) / math.log(0.36), 1.0), 2.2))
+
+    def encode(self, linear: Array) -> NDArray[np.uint8]:
+        """Screen values of linear ones, any shape."""
+        levels = np.clip(finite(linear) * np.float32(self.gain), 0, 1)
+        np.power(levels, np.float32(1 / self.gamma), out=levels)
+        return (levels * 255 + 0.5).astype(np.uint8)
+
+
+def finite(values: Array) -> NDArray[np.float32]:
+    """Return float32 values, 0 where they are not finite, 1 for +infinity."""
+    values = np.asarray(values, np.float32)
+    if np.isfinite(values.sum(dtype=np.float64)):  # cheaper than asking every value
+        return values
+    return np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0)
+
+
+def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
+    done, encoded = cv2.imencode(extension, image, options)
+    if not done:
+        raise ValueError(f"cannot encode a picture of shape {image.shape} as {extension}")
+    return data_address(encoded.tobytes(), extension)
+
+
+def png_of(image: NDArray[np.uint8]) -> str:
+    """A lossless picture as an address that holds it."""
+    return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
+
+
+def sprite(views: NDArray[np.uint8], quality: int) -> str:
+    """All views of (v, u, y, x, c) in one JPEG, each padded to whole JPEG blocks.
+
+    Colour is kept at full resolution: half-resolution chroma bleeds from view to view.
+    """
+    rows, columns, height, width, colours = views.shape
+    padding = [(0, -height % TILE_MULTIPLE_PX), (0, -width % TILE_MULTIPLE_PX)]
+    padded = np.pad(views, [(0, 0), (0, 0), *padding, (0, 0)], mode="edge")
+    tiled = padded.transpose(0, 2, 1, 3, 4).reshape(
+        rows * padded.shape[2], columns * padded.shape[3], colours
+    )
+    if colours == 3:
+        tiled = np.ascontiguousarray(tiled[..., ::-1])  # OpenCV's channel order
+    return _data_uri(
+        tiled,
+        ".jpg",
+        cv2.IMWRITE_JPEG_QUALITY,
+        quality,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    )
+
+
+def reduced(views: Array) -> Array:
+    """Views small enough for one sprite; the same array when they already are."""
+    rows, columns, height, width, colours = views.shape
+    shrink = math.sqrt(SPRITE_PIXELS / (rows * columns * height * width))
+    if shrink >= 1:
+        return views
+    size = (max(1, int(width * shrink)), max(1, int(height * shrink)))
+    small = [
+        cv2.resize(finite(view), size, interpolation=cv2.INTER_AREA)
+        for view in views.reshape(-1, height, width, colours)
+    ]
+    shape = (rows, columns, size[1], size[0], colours)
+    return np.asarray(small, np.float32).reshape(shape)
+
+
+def three_colours(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return pictures of one colour as pictures of three equal ones, others as they are."""
+    return np.repeat(views, 3, axis=-1) if views.shape[-1] == 1 else views
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 5, 7 times a power of ten: a readable end of a scale."""
+    if not math.isfinite(value) or value <= 0:
+        return 1.0
+    decade = 10.0 ** math.floor(math.log10(value))
+    end = next(step * decade for step in (1, 1.5, 2, 3, 5, 7, 10) if step * decade >= value)
+    return float(f"{end:.2g}")  # 0.15, not 0.15000000000000002
+
+
+def montage(tiles: NDArray[np.uint8], gap_px: int) -> NDArray[np.uint8]:
+    """(v, u, y, x) or (v, u, y, x, c) as one picture with white gaps."""
+    around = [(0, 0)] * tiles.ndim
+    around[2] = around[3] = (0, gap_px)
+    padded = np.pad(tiles, around, constant_values=255)
+    order = (0, 2, 1, 3, *range(4, tiles.ndim))
+    rows, columns, height, width = padded.shape[:4]
+    sheet = padded.transpose(order).reshape(rows * height, columns * width, *tiles.shape[4:])
+    return np.ascontiguousarray(sheet[:-gap_px, :-gap_px])
+
+
+def heat(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey levels through the heat colours, in OpenCV's channel order."""
+    at = np.linspace(0, 255, len(HEAT))
+    table = [np.interp(np.arange(256), at, channel) for channel in zip(*HEAT, strict=True)]
+    return np.stack(table[::-1], axis=-1).round().astype(np.uint8)[levels]

@@ -1,0 +1,164 @@
+"""The points of a stability sweep, measured for accuracy alone: in this process, untimed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.pages.page import number
+from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.pages.thumbnails import save_thumbnail
+from emmc_rig.progress import Watcher
+from emmc_rig.study.chart.scores import angular_snr_db
+from emmc_rig.study.stability.fault_points import Point
+from emmc_rig.study.stability.faults import FAULTS, camera_for
+from emmc_rig.study.stability.trial import Setup, Trial
+from emmc_rig.study.sweep import Results, Sweep, dictionary_identity, digest_of, machine
+from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.sparse import SparseSettings
+
+PICTURES = "pictures"
+open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)
+
+
+@dataclass
+class StabilitySweep(Sweep[Point]):
+    """The points of a sweep; settings: StabilitySettings."""
+
+    revision = 1
+
+    def picture(self, point: Point) -> Path:
+        """Return where the picture of a point is kept."""
+        return self.folder / PICTURES / f"{self.digest(point)}.webp"
+
+    def truth_picture(self, point: Point) -> Path:
+        """Return where the picture of what should have been reconstructed is kept."""
+        return self.folder / PICTURES / f"{digest_of(self._trial_inputs(point))}-truth.webp"
+
+    def unmeasured(self) -> list[str]:
+        """Return a line for what could not be measured, and why."""
+        missing: dict[tuple[str, str, str], dict[float, None]] = {}
+        for point, why in self.left_out.items():
+            strengths = missing.setdefault((point.scene_name, point.fault, why), {})
+            strengths[point.strength] = None
+        return [
+            f"{FAULTS[fault].title} at {', '.join(f'{one:g}' for one in strengths)}, {scene}: {why}"
+            for (scene, fault, why), strengths in missing.items()
+        ]
+
+    def inputs(self, point: Point) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        needed = METHODS[point.method].needs_dictionary
+        return {
+            **self._trial_inputs(point),
+            "method": point.method,
+            "settings": _settings(point).model_dump(mode="json"),
+            "dictionary": dictionary_identity(self.settings.dictionary) if needed else None,
+        }
+
+    def _trial_inputs(self, point: Point) -> dict[str, object]:
+        settings, fault = self.settings, FAULTS[point.fault]
+        clean = fault.is_clean(point.strength)
+        return {
+            "machine": machine(),
+            "scene": point.scene_name,
+            "content": _content(point.scene, settings.camera, settings.size, settings.seed),
+            "camera": camera_for(fault, find_camera(settings.camera)).model_dump(mode="json"),
+            "size": settings.size,
+            "zoom": settings.zoom,
+            "seed": settings.seed,
+            "fault": None if clean else point.fault,
+            "strength": None if clean else point.strength,
+        }
+
+    def is_whole(self, point: Point, result: dict) -> bool:
+        """Return whether a point that has figures has its picture."""
+        return "failed" in result or self.picture(point).is_file()
+
+    def group(self, point: Point) -> Hashable:
+        """Return what all methods of one trial have in common."""
+        return point.scene, point.fault, point.strength
+
+    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
+        """Yield the methods' figures on one trial."""
+        one = points[0]
+        made = self.settings.trial(one.fault, one.strength, one.scene)
+        truth = self.truth_picture(one)
+        truth.parent.mkdir(exist_ok=True)
+        if not truth.is_file():
+            save_thumbnail(truth, made.truth, telling_lines(made.truth))
+        for point in points:
+            yield self._measured(point, made)
+
+    def _measured(self, point: Point, made: Trial) -> dict:
+        dictionary = None
+        if METHODS[point.method].needs_dictionary:
+            views = made.psi.light_field_shape[:2]
+            dictionary = open_dictionary_once(self.settings.dictionary, views, made.psi.binning)
+        stretched_db = 20 * math.log10(made.peak)
+        view_db = psnr_db(replicate_centre(made.truth), made.truth) + stretched_db
+        try:
+            result = reconstruct(
+                point.method,
+                made.psi,
+                made.readings,
+                made.noise_sigma,
+                dictionary,
+                _settings(point, made.psi.binning),
+                made.usable,
+            )
+        except MemoryError:
+            return {"failed": "not enough memory", "keep": False}
+        except Exception as fault:
+            # That a method fails is a finding; a fault of the program is measured again next time.
+            known = type(fault).__module__.startswith(("reconstruction", "emmc_rig"))
+            kind = "" if known else f"{type(fault).__name__}: "
+            return {"failed": f"{kind}{fault}", "view_db": view_db, "keep": known}
+        estimate = result.light_field
+        if not np.isfinite(estimate).all():
+            return {"failed": "the estimate is not finite", "view_db": view_db}
+        save_thumbnail(self.picture(point), estimate, telling_lines(made.truth))
+        return {
+            "psnr_db": psnr_db(estimate, made.truth) + stretched_db,
+            "view_db": view_db,
+            "angular_db": angular_snr_db(estimate, made.truth),
+            "usable": float(made.usable.mean()),
+            "noise_sigma": made.noise_sigma,
+            "psi_error": made.psi.relative_difference(made.true_psi),
+            "status": result.status,
+            "advice": result.advice,
+            "screening": "; ".join(result.screening),
+        }
+
+    def words(self, point: Point, result: dict) -> str:
+        """Return a measured point in words."""
+        if "failed" in result:
+            return f"{point.label}: {result['failed']}"
+        return f"{number(result['psnr_db'], '.2f')} dB, {point.label}"
+
+
+def _settings(point: Point, binning: int = 1) -> MethodSettings:
+    """Return the settings of a point: the default ones, patches placed on whole pixels."""
+    stride = SparseSettings().stride
+    sparse = SparseSettings(stride=max(stride // binning * binning, binning))
+    return MethodSettings(screening=point.screened, sparse=sparse)
+
+
+@lru_cache
+def _content(
+    scene: str, camera: str, size: tuple[int, int] | None, seed: int
+) -> list[float] | None:
+    """Return what tells a measured scene from another of its name; a built-in one has its seed."""
+    setup = Setup(scene, find_camera(camera), size, seed)
+    if setup.is_built_in:
+        return None
+    seen = setup.scene_seen().light_field
+    return [float(np.sum(seen, dtype=np.float64)), float(np.sum(np.square(seen, dtype=np.float64)))]

@@ -1,0 +1,358 @@
+"""The engine of every study: points measured one by one, each kept, and gone on with after a stop.
+
+A point is found again by a digest of everything that it depends on, so changed settings never meet
+old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import platform
+import re
+from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_edited, refuse_inside_session
+from emmc_rig.files.results import command_line, metrics_text, versions
+from emmc_rig.model.settings import Settings
+from emmc_rig.progress import Watcher
+from emmc_rig.version import __version__
+
+P = TypeVar("P", bound=Hashable)
+Results = Generator[dict, None, None]
+
+
+class SweepStopped(KeyboardInterrupt):
+    """Ctrl-C; the points measured so far are kept."""
+
+
+class NotApplicableError(AppError):
+    """A point cannot be measured with this camera or scene; the message says why."""
+
+
+@contextmanager
+def sweep_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
+    """Yield the folder of a sweep, created where missing; it outlives interruptions of the block.
+
+    Raises what `open_folder` and `kept_when_stopped` do.
+    """
+    folder = open_folder(out, journal, command)
+    with kept_when_stopped(out, folder):
+        yield folder
+
+
+def open_folder(out: Path, journal: str, command: str) -> Path:
+    """Return the folder of a journal of this name, created where missing.
+
+    command: as typed, such as "chart". What is drawn and written of the points is replaced later by
+    `result_folder`; what that would refuse is refused here, before anything is measured.
+
+    Raises AppError when the folder holds something else, or results that somebody edited, and
+    where a session is.
+    """
+    refuse_inside_session(out)
+    out = Path(os.path.abspath(out))
+    if out.is_file():
+        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / journal).is_file():
+        raise AppError(
+            f"--out {out}: the folder holds something else than an earlier `emmc-rig {command}`; "
+            "choose another folder or empty it"
+        )
+    try:
+        refuse_edited(out, command)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / journal).touch()
+    except OSError as fault:
+        raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
+    return out
+
+
+@contextmanager
+def kept_when_stopped(
+    out: Path, folder: Path, what: Callable[[], str] = lambda: "every point that was done is"
+) -> Iterator[None]:
+    """Say what is kept when Ctrl-C or a full disk ends the block.
+
+    out: the folder as asked for, folder: where it is. what: such as "3 of 10 points are". Raises
+    SweepStopped and AppError.
+    """
+    try:
+        yield
+    except SweepStopped:
+        raise
+    except KeyboardInterrupt as stop:
+        raise SweepStopped(
+            f"stopped by Ctrl-C; {what()} kept in {folder}: run the same command again to go on"
+        ) from stop
+    except OSError as fault:
+        raise AppError(
+            f"--out {out}: cannot be written ({fault.strerror or fault}); {what()} kept: "
+            "make room and run the same command again to go on"
+        ) from fault
+
+
+def digest_of(inputs: Mapping[str, object]) -> str:
+    """Return a digest of plain data, the same for equal content in any order of keys."""
+    text = json.dumps(inputs, sort_keys=True, allow_nan=False)
+    return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
+
+
+class Journal:
+    """The results so far, by digest."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._results: dict[str, dict] = {}
+        path.touch()
+        text = path.read_bytes().decode("utf-8", errors="replace")
+        self._torn = bool(text) and not text.endswith("\n")
+        for line in text.splitlines():
+            try:
+                entry = json.loads(line)
+                self._results[entry["digest"]] = entry["result"]
+            except (ValueError, KeyError, TypeError):
+                continue
+
+    def __len__(self) -> int:
+        return len(self._results)
+
+    def get(self, digest: str) -> dict | None:
+        """Return a point's result, None when it is not measured."""
+        return self._results.get(digest)
+
+    def add(self, digest: str, inputs: Mapping[str, object], result: dict) -> None:
+        """Keep a result: it is on the disk when this returns. Raises OSError when it cannot be."""
+        entry = {"digest": digest, "inputs": inputs, "result": result}
+        line = json.dumps(entry, allow_nan=False) + "\n"
+        start, self._torn = (b"\n" if self._torn else b""), True
+        with open(self._path, "ab") as file:
+            file.write(start + line.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        self._torn = False
+        self._results[digest] = result
+
+
+@dataclass
+class Sweep(Generic[P]):
+    """Points measured into a folder. A study is a subclass that says what a point is.
+
+    results: by point, plain data; one with `failed` says why there are no figures, and is measured
+    again the next time if its `keep` is False. left_out: points that cannot be, and why.
+    """
+
+    settings: Any
+    folder: Path
+    results: dict[P, dict] = field(default_factory=dict, init=False)
+    left_out: dict[P, str] = field(default_factory=dict, init=False)
+    _digests: dict[P, str] = field(default_factory=dict, init=False)
+
+    journal: ClassVar[str] = "points.jsonl"
+    noun: ClassVar[str] = "points"
+    stage: ClassVar[str] = "measure the points"
+    revision: ClassVar[int | None] = None
+    """Of what a point's figures are: raised with them, so that older points are measured again."""
+
+    def inputs(self, point: P) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data.
+
+        Raises NotApplicableError for a point that cannot be measured.
+        """
+        raise NotImplementedError
+
+    def measured(self, points: Sequence[P], watcher: Watcher) -> Results:
+        """Yield the result of each point of a group, in order.
+
+        Raises NotApplicableError where the rest of the group cannot be measured.
+        """
+        raise NotImplementedError
+
+    def group(self, point: P) -> Hashable:
+        """Return what points that are measured together have in common."""
+        return point
+
+    def is_whole(self, point: P, result: dict) -> bool:
+        """Return whether all that belongs to a kept result, such as a picture, is there."""
+        return True
+
+    def prepare(self, points: Sequence[P], watcher: Watcher) -> None:
+        """Make what several of the points need that will be measured."""
+
+    def words(self, point: P, result: dict) -> str:
+        """Return a measured point in words."""
+        return self.label(point)
+
+    def label(self, point: P) -> str:
+        """Return a point in words."""
+        return getattr(point, "label", str(point))
+
+    def all_inputs(self, point: P) -> dict[str, object]:
+        """Return the inputs with the versions of the program and of the figures."""
+        revision = {} if self.revision is None else {"revision": self.revision}
+        return {"version": __version__, **revision, **self.inputs(point)}
+
+    def digest(self, point: P) -> str:
+        """Return the digest by which a point is found again."""
+        if point not in self._digests:
+            self._digests[point] = digest_of(self.all_inputs(point))
+        return self._digests[point]
+
+    def failures(self) -> list[str]:
+        """Return a line for each point that has no figures."""
+        return [
+            f"{self.label(point)}: {result['failed']}"
+            for point, result in self.results.items()
+            if "failed" in result
+        ]
+
+    def run(self, points: Iterable[P], watcher: Watcher) -> dict[P, dict]:
+        """Measure the points that the folder does not hold; return the results in their order.
+
+        Raises SweepStopped at Ctrl-C, AppError when the folder cannot be written, and what the
+        study does for wrong input; what is measured is kept in each case.
+        """
+        points = list(dict.fromkeys(points))
+        self.results, self.left_out = {}, {}
+
+        def kept() -> str:
+            return f"{len(self.results)} of {len(points)} {self.noun} are"
+
+        with kept_when_stopped(self.folder, self.folder, kept):
+            journal = Journal(self.folder / self.journal)
+            missing = [point for point in points if not self._recalled(point, journal)]
+            missing = [point for point in missing if point not in self.left_out]
+            self.prepare(missing, watcher)
+            before = f", {len(self.results)} kept from before" if self.results else ""
+            watcher.begin(self.stage + before, len(missing))
+            groups: dict[Hashable, list[P]] = {}
+            for point in missing:
+                groups.setdefault(self.group(point), []).append(point)
+            for group in groups.values():
+                self._measure(group, journal, watcher)
+        self.results = {point: self.results[point] for point in points if point in self.results}
+        return self.results
+
+    def _recalled(self, point: P, journal: Journal) -> bool:
+        """Take a point's result from the journal; return whether there is a whole one."""
+        try:
+            result = journal.get(self.digest(point))
+        except NotApplicableError as why:
+            self.left_out[point] = str(why)
+            return False
+        if result is None or not self.is_whole(point, result):
+            return False
+        self.results[point] = result
+        return True
+
+    def _measure(self, group: Sequence[P], journal: Journal, watcher: Watcher) -> None:
+        # Points of an earlier group may have had the same inputs.
+        missing = [point for point in group if not self._recalled(point, journal)]
+        for point in group:
+            if point not in missing:
+                watcher.step(self.words(point, self.results[point]))
+        if not missing:
+            return
+        with closing(self.measured(missing, watcher)) as results:
+            try:
+                for point, result in zip(missing, results, strict=True):
+                    result = plain(result)
+                    if result.get("keep", True):
+                        journal.add(self.digest(point), self.all_inputs(point), result)
+                    self.results[point] = result
+                    watcher.step(self.words(point, result))
+            except NotApplicableError as why:
+                for point in missing:
+                    if point not in self.results:
+                        self.left_out[point] = str(why)
+                        watcher.step(f"left out: {self.label(point)}")
+
+
+def plain(result: Mapping[str, object]) -> dict:
+    """Return a result as JSON gives it back: None for what is not finite, lists for tuples."""
+    return json.loads(metrics_text(result))
+
+
+def csv_text(
+    rows: Sequence[Mapping[str, object]],
+    columns: Sequence[str] = (),
+    form: str = ".6g",
+    forms: Mapping[str, str] | None = None,
+) -> str:
+    """Return rows as CSV: the columns named, or all that any row has; None is an empty field.
+
+    form: of floats, but for the columns that `forms` has.
+    """
+
+    def written(name: str, value: object) -> object:
+        return format(value, (forms or {}).get(name, form)) if isinstance(value, float) else value
+
+    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n", restval="", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows({name: written(name, value) for name, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def recorded(settings: Settings) -> dict[str, object]:
+    """Return what metrics.json says of how its figures were made."""
+    return {
+        "settings": settings.model_dump(mode="json"),
+        "command": command_line(),
+        "versions": versions(),
+    }
+
+
+def provenance(settings: Settings, seconds: float, **more: str) -> dict[str, str]:
+    """Return what a page says of where it came from; more: rows after the seconds."""
+    return {
+        "Command line": command_line(),
+        "Seconds of this run": f"{seconds:.0f}",
+        **more,
+        "Settings": settings.model_dump_json(),
+        **{f"Version of {name}": version for name, version in versions().items()},
+    }
+
+
+def check_scene_names(specs: Sequence[str], option: str = "--scene") -> None:
+    """Raise AppError when two scenes (or cameras, by `option`) have one name."""
+    names = [Path(spec).stem for spec in specs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise AppError(f"{option}: two are called '{twice}'; name each once, or rename one")
+
+
+def available_cores() -> int:
+    """Return the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def machine() -> str:
+    """Return the processor's name and the number of cores."""
+    name = platform.processor() or platform.machine()
+    try:
+        cpu = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
+    except OSError:
+        cpu = ""
+    if found := re.search(r"^model name\s*:\s*(.+)$", cpu, re.MULTILINE):
+        name = found[1].strip()
+    return f"{name}, {available_cores()} cores"
+
+
+def dictionary_identity(dictionary: str | None) -> str:
+    """Return what tells a dictionary from another: its name, and of a file its size and time."""
+    if dictionary is None or not Path(dictionary).is_file():
+        return dictionary or "lambertian"
+    seen = Path(dictionary).stat()
+    return f"{dictionary} {seen.st_size} {seen.st_mtime_ns}"

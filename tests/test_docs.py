@@ -1,0 +1,78 @@
+"""The documentation is run: every command block, as it stands, in order, in one fresh folder.
+
+A comment before a block says why it is only parsed, not run: it needs hardware, or real files, or
+takes minutes. EMMC_SIZE, which the README names, makes the rest small.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+from placed import files_of, listed
+from programs import program
+
+from emmc_rig import cli
+from emmc_rig.commands.options import SIZE_VARIABLE
+
+ROOT = Path(__file__).parents[1]
+REASONS = ("hardware", "real files", "minutes")
+NOT_OURS = ("pip", "pytest")
+"""Programs that brought the tests here, or are the tests."""
+BLOCK = re.compile(r"^(?:<!-- (?P<why>[^\n]*) -->\n)?```\n(?P<text>.*?)^```$", re.M | re.S)
+
+
+def blocks(document):
+    """Yield (why it is not run, its commands) of every block that begins with a program."""
+    for found in BLOCK.finditer(document.read_text(encoding="utf-8")):
+        if found["text"].split()[0] in ("emmc-rig", *NOT_OURS):
+            yield found["why"], list(commands(found["text"]))
+
+
+def commands(text):
+    """Yield the words of every emmc-rig command of a block, as a shell splits them."""
+    for line in text.splitlines():
+        for part in " ".join(shlex.split(line, comments=True)).split(" && "):
+            words = part.split()
+            assert words, line
+            assert words[0] in ("emmc-rig", *NOT_OURS), f"not a command: {line}"
+            if words[0] == "emmc-rig":
+                yield words[1:]
+
+
+ALL = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [document for document in ALL if any(found for _, found in blocks(document))]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_command_of_the_documentation_is_one_of_the_program(document):
+    for why, found in blocks(document):
+        assert why is None or why in REASONS, why
+        for words in found:
+            command, rest = typer.main.get_command(cli.app), list(words)
+            while (group := getattr(command, "commands", None)) is not None:
+                command = group[rest.pop(0)]
+            command.make_context(words[0], rest)
+
+
+@pytest.fixture
+def small(tmp_path, monkeypatch):
+    """A fresh folder, a small size, and servers that end at once."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(SIZE_VARIABLE, "32x40")
+    monkeypatch.setattr("emmc_rig.commands.live._serve", lambda *arguments: None)
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
+    for why, found in blocks(document):
+        for words in found if why is None else ():
+            before, ours = files_of(Path()), listed(Path())
+            code, out, err = program(*words)
+            assert code == 0, f"emmc-rig {' '.join(words)}\n{out}\n{err}"
+            after = files_of(Path())
+            lost = [path for path in before if after.get(path) != before[path]]
+            grown = [path for path in lost if path.name == "journal.jsonl"]
+            assert all(ours.get(path) == before[path] or path in grown for path in lost), lost

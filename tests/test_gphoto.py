@@ -1,0 +1,242 @@
+"""libgphoto2 as our camera, against our own simulated camera over PTP/IP (extra `gphoto2`).
+
+The simulated camera runs in a process of its own: libgphoto2 holds Python's lock while it waits.
+"""
+
+import json
+import subprocess
+import sys
+from contextlib import closing, contextmanager
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
+
+from drivers.errors import (
+    CameraClosedError,
+    CameraSettingError,
+    CaptureError,
+    GphotoError,
+    RawFrameError,
+)
+from drivers.gphoto import GphotoCamera, seconds_of
+from drivers.ptp_canon import EosOperation
+from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.errors import AppError
+from emmc_rig.rig.hardware import open_camera
+from simulators.clock import ManualClock
+from simulators.ptp import PtpUsbFunction
+from simulators.ptp_canon import EosCameraSimulator
+from simulators.usb import SimulatedUsb
+
+SERVER = """
+import json, sys
+import numpy as np
+from drivers.clock import SystemClock
+from simulators.ptp import PtpCameraSimulator
+from simulators.ptp_canon import EosCameraSimulator
+from simulators.ptpip import PtpIpServer
+
+mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
+told = json.loads(sys.argv[1])
+make = EosCameraSimulator if told["eos"] else PtpCameraSimulator
+settings = {"old": True} if told["eos"] == "old" else {}
+camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=told["quality"], **settings)
+asked, respond = [], camera.respond
+
+def noted(request, data):
+    asked.append([request.code, list(request.parameters), data.hex()])
+    return respond(request, data)
+
+camera.respond = noted
+for fault in told["faults"]:
+    camera.faults.inject(fault)
+with PtpIpServer(camera) as server:
+    print(server.port, flush=True)
+    sys.stdin.read()
+    print(json.dumps([sum(bool(data) for _, data in camera.objects.values()), asked]))
+"""
+MOSAIC = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
+
+
+@contextmanager
+def served(quality="raw", faults=(), eos=""):
+    """A simulated camera on a port; yields libgphoto2's name of it, and a list of what is known
+    of it when it ended: the number of files left on its card, and all that it was asked.
+    """
+    told = json.dumps({"quality": quality, "faults": faults, "eos": eos})
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVER, told],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    known = []
+    try:
+        port = process.stdout.readline().strip()
+        yield f"ptpip:127.0.0.1:{port}:{port}", known
+    finally:
+        out, _ = process.communicate("", timeout=20)
+        known.extend(json.loads(out))
+
+
+@pytest.fixture(scope="module")
+def address():
+    with served() as (name, _):
+        yield name
+
+
+@pytest.fixture
+def camera(address):
+    with closing(GphotoCamera(address)) as opened:
+        opened.set_gain(1.0)
+        yield opened
+
+
+def test_a_frame_is_what_the_sensor_reads(camera):
+    camera.set_exposure_s(0.008)
+    frame = camera.snap()
+    np.testing.assert_array_equal(frame.mosaic, MOSAIC)
+    assert (frame.cfa, frame.exposure_s, frame.gain) == ("grbg", 0.008, 1.0)
+    assert frame.metadata["name"].endswith(".DNG")
+    assert camera.identity.model == "EMMC simulated camera"
+
+
+def test_a_second_session_exposes_as_the_first_did(address):
+    for _ in range(2):
+        with closing(GphotoCamera(address)) as camera:
+            for exposure_s in (0.004, 0.0166):
+                camera.set_exposure_s(exposure_s)
+                assert camera.snap().exposure_s == pytest.approx(exposure_s, rel=0.02)
+
+
+def test_the_gain_is_the_iso_over_the_lowest(camera):
+    camera.set_gain(4.0)
+    frame = camera.snap()
+    assert (camera.gain, frame.gain) == (4.0, 4.0)
+    black = 64.0
+    expected = np.clip(np.rint(black + 4 * (MOSAIC.astype(float) - black)), 0, 4095)
+    np.testing.assert_array_equal(frame.mosaic, expected)
+    camera.set_gain(1.0)
+
+
+def test_settings_are_set_by_libgphoto2s_names_and_all_are_listed(address):
+    with closing(GphotoCamera(address, settings={"iso": 200})) as camera:
+        assert camera.gain == 2.0
+        assert camera.details()["shutterspeed"].endswith("s")
+        camera.set_gain(1.0)
+    with pytest.raises(CameraSettingError, match="no_such cannot become 1"):
+        GphotoCamera(address, settings={"no_such": 1})
+
+
+def test_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
+    with served("raw+jpeg") as (name, known), closing(GphotoCamera(name, delete=True)) as camera:
+        for _ in range(2):
+            np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    assert known[0] == 2
+
+
+EOS_CONTROLS = {*EosOperation} - {
+    EosOperation.SET_REMOTE_MODE,
+    EosOperation.SET_EVENT_MODE,
+    EosOperation.GET_EVENT,
+}
+
+
+@pytest.mark.parametrize("age", ["new", "old"])
+def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_makes(age):
+    card = {"capturetarget": "Memory card"}
+    with served(eos=age) as (name, known):
+        for _ in range(2):
+            with closing(GphotoCamera(name, settings=card)) as camera:
+                take(camera)
+    theirs = [one for one in known[1] if one[0] in EOS_CONTROLS and "1cd1" not in one[2]]
+    ours = []
+    clock = ManualClock()
+    body = EosCameraSimulator(lambda exposure_s: MOSAIC, clock, "grbg", old=age == "old")
+    respond = body.respond
+
+    def noted(request, data):
+        ours.append([request.code, list(request.parameters), data.hex()])
+        return respond(request, data)
+
+    body.respond = noted
+    bus = SimulatedUsb(clock, PtpUsbFunction(body))
+    for _ in range(2):
+        with closing(open_camera("ptp:", clock, bus)) as camera:
+            take(camera)
+    assert theirs == [one for one in ours if one[0] in EOS_CONTROLS]
+
+
+def take(camera):
+    """Set what has exactly one code, and expose."""
+    camera.set_exposure_s(0.5)
+    camera.set_gain(4.0)
+    frame = camera.snap()
+    assert frame.mosaic.shape == (40, 48)
+    assert camera.exposure_s == pytest.approx(0.5)
+
+
+def test_a_camera_set_to_jpeg_is_told_so():
+    with (
+        served("jpeg") as (name, _),
+        closing(GphotoCamera(name)) as camera,
+        pytest.raises(CaptureError, match=r"gave EMMC0001.JPG: set its image quality to RAW"),
+    ):
+        camera.snap()
+
+
+def test_a_torn_file_is_no_frame_and_the_next_one_is():
+    with served(faults=["torn_raw"]) as (name, known), closing(GphotoCamera(name)) as camera:
+        with pytest.raises(RawFrameError, match="torn"):
+            camera.snap()
+        np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+    assert known[0] == 2
+
+
+def test_no_camera_is_one_line_with_a_remedy():
+    with pytest.raises(GphotoError, match="plug it in") as caught:
+        GphotoCamera("", model="")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(GphotoError, match="list-cameras"):
+        GphotoCamera("usb:", model="No Such Camera")
+
+
+def test_a_closed_camera_takes_no_setting(address):
+    camera = GphotoCamera(address)
+    camera.close()
+    with pytest.raises(CameraClosedError):
+        camera.set_exposure_s(0.008)
+
+
+def test_a_short_name_and_a_file_open_it(address, tmp_path):
+    with closing(open_camera(f"gphoto2:{address}")) as camera:
+        assert camera.shape == (40, 48)
+    file = tmp_path / "camera.yaml"
+    file.write_text(f"{{kind: gphoto2, address: '{address}', settings: {{iso: 100}}}}")
+    with closing(open_camera(str(file))) as camera:
+        assert camera.gain == 1.0
+    file.write_text("{kind: gphoto2, setings: {iso: 100}}")
+    with pytest.raises(AppError, match="did you mean 'settings'"):
+        open_camera(str(file))
+
+
+@pytest.mark.parametrize(
+    ("words", "seconds"),
+    [
+        ("1/125", 1 / 125),
+        ("0.0080s", 0.008),
+        ("30", 30.0),
+        ('1.3"', 1.3),
+        ("10/13", 10 / 13),
+        ("bulb", None),
+        ("auto", None),
+        ("1/0", None),
+        ("0.0000s", None),
+    ],
+)
+def test_a_choice_of_any_maker_means_its_exposure(words, seconds):
+    assert seconds_of(words) == (seconds if seconds is None else pytest.approx(seconds))

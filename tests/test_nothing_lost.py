@@ -1,0 +1,229 @@
+"""No command deletes or overwrites what it did not make: every command against every bad place.
+
+A command that writes needs its smallest arguments in WRITERS; one that writes nothing is named in
+READERS. A command in neither fails the first test.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import yaml
+from placed import files_of, listed
+from programs import program
+
+from emmc_rig import cli
+from emmc_rig.files.folders import result_folder
+from emmc_rig.model.lightfield import save_hdf5
+
+SIZE = ("--size", "24x32")
+RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
+ONE_FILE = {"capture --new", "session export", "train", "devices serve"}
+WRITERS = {
+    "cameras": ("rgbw-mono",),
+    "capture": ("other.yaml", *RIG),
+    "capture --new": ("rgbw-mono",),
+    "calibrate": (*SIZE,),
+    "calibrate SESSION": ("made-session",),
+    "calibrate --check": ("psi", *SIZE),
+    "calibrate --drift": ("frames", "--known", "frames"),
+    "calibrate --plan": (*SIZE,),
+    "chart": ("--fast",),
+    "chart --ablation": (*SIZE,),
+    "chart --kernels": (*SIZE,),
+    "chart --next-shot": (*SIZE,),
+    "chart --peers": (*SIZE,),
+    "chart --solvers": (),
+    "demo": (*SIZE,),
+    "devices bench": (),
+    "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
+    "devices serve": ("zaber",),
+    "devices snap": ("--rig", "simulated"),
+    "reconstruct": ("frames",),
+    "reconstruct SESSION": ("made-session",),
+    "reconstruct --tile": (8, "frames"),
+    "session bench": (),
+    "session export": ("made-session",),
+    "session sheet": ("made-session",),
+    "simulate": (*SIZE,),
+    "stability": ("--fast",),
+    "stability --theory": ("--fast",),
+    "stability --verdicts": ("--fast",),
+    "tables": ("--fast",),
+    "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
+              "--sparsity", 2, "--iterations", 1),
+}  # fmt: skip
+READERS = {
+    "devices camera", "devices home", "devices info", "devices jog", "devices list",
+    "devices probe", "devices udev-rule", "live", "session list", "session prune", "session show",
+    "session verify",
+}  # fmt: skip
+JOURNALS = {
+    "chart": "points.jsonl",
+    "chart --next-shot": "next_shots.jsonl",
+    "stability": "points.jsonl",
+    "stability --theory": "points.jsonl",
+    "stability --verdicts": "verdicts.jsonl",
+    "tables": "cells.jsonl",
+}
+"""What lies in a folder that a study goes on with."""
+
+
+def commands(group, path=()):
+    """Yield name and parameters of every command."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*path, name))
+        else:
+            yield " ".join((*path, name)), [opt for one in command.params for opt in one.opts]
+
+
+def test_every_command_is_known_here_and_those_that_name_a_place_to_write_are_tried():
+    known = {typed.partition(" --")[0].removesuffix(" SESSION") for typed in WRITERS}
+    for name, options in commands(typer.main.get_command(cli.app)):
+        writes = {"--out", "--link"} & set(options)
+        assert name in known or name in READERS, f"give `{name}` its smallest arguments in WRITERS"
+        assert not (writes and name in READERS), f"`{name}` has {writes}: move it to WRITERS"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A folder as somebody has it: a session, results, frames, a thesis."""
+    folder = tmp_path_factory.mktemp("world")
+    shots = {"camera": "rgbw-bayer-1shot", "shots": [{}], "whiteboards": None, "darks": None}
+    (folder / "plan.yaml").write_text(yaml.safe_dump(shots))
+    (folder / "other.yaml").write_text(yaml.safe_dump({**shots, "title": "another"}))
+    (folder / "held").mkdir()
+    done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session")
+    assert done[0] == 0, done
+    shutil.copytree(folder / "held/session", folder / "made-session")
+    (folder / "link").symlink_to(folder / "held/session")
+    done = program("simulate", *SIZE, "--scene", "near-planar", "--out", folder / "frames")
+    assert done[0] == 0, done
+    field = np.random.default_rng(0).uniform(0, 1, (5, 5, 16, 16, 3)).astype(np.float32)
+    save_hdf5(folder / "scene.h5", field, {})
+    (folder / "foreign").mkdir()
+    (folder / "foreign/thesis.txt").write_text("years of work")
+    (folder / "taken.h5").write_text("years of work")
+    (folder / "taken.png").write_text("years of work")
+    return folder
+
+
+def edited(folder, typed):
+    """Make a result of the command that somebody edited."""
+    command = typed.removesuffix(" SESSION").replace(" --theory", "").replace(" --tile", "")
+    with result_folder(folder, command, belongs_to=folder, adds=True) as new:
+        for name in ("metrics.json", "report.html"):
+            (new / name).write_text("{}")
+    if typed in JOURNALS:
+        (folder / JOURNALS[typed]).touch()
+    (folder / "metrics.json").write_text('{"mine": true}')
+    return folder
+
+
+def place(world, situation, typed):
+    """Return what --out names."""
+    new = "new.h5" if typed in ONE_FILE else "new"
+    if situation == "an edited result":
+        folder = world / ("edited-" + typed.replace(" ", ""))
+        return edited(folder, typed) / ("metrics.json" if typed in ONE_FILE else "")
+    return {
+        "a session": world / "held/session",
+        "its parent": world / "held",
+        "inside it": world / "held/session" / new,
+        "its frames": world / "held/session/frames",
+        "a link to it": world / "link",
+        "beyond the link": world / "link" / new,
+        "a foreign folder": world / "foreign" / (new if typed in ONE_FILE else ""),
+        "a file": world / "taken.h5",
+    }[situation]
+
+
+ALLOWED = {
+    # New files of names that are free, beside what is there.
+    "a foreign folder": {*ONE_FILE, "devices snap", "devices live"},
+    "its parent": {"devices snap", "devices live"},
+    "an edited result": {"devices snap", "devices live"},
+}
+SITUATIONS = (
+    "a session", "its parent", "inside it", "its frames", "a link to it", "beyond the link",
+    "a foreign folder", "an edited result", "a file",
+)  # fmt: skip
+
+
+def called(typed, *more):
+    """Run a command by its name here; returns exit code and standard error."""
+    name, dashes, mode = typed.removesuffix(" SESSION").partition(" --")
+    first = (f"{dashes.strip()}{mode}",) if mode else ()
+    code, _, err = program(*name.split(), *first, *WRITERS[typed], *more)
+    return code, err
+
+
+@pytest.mark.parametrize("typed", WRITERS)
+def test_nothing_is_lost_wherever_out_leads(world, monkeypatch, typed):
+    monkeypatch.chdir(world)
+    monkeypatch.setattr("time.sleep", lambda seconds: (_ for _ in ()).throw(KeyboardInterrupt))
+    for situation in SITUATIONS:
+        out = place(world, situation, typed)
+        before, ours = files_of(world), listed(world)
+        option = "--link" if typed == "devices serve" else "--out"
+        code, err = called(typed, option, out)
+        after = files_of(world)
+        lost = [path for path in before if after.get(path) != before[path]]
+        assert all(ours.get(path) == before[path] for path in lost), (situation, lost)
+        hidden = [path.name for path in world.rglob(".*") if path not in before]
+        assert not hidden, situation
+        if typed not in ALLOWED.get(situation, ()):
+            assert code in (1, 2), (situation, err)
+            assert set(after) == set(before), situation
+            assert "Traceback" not in err
+            assert len([line for line in err.splitlines() if line.startswith("emmc-rig:")]) == 1
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        ("calibrate SESSION", "calibration/metrics.json"),
+        ("reconstruct SESSION", "reconstruction/metrics.json"),
+        ("session sheet", "report.html"),
+    ],
+)
+def test_results_in_their_place_in_a_session_are_not_replaced_once_edited(
+    world, monkeypatch, typed, name
+):
+    monkeypatch.chdir(world)
+    path = world / "made-session" / name
+    if path.parent.name != "made-session":
+        edited(path.parent, typed)
+    path.write_text("mine")
+    before = files_of(world)
+    code, err = called(typed)
+    assert code == 1
+    assert f"{name.rpartition('/')[2]} is not what" in err
+    assert files_of(world) == before
+
+
+def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ("simulate", *SIZE, "--scene", "near-planar", "--out", "w")
+    assert program(*arguments)[0] == 0
+    Path("w/thesis.txt").write_text("years of work")
+    first = json.loads(Path("w/metrics.json").read_text())
+    assert program(*arguments, "--seed", "1")[0] == 0
+    assert Path("w/thesis.txt").read_text() == "years of work"
+    assert json.loads(Path("w/metrics.json").read_text()) != first
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_a_plan_in_a_session_begins_no_session_inside_it(world, monkeypatch):
+    monkeypatch.chdir(world)
+    before = files_of(world)
+    code, _, err = program("capture", "held/session/plan.yaml", *RIG)
+    assert code == 1
+    assert "lies inside the session" in err
+    code, _, err = program("session", "bench", "--folder", "held/session")
+    assert code == 1
+    assert files_of(world) == before

@@ -1,0 +1,168 @@
+"""The engine of the studies: what is measured, kept, recalled and left out; its CSV and pages."""
+
+import csv
+import io
+import json
+import math
+import re
+from dataclasses import dataclass
+
+import pytest
+
+from emmc_rig.errors import AppError
+from emmc_rig.pages.page import Section, fragment, framed, inline_svg, number
+from emmc_rig.progress import Silent
+from emmc_rig.study.sweep import NotApplicableError, Sweep, SweepStopped, csv_text, plain
+
+
+@dataclass
+class Squares(Sweep[int]):
+    """Squares of numbers, tens together; a negative number has none."""
+
+    noun = "numbers"
+
+    def __post_init__(self):
+        self.calls: list[list[int]] = []
+
+    def inputs(self, point):
+        if point < 0:
+            raise NotApplicableError("no root is negative")
+        return {"size": abs(point) % 100}
+
+    def group(self, point):
+        return point // 10
+
+    def measured(self, points, watcher):
+        self.calls.append(list(points))
+        for point in points:
+            if point == 66:
+                raise NotApplicableError("66 is unlucky")
+            if point == 55:
+                yield {"failed": "full", "keep": False}
+            else:
+                yield {"square": point * point, "missing": math.inf}
+
+
+class Counted(Silent):
+    """Counts steps, and presses Ctrl-C after some."""
+
+    def __init__(self, patience=1000):
+        self.total, self.steps, self.patience = 0, 0, patience
+
+    def begin(self, stage, steps):
+        self.total, self.steps = steps, 0
+
+    def step(self, detail):
+        self.steps += 1
+        if self.steps == self.patience:
+            raise KeyboardInterrupt
+
+
+def test_points_are_measured_in_groups_and_recalled_in_their_order(tmp_path):
+    first, watcher = Squares(None, tmp_path), Counted()
+    results = first.run([3, 12, 1, 3], watcher)
+    assert list(results) == [3, 12, 1]
+    assert first.calls == [[3, 1], [12]]
+    assert results[12] == {"square": 144, "missing": None}
+    assert watcher.steps == watcher.total == 3
+    again, watcher = Squares(None, tmp_path), Counted()
+    assert again.run([1, 3, 12], watcher) == {1: results[1], 3: results[3], 12: results[12]}
+    assert again.calls == []
+    assert watcher.total == 0
+
+
+def test_points_of_one_digest_are_measured_once(tmp_path):
+    sweep = Squares(None, tmp_path)
+    results = sweep.run([7, 107], Silent())
+    assert sweep.calls == [[7]]
+    assert results[107] == results[7]
+
+
+def test_what_cannot_be_measured_is_left_out_and_the_others_are_not(tmp_path):
+    sweep, watcher = Squares(None, tmp_path), Counted()
+    results = sweep.run([-1, 65, 66, 67, 2], watcher)
+    assert list(results) == [65, 2]
+    assert sweep.left_out == dict.fromkeys((66, 67), "66 is unlucky") | {-1: "no root is negative"}
+    assert watcher.steps == watcher.total == 4
+
+
+def test_a_failure_that_may_pass_is_measured_again(tmp_path):
+    for _ in range(2):
+        sweep = Squares(None, tmp_path)
+        sweep.run([55, 5], Silent())
+        assert [55] in sweep.calls
+        assert sweep.failures() == ["55: full"]
+    assert (tmp_path / "points.jsonl").read_text().count("\n") == 1
+
+
+def test_ctrl_c_says_what_is_kept_and_closes_what_measures(tmp_path):
+    closed = []
+
+    class Closing(Squares):
+        def measured(self, points, watcher):
+            try:
+                yield from super().measured(points, watcher)
+            finally:
+                closed.append(points)
+
+    with pytest.raises(SweepStopped, match="2 of 4 numbers are kept in"):
+        Closing(None, tmp_path).run([1, 2, 3, 4], Counted(2))
+    assert closed == [[1, 2, 3, 4]]
+    sweep = Squares(None, tmp_path)
+    assert len(sweep.run([1, 2, 3, 4], Silent())) == 4
+    assert sweep.calls == [[3, 4]]
+
+
+def test_other_figures_of_a_point_are_another_digest(tmp_path, monkeypatch):
+    Squares(None, tmp_path).run([1], Silent())
+    monkeypatch.setattr(Squares, "revision", 2)
+    sweep = Squares(None, tmp_path)
+    sweep.run([1], Silent())
+    assert sweep.calls == [[1]]
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    with pytest.raises(AppError, match="0 of 1 numbers are kept: make room"):
+        Squares(None, tmp_path / "missing").run([1], Silent())
+
+
+def test_rows_of_csv_are_quoted_and_unknown_values_are_empty():
+    rows = [{"name": 'a "b", c', "db": 1 / 3, "on": True}, {"db": None, "more": 2.0}]
+    read = list(csv.DictReader(io.StringIO(csv_text(rows, form=".2f", forms={"more": "g"}))))
+    assert read == [
+        {"name": 'a "b", c', "db": "0.33", "on": "True", "more": ""},
+        {"name": "", "db": "", "on": "", "more": "2"},
+    ]
+    assert csv_text(rows, ["db"]).splitlines() == ["db", "0.333333", '""']
+
+
+def test_a_result_is_kept_as_json_gives_it_back():
+    assert plain({"a": (1, math.nan), "b": {2: -math.inf}}) == {"a": [1, None], "b": {"2": None}}
+
+
+def test_text_on_a_page_is_escaped_and_data_cannot_end_its_script():
+    body = fragment("figures.html", heads=["<b>"], rows=[["</td>", "&"]], pictures={})
+    page = framed("<i>", ["&"], ["'"], [Section("one", "One", body)], data={"d": ["</script>"]})
+    assert "<b>" not in page
+    assert "&lt;/td&gt;" in page
+    assert page.count("</script>") == 1
+    (data,) = re.findall(r'id="d">(.*?)</script>', page)
+    assert json.loads(data) == ["</script>"]
+
+
+def test_a_drawing_in_a_page_refers_only_to_itself(tmp_path):
+    path = tmp_path / "drawing.svg"
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
+        '<metadata/><g id="mark-a"/><path id="p"/><use xlink:href="#p" clip-path="url(#c)"/></svg>'
+    )
+    drawn = inline_svg(path, "k")
+    assert 'id="mark-a"' in drawn
+    assert 'id="k-p"' in drawn
+    assert 'href="#k-p"' in drawn
+    assert "url(#k-c)" in drawn
+    assert "metadata" not in drawn
+
+
+def test_a_figure_that_is_not_known_is_a_dash():
+    assert [number(value, ".1f") for value in (1.25, None, math.nan)] == ["1.2", "–", "–"]
