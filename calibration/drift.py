@@ -86,7 +86,7 @@ class Drift:
                 "searched: Psi is not repaired; take one whiteboard and calibrate again"
             )
         if not self.drifted:
-            return "Psi still fits the captures, as far as was searched"
+            return "Psi still fits the captures"
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
         return (
             f"Psi no longer fits: the shadow has moved by {self.displacement_px:.2f} pixels, most "
