@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, photon_transfer
+from calibration.levels import Check, Levels
 from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
 from emmc_rig.model.sensing import PsiLayout
 
@@ -43,12 +44,14 @@ class BoardSet:
     """All that was captured at the whiteboard, whatever wrote it: a rig, a session, a simulation.
 
     darks: lamp off, at one exposure or more; between two the dark current is drawn as a line.
-    references[shot, lamp]: aperture open, masks out.
+    references[shot, lamp]: aperture open, masks out. checks: boards seen again and again, which
+    tell what lamp and response do meanwhile.
     """
 
     darks: tuple[MeanFrame, ...]
     references: Mapping[tuple[int, str], MeanFrame]
     frames: tuple[BoardFrame, ...]
+    checks: tuple[Check, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.darks:
@@ -61,13 +64,20 @@ class BoardSet:
 
     def dark_at(self, exposure_s: float) -> MeanFrame:
         """Return the dark frame of an exposure: black level and dark current of every pixel."""
+        exact = [one for one in self.darks if np.isclose(one.exposure_s, exposure_s, rtol=0.02)]
+        if exact:
+            return exact[0]
         first, last = self.dark, max(self.darks, key=lambda frame: frame.exposure_s)
         if last.exposure_s == first.exposure_s:
             return first
         share = (exposure_s - first.exposure_s) / (last.exposure_s - first.exposure_s)
         mean = (first.mean_dn + share * (last.mean_dn - first.mean_dn)).astype(np.float32)
         spread = first.variance_dn2 + share * (last.variance_dn2 - first.variance_dn2)
-        return MeanFrame(mean, max(spread, 0.0), min(first.count, last.count), exposure_s)
+        mine = (1 - share) ** 2 * first.variance_dn2 / first.count
+        theirs = share**2 * last.variance_dn2 / last.count
+        count = min(first.count, last.count)
+        extra = max(mine + theirs - max(spread, 0.0) / count, 0.0)
+        return MeanFrame(mean, max(spread, 0.0), count, exposure_s, extra_variance_dn2=extra)
 
     @property
     def exposures(self) -> int:
@@ -82,8 +92,14 @@ class BoardSet:
         dark = self.dark
 
         def as_if_dark(frame: MeanFrame) -> MeanFrame:
-            more = self.dark_at(frame.exposure_s).mean_dn - dark.mean_dn
-            return replace(frame, mean_dn=frame.mean_dn - more)
+            own = self.dark_at(frame.exposure_s)
+            extra = _dark_variance(own) - dark.variance_dn2 / dark.count
+            extra += (own.variance_dn2 - dark.variance_dn2) / frame.count
+            return replace(
+                frame,
+                mean_dn=frame.mean_dn - (own.mean_dn - dark.mean_dn),
+                extra_variance_dn2=frame.extra_variance_dn2 + extra,
+            )
 
         return Whiteboards(
             dark,
@@ -97,7 +113,20 @@ class BoardSet:
 
     def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:
         """Return the same dark and reference frames with other whiteboards."""
-        return BoardSet(self.darks, self.references, tuple(frames))
+        return replace(self, frames=tuple(frames))
+
+    def levelled(self, levels: Levels, channels: NDArray[np.uint8]) -> BoardSet:
+        """Return the frames as under a steady lamp and a straight response."""
+
+        def steady(frame: MeanFrame) -> MeanFrame:
+            return levels.corrected(frame, self.dark_at(frame.exposure_s).mean_dn, channels)
+
+        references = {id(one): steady(one) for one in self.references.values()}
+        return replace(
+            self,
+            references={key: references[id(one)] for key, one in self.references.items()},
+            frames=tuple(replace(one, frame=steady(one.frame)) for one in self.frames),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +238,22 @@ def _signal(frame: MeanFrame, boards: BoardSet, gain: SensorGain) -> tuple[Array
     """Return DN per second above the dark, and its variance."""
     dark = boards.dark_at(frame.exposure_s)
     signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
-    variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
+    own = gain.gain_dn_per_electron * np.maximum(signal, 0) + dark.variance_dn2
+    variance = own / frame.count + _dark_variance(dark) + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2
+
+
+def _dark_variance(dark: MeanFrame) -> float:
+    """Return the variance of a mean dark frame."""
+    return dark.variance_dn2 / dark.count + dark.extra_variance_dn2
+
+
+def channels_of(layout: PsiLayout, shot: int = 0) -> NDArray[np.uint8]:
+    """Return the colour that each pixel sees under white light, (pixel_y, pixel_x); 3: all."""
+    k = layout.binning
+    if layout.colour is None:
+        return np.full(layout.frames_shape[1:], 3, dtype=np.uint8)
+    return np.ascontiguousarray(layout.colour[shot, ::k, ::k])
 
 
 def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:

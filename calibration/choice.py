@@ -1,9 +1,9 @@
-"""Which description of Psi to trust: the simplest whose held-out whiteboard lies at the noise."""
+"""Which Psi to trust: the surest one that predicts every kind of whiteboard to the noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 Array = NDArray[np.floating]
 AT_THE_NOISE = 1.5
 """Mean squared residual over the variance: what is left is less than the noise."""
-ROUTES = ("parametric", "mixed", "free")
-"""From the simplest to the freest."""
+ROUTES = ("combined", "parametric", "mixed", "free")
+"""The surest first, then from the simplest to the freest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class HeldOut:
 
     chi2: mean squared residual over its variance, all usable pixels. trimmed: without the worst
     1 % of them. whiteness: correlation of neighbours' residuals. residual: (pixel_y, pixel_x), in
-    deviations, 0 where not usable.
+    deviations, 0 where not usable. groups: chi2 by kind of whiteboard; all else is of the worst.
     """
 
     route: str
@@ -35,6 +35,13 @@ class HeldOut:
     whiteness: float
     relative_error: float
     residual: NDArray[np.float32]
+    groups: Mapping[str, float] = field(default_factory=dict)
+
+
+def worst(judged: Mapping[str, HeldOut]) -> HeldOut:
+    """Return the judgement of the kind of whiteboards that a description predicts worst."""
+    groups = {name: one.chi2 for name, one in judged.items()}
+    return replace(judged[max(groups, key=lambda name: groups[name])], groups=groups)
 
 
 def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
@@ -112,11 +119,16 @@ def choose(judged: Sequence[HeldOut], limit: float = AT_THE_NOISE) -> tuple[Held
     for one in known:
         if one.chi2 <= limit:
             return one, (
-                f"{one.route}: the simplest whose held-out whiteboard lies at the noise "
-                f"(residual {one.chi2:.2f} of it, limit {limit:g})"
+                f"{one.route}: every kind of whiteboard lies at the noise (the worst, "
+                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {limit:g})"
             )
     best = min(known, key=lambda one: one.chi2)
     return best, (
-        f"{best.route}: none reaches the noise on the held-out whiteboard; this one comes nearest "
-        f"({best.chi2:.2f} of it, limit {limit:g})"
+        f"{best.route}: none reaches the noise on every kind of whiteboard; this one comes nearest "
+        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {limit:g}), and its deviations "
+        "count what is missed"
     )
+
+
+def _worst_name(one: HeldOut) -> str:
+    return max(one.groups, key=lambda name: one.groups[name]) if one.groups else "held out"

@@ -30,6 +30,8 @@ ATTRIBUTES = ("offset_x_um", "offset_y_um", "rotation_rad", "scale", "distance_s
 SPREADS = (30.0, 30.0, 0.004, 0.003, 0.05)
 """Of the prior of a drift between calibration and capture."""
 MOST_STEPS = 12
+RIM = 0.95
+"""Of the shifts searched: a drift beyond it may be larger than what is found."""
 
 
 class DriftSettings(Settings):
@@ -59,7 +61,8 @@ class Drift:
 
     values, deviations: by KINDS, then the brightness of shots 2, 3, ... (relative). displacement:
     of the shadow, root mean square over the picture, pixels; by kind likewise. chi2: the drift
-    squared over its covariance; probability: of more on a Psi that fits.
+    squared over its covariance; probability: of more on a Psi that fits. beyond_search: what was
+    found lies at the rim of what was searched, so that the real drift may be larger.
     """
 
     values: dict[str, float]
@@ -72,10 +75,16 @@ class Drift:
     placement: Placement
     steps: int
     status: str
+    beyond_search: bool = False
 
     @property
     def words(self) -> str:
         """What to tell the user in one line."""
+        if self.beyond_search:
+            return (
+                f"the shadow has moved by {self.displacement_px:.1f} pixels or more, as far as was "
+                "searched: Psi is not repaired; take one whiteboard and calibrate again"
+            )
         if not self.drifted:
             return "Psi still fits the captures"
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
@@ -291,6 +300,7 @@ def find_drift(
         drifted(placement, drift),
         taken,
         "converged" if converged else "step limit reached",
+        bool(np.abs(drift[:2]).max() > RIM * settings.search_px * pixel_um > 0),
     )
 
 

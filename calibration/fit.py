@@ -38,6 +38,8 @@ TUKEY = 4.685
 """Times the deviation: 95 % as sure as least squares where the noise is normal."""
 CHUNK = 4096
 FIRST_WINDOW_PX = 64
+FEWEST_PIXELS = 400
+"""Of a whiteboard, however many there are."""
 DECIDED = 0.7
 """Of the prior's deviation: a parameter told no better stays at the design."""
 LEAST_GAIN = 0.01
@@ -50,12 +52,12 @@ OFFSETS = slice(0, 2)
 class FitSettings(Settings):
     """Settings of the fit.
 
-    pixels_per_board: at most so many of each whiteboard, drawn at random over the window; more
-    make the placement surer than the whiteboards make Psi.
+    pixels: at most so many of all whiteboards together, alike of each, drawn at random over the
+    window; more make the placement surer than the mask is like its model.
     """
 
-    pixels_per_board: int = Field(default=60_000, ge=500)
-    first_pixels: int = Field(default=6_000, ge=500, description="while the window widens")
+    pixels: int = Field(default=100_000, ge=500)
+    first_pixels: int = Field(default=12_000, ge=500, description="while the window widens")
     max_steps: int = Field(default=40, ge=1)
     tolerance: float = Field(
         default=0.02, gt=0, description="of a last step, in standard deviations"
@@ -126,8 +128,9 @@ class _Sample:
 def _samples(
     boards: Sequence[Board], half_px: float, limit: int, rng: np.random.Generator
 ) -> list[_Sample]:
-    """Return at most `limit` usable pixels of every board within `half_px` of the middle."""
+    """Return at most `limit` usable pixels of all boards within `half_px` of the middle."""
     found = []
+    limit = max(limit // len(boards), FEWEST_PIXELS)
     for board in boards:
         rows, columns = board.reading.shape
         y, x = (np.arange(count) - (count - 1) / 2 for count in (rows, columns))
@@ -344,7 +347,7 @@ def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]
     while half < whole:
         found.append((half, settings.first_pixels))
         half *= 2
-    return [*found, (whole, settings.first_pixels), (whole, settings.pixels_per_board)]
+    return [*found, (whole, settings.first_pixels), (whole, settings.pixels)]
 
 
 def _descend(

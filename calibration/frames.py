@@ -21,19 +21,27 @@ class MeanFrame:
     """The mean of `count` frames of one exposure.
 
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
-    the spread between repeats; NaN with one frame.
+    the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
+    extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
     """
 
     mean_dn: NDArray[np.float32]
     variance_dn2: float
     count: int
     exposure_s: float
+    taken_s: float = 0.0
+    extra_variance_dn2: float = 0.0
 
 
 def average(
-    frames: Iterable[NDArray[np.uint16]], exposure_s: float, white_level_dn: int, what: str
+    frames: Iterable[NDArray[np.uint16]],
+    exposure_s: float,
+    white_level_dn: int,
+    what: str,
+    taken_s: float = 0.0,
+    lit: bool = True,
 ) -> MeanFrame:
-    """Return the mean of repeated frames (y, x), uint16.
+    """Return the mean of repeated frames (y, x), uint16; lit: they are no darks.
 
     Raises CalibrationError when there are none, when they differ in size, when more than
     LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
@@ -63,17 +71,38 @@ def average(
     spread = np.nan
     if count > 1:
         spread = float(np.mean(squares - total**2 / count) / (count - 1))
-        _check_steady(levels, float(np.sqrt(spread / total.size)), what)
-    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s)
+        _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
+    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s, taken_s)
 
 
-def _check_steady(levels: list[float], noise: float, what: str) -> None:
+def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
+    """Return the mean of darks taken before and after, sure to what they differ by."""
+    count = before.count + after.count
+    share = before.count / count
+    mean = share * before.mean_dn + (1 - share) * after.mean_dn
+    change = float(np.mean(after.mean_dn - before.mean_dn))
+    variance = share * before.variance_dn2 + (1 - share) * after.variance_dn2
+    # Anywhere between the two with the same chance.
+    return MeanFrame(
+        mean.astype(np.float32),
+        variance,
+        count,
+        before.exposure_s,
+        (before.taken_s + after.taken_s) / 2,
+        change**2 / 12,
+    )
+
+
+def _check_steady(levels: list[float], noise: float, what: str, lit: bool) -> None:
     """Raise CalibrationError when frames differ in brightness; noise: deviation of a level."""
     difference, most = max(levels) - min(levels), max(levels)
     if difference > max(LARGEST_FLICKER * most, SURE * noise):
+        why = "the lamp flickers: let it warm up, run it on direct current, or expose for whole "
+        why += "periods of the mains"
+        if not lit:
+            why = "the sensor warms up, or light comes in: wait, and cover the camera"
         raise CalibrationError(
-            f"{what}: repeats differ by {difference / most:.1%} in brightness; the lamp flickers: "
-            "let it warm up, run it on direct current, or expose for whole periods of the mains"
+            f"{what}: repeats differ by {difference / most:.1%} in brightness; {why}"
         )
 
 

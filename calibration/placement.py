@@ -3,8 +3,11 @@
 A ray through sensor point x and lens point u meets the mask at xi = (1 - rho) x + rho u, rho =
 d / D (paper, eq. 2), bent by distortion_um x |x|^2 / corner^3. Column and row of the mask there,
 in cells from its middle: B (xi - offset - stage) / cell, with B = [1 skew; 0 1] R(-rotation) /
-scale. The mask is seen through the convolution of three kernels: the pixel's box, the aperture
-cell's box, and a Gaussian of deviation blur_um (rounded cells, diffraction).
+scale. A tilted or bowed mask is farther by tilt . x + bow_um |x|^2 / corner^2: xi grows by so much
+of the ray's slope t = (u - x) / D. Glass of glass_um between mask and sensor moves the ray by
+glass_um (t / sqrt(n^2 (1 + |t|^2) - |t|^2) - t / n), n = 1.52 (Snell's law); what is linear in t is
+part of the distance. The mask is seen through the convolution of three kernels: the pixel's box,
+the aperture cell's box, and a Gaussian of deviation blur_um (rounded cells, diffraction).
 
 The coefficient of view j at pixel p is w_j(p) (leak + (clear - leak) T_j(p)), T the design's
 transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j + falloff |u_j|^2) / sum over the
@@ -35,6 +38,10 @@ SCALARS = (
     "leak",
     "vignetting",
     "falloff",
+    "tilt_x_rad",
+    "tilt_y_rad",
+    "bow_um",
+    "glass_um",
 )
 LEAST_BLUR_UM = 0.3
 
@@ -59,6 +66,10 @@ class Placement:
     leak: float = 0.0
     vignetting: float = 0.0
     falloff: float = 0.0
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    bow_um: float = 0.0
+    glass_um: float = 0.0
     aperture: tuple[tuple[float, ...], ...] = ()
 
     def vector(self) -> NDArray[np.float64]:
@@ -110,6 +121,10 @@ class Tolerances:
     leak: float = 0.1
     vignetting: float = 0.2
     falloff: float = 0.5
+    tilt_x_rad: float = 0.01
+    tilt_y_rad: float = 0.01
+    bow_um: float = 10.0
+    glass_um: float = 100.0
     aperture: float = 0.05
 
     def deviations(self, views: tuple[int, int]) -> NDArray[np.float64]:

@@ -2,12 +2,17 @@
 
 Parametric: a frame of N pixels adds the Fisher information sum over pixels of (slope slope^T) /
 variance; with n frames of each kind the covariance of the placement is C = (prior + sum n_k I_k)^-1
-and the expected squared error of Psi trace(G C), G from `psi_information`. Frames are added one by
-one, always the kind that lowers that error most (greedy A-optimal design: Pukelsheim 2006, ch. 5).
+and the expected squared error of Psi trace(G C), G from `psi_information`. Every kind is taken
+once: a view that is never opened is told by its neighbours alone, whose shadows are nearly its own,
+and takes up whatever the model misses. Frames are then added one by one, always the kind that
+lowers that error most (greedy A-optimal design: Pukelsheim 2006, ch. 5).
 
 Free: a coefficient's relative variance is that of its signal and of the reference it is divided
 by, so the relative error of Psi after n frames a view is the root of
 (sum var(pinhole) / n + psi^2 var(reference) / m) / sum psi^2.
+
+A fitted mask is not the real one: MODEL_ERROR is in every expected error of a route that has one.
+Both in one (see `combine`): the variances of model and pinhole add as those of two measurements.
 """
 
 from __future__ import annotations
@@ -27,6 +32,8 @@ Array = NDArray[np.floating]
 DARK_FRAMES = 2
 REFERENCE_FRAMES = 4
 MOST_FRAMES = 400
+MODEL_ERROR = 0.004
+"""Of Psi, relative: what the fit of the shipped flaws leaves (`calibrate --check psi`: 0.35 %)."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ def plan_parametric(
     tolerances: Tolerances | None = None,
     most: int = MOST_FRAMES,
 ) -> PlannedFrames:
-    """Return frames of the given kinds that bring Psi's expected relative error to `target`.
+    """Return frames of the given kinds, each at least once, for an error of `target`.
 
     The first frame is always the first kind, which the fit registers. Stops at `most` frames:
     the error expected then is in the result.
@@ -112,39 +119,56 @@ def plan_parametric(
     tolerances = tolerances or Tolerances()
     matrix, squares = psi_information(Shadow(mask, placement))
     each = {kind: information_of(mask, placement, kind, light) for kind in kinds}
-    total = np.diag(1 / tolerances.deviations(mask.views) ** 2) + each[kinds[0]]
-    counts = dict.fromkeys(kinds, 0)
-    counts[kinds[0]] = 1
+    total = np.diag(1 / tolerances.deviations(mask.views) ** 2) + sum(each.values())
+    counts = dict.fromkeys(kinds, 1)
 
     def error(information: NDArray[np.float64]) -> float:
-        return float(np.sqrt(max(np.trace(np.linalg.solve(information, matrix)), 0) / squares))
+        noise2 = max(np.trace(np.linalg.solve(information, matrix)), 0) / squares
+        return float(np.sqrt(noise2 + MODEL_ERROR**2))
 
     expected = error(total)
-    while expected > target and sum(counts.values()) < most:
+    while expected > max(target, 1.01 * MODEL_ERROR) and sum(counts.values()) < most:
         best = min(kinds, key=lambda kind: error(total + each[kind]))
         total = total + each[best]
         counts[best] += 1
         expected = error(total)
-    return PlannedFrames({kind: n for kind, n in counts.items() if n}, expected)
+    return PlannedFrames(counts, expected)
 
 
-def free_error(mask: ShadowMask, placement: Placement, light: Light, repeats: int) -> float:
-    """Return Psi's expected relative error by the free route with so many frames a view."""
+@dataclass(frozen=True)
+class FreeNoise:
+    """Squared relative error of the free route: of one frame a view, and of the references."""
+
+    pinhole2: float
+    reference2: float
+
+    def error(self, repeats: int) -> float:
+        """Return the expected relative error of Psi after so many frames a view."""
+        return float(np.sqrt(self.pinhole2 / repeats + self.reference2))
+
+    def with_model(self, repeats: int) -> float:
+        """Return the same where the model makes it surer."""
+        free2 = self.error(repeats) ** 2
+        return float(np.sqrt(free2 * MODEL_ERROR**2 / (free2 + MODEL_ERROR**2)))
+
+
+def free_noise(mask: ShadowMask, placement: Placement, light: Light) -> FreeNoise:
+    """Return what the noise of the free route's error is made of."""
     rng = np.random.default_rng(0)
     rows, columns = mask.pixel_shape()
     chosen = np.stack([rng.integers(rows, size=SAMPLED), rng.integers(columns, size=SAMPLED)], 1)
     channels = rng.integers(ANY_COLOUR, size=SAMPLED).astype(np.uint8)
     shadow = Shadow(mask, placement)
-    errors = squares = 0.0
+    pinhole = white = squares = 0.0
     for view in np.ndindex(mask.views):
         views_open = np.zeros(mask.views, dtype=bool)
         views_open[view] = True
         psi = shadow.readings(chosen, channels, views_open)
-        pinhole = reading_variance(psi, Kind(view), light) / repeats
-        white = reading_variance(np.ones_like(psi), Kind(None), light) / REFERENCE_FRAMES
-        errors += float((pinhole + psi**2 * white).sum())
+        pinhole += float(reading_variance(psi, Kind(view), light).sum())
+        reference = reading_variance(np.ones_like(psi), Kind(None), light) / REFERENCE_FRAMES
+        white += float((psi**2 * reference).sum())
         squares += float((psi**2).sum())
-    return float(np.sqrt(errors / squares))
+    return FreeNoise(pinhole / squares, white / squares)
 
 
 def plan_free(
@@ -154,10 +178,15 @@ def plan_free(
     target: float,
     shots: int,
     most: int = MOST_FRAMES,
+    modelled: bool = False,
 ) -> PlannedFrames:
-    """Return frames through the pinhole, the same number before every view and for every shot."""
-    repeats = 1
-    while free_error(mask, placement, light, repeats) > target and repeats < most:
-        repeats += 1
+    """Return frames through the pinhole, the same number before every view and for every shot.
+
+    At most `most` before each: the error expected then is in the result. modelled: with the fitted
+    mask as well, which makes it surer.
+    """
+    noise = free_noise(mask, placement, light)
+    error = noise.with_model if modelled else noise.error
+    repeats = next((n for n in range(1, most) if error(n) <= target), most)
     counts = {Kind((v, u)): repeats * shots for v, u in np.ndindex(mask.views)}
-    return PlannedFrames(counts, free_error(mask, placement, light, repeats))
+    return PlannedFrames(counts, error(repeats))

@@ -8,18 +8,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board, BoardSet, as_readings, gain_of, sensor_blemishes
+from calibration.board_angle import board_over_angle, without
+from calibration.boards import Board, BoardSet, as_readings, channels_of, gain_of, sensor_blemishes
 from calibration.choice import (
+    AT_THE_NOISE,
     HeldOut,
     choose,
     judge,
     predicted_by_psi,
     predicted_by_shadow,
     prediction_variance,
+    worst,
 )
+from calibration.colours import crosstalk, in_three_colours, mixing, other_colours
+from calibration.combine import combined
 from calibration.defects import Defects, find_defects
 from calibration.errors import CalibrationError
+from calibration.findings import angle_findings, level_findings, mask_findings
 from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
+from calibration.levels import fit_levels
+from calibration.misfit import Misfit, measured_misfit
 from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
 from calibration.placement import Tolerances
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -29,16 +37,22 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 MOST_PIXELS_WITH_DEVIATION = 2_000_000
 LARGEST_FLICKER = 0.01
+BRIGHTEST_MASK = 0.95
+"""No mask that codes lets nearly all light through everywhere."""
 LARGEST_MOVE_UM = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Parametric:
-    """What the parametric routes know of the bench: fit and mask, with its defects if sought."""
+    """What the parametric routes know of the bench: fit and mask, with its defects if sought.
+
+    misfit: of the model at whiteboards through the pinhole, by view; None without any.
+    """
 
     fit: Fit
     mask: ShadowMask
     defects: Defects | None = None
+    misfit: Mapping[tuple[int, int], Misfit] | None = None
 
     @property
     def shadow(self) -> Shadow:
@@ -52,9 +66,10 @@ class Parametric:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Psi by every route asked for, how each does on the held-out whiteboards, and the choice.
+    """Psi by every route asked for, how each does on held-out whiteboards, and the choice.
 
-    frames: exposures that each route used. advice: what to measure again.
+    frames: exposures that each route used. findings: what is wrong with the bench and was taken
+    into account. advice: what to measure again.
     """
 
     chosen: str
@@ -66,6 +81,7 @@ class Outcome:
     mixed: Parametric | None
     good: NDArray[np.bool_]
     advice: tuple[str, ...]
+    findings: tuple[str, ...] = ()
 
     @property
     def calibration(self) -> Calibration:
@@ -83,64 +99,135 @@ def calibrate(
     fit_settings: FitSettings | None = None,
     tolerances: Tolerances | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
+    turned: Mapping[float, BoardSet] | None = None,
 ) -> Outcome:
-    """Return Psi by the routes named (parametric, mixed, free), and the one to use.
+    """Return Psi by the routes named (parametric, mixed, free, combined), and the one to use.
 
     few: whiteboards for the parametric routes. pinholes: for the free one, every view of every
     shot. held_out: whiteboards through the open aperture under a white lamp that no route sees;
-    the first at the position of shot 0, which the free route can predict. Raises
-    CalibrationError for whatever makes the whiteboards unfit.
+    one at the position of shot 0, which the free route can predict. turned: an open
+    whiteboard at that position and its references, by the degrees that the board was turned.
+    Raises CalibrationError for whatever makes the whiteboards unfit.
     """
-    calibrations: dict[str, Calibration] = {}
-    judged: dict[str, HeldOut] = {}
-    frames: dict[str, int] = {}
     advice: list[str] = []
-    good = sensor_blemishes(held_out)
-    for boards in (few, pinholes):
-        if boards is not None:
-            good &= sensor_blemishes(boards)
+    turned = turned or {}
+    sets = [held_out, *(one for one in (few, pinholes) if one is not None), *turned.values()]
+    good = np.logical_and.reduce([sensor_blemishes(one) for one in sets])
+    channels = channels_of(design.layout)
+    levels = fit_levels(list(dict.fromkeys(check for one in sets for check in one.checks)))
+    findings = level_findings(levels)
+    if levels is not None:
+        held_out = held_out.levelled(levels, channels)
+        few = None if few is None else few.levelled(levels, channels)
+        pinholes = None if pinholes is None else pinholes.levelled(levels, channels)
+        turned = {turn: one.levelled(levels, channels) for turn, one in turned.items()}
+    seen_colours = crosstalk(held_out, channels, good)
     judges = as_readings(held_out, design.layout, good)
     if not judges:
         raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
-    parametric = mixed = None
-    if {"parametric", "mixed"} & set(routes):
+    for board in judges:
+        refuse_without_mask(board)
+    calibrations: dict[str, Calibration] = {}
+    bare: dict[str, Calibration] = {}
+    judged: dict[str, HeldOut] = {}
+    frames: dict[str, int] = {}
+    parametric = mixed = plain = None
+    if {"parametric", "mixed", "combined"} & set(routes):
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
         on_stage("parametric fit")
         seen = as_readings(few, design.layout, good)
-        mask = shadow_mask(camera, design.size)
+        plain = shadow_mask(camera, design.size)
+        mask = plain if seen_colours is None else mixing(plain, seen_colours)
         fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
         advice += fit_advice(fit)
-        parametric = Parametric(fit, mask)
-        if "mixed" in routes:
+        parametric = with_misfit(Parametric(fit, mask), seen)
+        if {"mixed", "combined"} & set(routes) and design.binning == 1:
             on_stage("defects of the mask")
-            mixed = _mixed(seen, camera, parametric, fit_settings, tolerances)
+            mixed = with_misfit(_mixed(seen, camera, parametric, fit_settings, tolerances), seen)
         for name, one in (("parametric", parametric), ("mixed", mixed)):
-            if one is not None and name in routes:
+            if one is not None:
                 on_stage(f"Psi, {name}")
-                calibrations[name] = _calibration(one, camera, design, few, good)
-                judged[name] = _judged(name, one.shadow, judges)
+                bare[name] = _calibration(one, camera, design, few, good)
+                calibrations[name] = _counting_misfit(bare[name], one)
+                judged[name] = _judged(name, one.shadow, judges, seen)
                 frames[name] = few.exposures
-    if "free" in routes:
+        findings += mask_findings(mixed or parametric)
+    if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")
         on_stage("Psi, free")
-        free = measure_psi(pinholes.pinholes(), design)
-        calibrations["free"] = replace(free, good=good)
-        first = judges[0]
-        predicted = predicted_by_psi(free.psi, first)
-        variance = prediction_variance(free.deviation, first, design.binning)
-        judged["free"] = judge("free", first, predicted, variance)
+        free = replace(measure_psi(pinholes.pinholes(), design), good=good)
+        calibrations["free"] = free
+        stage_um = shot_stages(camera)[0]
+        still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
+        if not still:
+            raise CalibrationError(
+                "the free route is judged by an open whiteboard where the mask stands in the "
+                "first shot: hold one out there"
+            )
+        judged["free"] = _judged_measured("free", free, still[0], design.binning)
         frames["free"] = pinholes.exposures
-    chosen, why = choose([judged[name] for name in routes if name in judged])
-    if chosen.chi2 > 4:
+        best = mixed or parametric
+        if "combined" in routes and best is not None and few is not None:
+            on_stage("Psi, combined")
+            model = bare["mixed" if mixed is not None else "parametric"]
+            if np.isfinite(model.deviation).all():
+                both = combined(free, model, good)
+                calibrations["combined"] = both
+                judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
+                frames["combined"] = few.exposures
+    chosen, why = choose([judged[name] for name in judged if name in routes])
+    if chosen.chi2 > AT_THE_NOISE:
+        missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
+        calibrations[chosen.route] = _less_sure(calibrations[chosen.route], missed)
         advice.append(
-            f"the held-out whiteboard differs from the chosen Psi by {chosen.chi2:.1f} times the "
-            "noise: look at its residual map, and measure Psi by the free route"
+            f"a whiteboard differs from the chosen Psi by {chosen.relative_error:.2%} of its "
+            f"level, {chosen.chi2:.1f} times the noise's variance; what is worst: "
+            f"{_worst_groups(chosen)}; look at its residual map"
         )
+    if seen_colours is not None:
+        findings.append(
+            f"the colour filters let {seen_colours.largest:.1%} of their neighbours' "
+            "light through: Psi has three colours for every pixel"
+        )
+        if plain is None:
+            raise CalibrationError(
+                "the colour filters let other colours through, and the free route under a white "
+                "lamp does not tell which: add open whiteboards, for the parametric route"
+            )
+        by = mixed or parametric
+        assert by is not None
+        others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
+        calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
+    if turned:
+        boards = {turn: as_readings(one, design.layout, good)[0] for turn, one in turned.items()}
+        board = board_over_angle(calibrations[chosen.route].psi, boards)
+        findings += angle_findings(board)
+        if board.uneven:
+            calibrations = {name: without(board, one) for name, one in calibrations.items()}
     return Outcome(
-        chosen.route, why, calibrations, judged, frames, parametric, mixed, good, tuple(advice)
+        chosen.route,
+        why,
+        {name: one for name, one in calibrations.items() if name in routes},
+        {name: one for name, one in judged.items() if name in routes},
+        frames,
+        parametric,
+        mixed,
+        good,
+        tuple(advice),
+        tuple(findings),
     )
+
+
+def refuse_without_mask(board: Board) -> None:
+    """Raise CalibrationError for an open whiteboard that reads as if no mask were in the beam."""
+    readings = board.reading[board.usable]
+    if readings.size and np.percentile(readings, 2) > BRIGHTEST_MASK:
+        raise CalibrationError(
+            f"{board.name}: it reads {np.median(readings):.2f} of the whiteboard without masks, "
+            "and no pixel much less: is the mask in the beam?"
+        )
 
 
 def _mixed(
@@ -159,10 +246,59 @@ def _mixed(
     return Parametric(fit, parametric.mask, find_defects(seen, parametric.mask, fit.placement))
 
 
-def _judged(name: str, shadow: Shadow, judges: Sequence[Board]) -> HeldOut:
-    """Return the worse of the held-out whiteboards."""
-    each = [judge(name, board, predicted_by_shadow(shadow, board)) for board in judges]
-    return max(each, key=lambda one: one.chi2)
+def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
+    """Return the model with its misfit, from what it leaves of every pinhole's whiteboard.
+
+    A view that none opens has the largest of the others. Many pixels tell few parameters, so that
+    a board the fit has seen is as good as held out.
+    """
+    shadow = one.shadow
+    found: dict[tuple[int, int], Misfit] = {}
+    for board in seen:
+        if board.views_open.sum() != 1:
+            continue
+        predicted = predicted_by_shadow(shadow, board)
+        squares = (board.reading - predicted) ** 2
+        v, u = (int(place) for place in np.argwhere(board.views_open)[0])
+        found[v, u] = measured_misfit(squares, board.variance, predicted, board.usable)
+    if not found:
+        return one
+    worst_of = max(found.values(), key=lambda misfit: misfit.level)
+    every = {view: found.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
+    return replace(one, misfit=every)
+
+
+def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
+    """Return the worst of the held-out whiteboards and of the views opened one by one."""
+    groups = {
+        ("open aperture" if i == 0 else "mask moved"): judge(
+            name, board, predicted_by_shadow(shadow, board)
+        )
+        for i, board in enumerate(judges)
+    }
+    for board in seen:
+        if board.views_open.sum() == 1:
+            v, u = np.argwhere(board.views_open)[0]
+            groups[f"view ({v}, {u})"] = judge(name, board, predicted_by_shadow(shadow, board))
+    return worst(groups)
+
+
+def _judged_measured(name: str, known: Calibration, board: Board, binning: int) -> HeldOut:
+    """Return how a measured Psi, summed over its views, fits the open whiteboard."""
+    predicted = predicted_by_psi(known.psi, board)
+    variance = prediction_variance(known.deviation, board, binning)
+    return worst({"open aperture": judge(name, board, predicted, variance)})
+
+
+def _worst_groups(one: HeldOut) -> str:
+    order = sorted(one.groups, key=lambda name: -one.groups[name])
+    return ", ".join(f"{name} ({one.groups[name]:.1f})" for name in order[:4])
+
+
+def _less_sure(known: Calibration, missed: float) -> Calibration:
+    """Return a calibration whose deviations count a relative error beside."""
+    more = np.square(missed * known.psi.weights)
+    return replace(known, deviation=np.sqrt(np.square(known.deviation) + more).astype(np.float32))
 
 
 def _calibration(
@@ -180,6 +316,18 @@ def _calibration(
         deviation = np.broadcast_to(np.float32(np.nan), psi.weights.shape)
     white = np.stack([_white(boards, design, shot) for shot in range(design.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
+
+
+def _counting_misfit(known: Calibration, one: Parametric) -> Calibration:
+    """Return a model's calibration with its misfit in the deviations."""
+    if one.misfit is None:
+        return known
+    deviation = np.square(known.deviation, dtype=np.float64)
+    scale = known.psi.weights.shape[4] * known.psi.binning**2
+    for shot, v, u, stored in np.ndindex(deviation.shape[:3] + deviation.shape[4:5]):
+        plane = known.psi.weights[shot, v, u, :, stored].astype(np.float64) * scale
+        deviation[shot, v, u, :, stored] += one.misfit[v, u].variance(plane) / scale**2
+    return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
 def _white(boards: BoardSet, design: ImagingMatrix, shot: int) -> NDArray[np.float32]:

@@ -25,6 +25,7 @@ Pixels = NDArray[np.int64]
 TABLE_STEPS = 512
 TAILS = 4.0
 NARROWEST_CELLS = 1e-3
+GLASS_INDEX = 1.52
 ANY_COLOUR = 3
 SPARE_UM = 900.0
 """Beyond the beam, for a mask that sits askew."""
@@ -200,17 +201,19 @@ def _read(
     each (n, view), if it has rows, is set to what every open view adds.
 
     numbers: size (rows, columns), binning. lengths: cell, rho, d / D, pitch, aperture cell, corner,
-    aperture corner, offset x, y, bend, clear, leak, vignetting, falloff.
+    aperture corner, offset x, y, bend, clear, leak, vignetting, falloff, tilt x, y, bow, glass,
+    lens.
     """
     cell_um, ratio, designed, pitch_um, view_um, corner_um, far_um = lengths[:7]
-    off_x, off_y, bend, clear, leak, vignetting, falloff = lengths[7:]
+    off_x, off_y, bend, clear, leak, vignetting, falloff = lengths[7:14]
+    tilt_x, tilt_y, bow, glass, lens_um = lengths[14:]
     rows, columns, binning = numbers
     height, width = cells.shape[0], cells.shape[1]
     views_v, views_u = aperture.shape
     count = tables.shape[2]
     steps = tables.shape[1] - 1
     wanted = slope.shape[0] > 0
-    scalars = 12
+    scalars = 16
     parts = binning * binning
     for n in prange(pixels.shape[0]):
         across = np.empty((4, count))
@@ -224,7 +227,9 @@ def _read(
             x = pixels[n, 1] * binning + part % binning
             y_um = (y - (rows - 1) / 2) * pitch_um
             x_um = (x - (columns - 1) / 2) * pitch_um
-            cube = (x_um * x_um + y_um * y_um) / corner_um**3
+            square = (x_um * x_um + y_um * y_um) / corner_um**2
+            cube = square / corner_um
+            farther_um = tilt_x * x_um + tilt_y * y_um + bow * square
             weight_sum, leaning_sum, far_sum = 0.0, 0.0, 0.0
             for v in range(views_v):
                 for u in range(views_u):
@@ -243,8 +248,14 @@ def _read(
                         continue
                     v_um = (v - (views_v - 1) / 2) * view_um
                     u_um = (u - (views_u - 1) / 2) * view_um
+                    to_u, to_v = (u_um - x_um) / lens_um, (v_um - y_um) / lens_um
+                    steep = to_u * to_u + to_v * to_v
+                    refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
+                    more = farther_um + glass * refracted
                     xi_x = (1 - ratio) * x_um + ratio * u_um + bend * cube * x_um - off_x
                     xi_y = (1 - ratio) * y_um + ratio * v_um + bend * cube * y_um - off_y
+                    xi_x += more * to_u
+                    xi_y += more * to_v
                     column = (turns[0, 0, 0] * xi_x + turns[0, 0, 1] * xi_y) / cell_um + width / 2
                     row = (turns[0, 1, 0] * xi_x + turns[0, 1, 1] * xi_y) / cell_um + height / 2
                     left = int(np.floor(column - reach))
@@ -313,6 +324,11 @@ def _read(
                     here_gradient[9] += share * (1 - passed)
                     here_gradient[10] += aperture[v, u] * lean / weight_sum * through
                     here_gradient[11] += aperture[v, u] * far / weight_sum * through
+                    along = to_x * to_u + to_y * to_v
+                    here_gradient[12] += along * x_um
+                    here_gradient[13] += along * y_um
+                    here_gradient[14] += along * square
+                    here_gradient[15] += along * refracted
                     here_gradient[scalars + v * views_u + u] += share / aperture[v, u] * through
             reading += here / parts
             if wanted:
@@ -404,9 +420,18 @@ class Shadow:
         grid_v, grid_u = (
             (np.arange(count) - (count - 1) / 2) * mask.aperture_cell_um for count in mask.views
         )
-        bend = at.distortion_um * (x**2 + y**2) / mask.corner_um**3
-        xi_x = (1 - ratio) * x + ratio * grid_u[chosen[:, 1]] + bend * x
-        xi_y = (1 - ratio) * y + ratio * grid_v[chosen[:, 0]] + bend * y
+        square = (x**2 + y**2) / mask.corner_um**2
+        bend = at.distortion_um * square / mask.corner_um
+        to_u, to_v = (
+            (grid_u[chosen[:, 1]] - x) / mask.lens_um,
+            (grid_v[chosen[:, 0]] - y) / mask.lens_um,
+        )
+        steep = to_u**2 + to_v**2
+        refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
+        farther_um = at.tilt_x_rad * x + at.tilt_y_rad * y + at.bow_um * square
+        more = farther_um + at.glass_um * refracted
+        xi_x = (1 - ratio) * x + ratio * grid_u[chosen[:, 1]] + bend * x + more * to_u
+        xi_y = (1 - ratio) * y + ratio * grid_v[chosen[:, 0]] + bend * y + more * to_v
         xi_x = xi_x - at.offset_x_um - stage_um[0]
         xi_y = xi_y - at.offset_y_um - stage_um[1]
         turn = self._turns[0] / mask.cell_um
@@ -470,6 +495,11 @@ class Shadow:
                 at.leak,
                 at.vignetting,
                 at.falloff,
+                at.tilt_x_rad,
+                at.tilt_y_rad,
+                at.bow_um,
+                at.glass_um,
+                mask.lens_um,
             ]
         )
         _read(

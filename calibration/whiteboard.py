@@ -197,6 +197,7 @@ def _signal(
         raise CalibrationError(f"whiteboard {what}: another size than the dark frame")
     signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
     variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
+    variance = variance + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2
 
 

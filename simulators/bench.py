@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numba import njit, prange
@@ -21,7 +22,17 @@ from scipy.stats import norm
 from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
-from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, OpticsFlaws, SensorFlaws
+from emmc_rig.model.geometry import centred_grid
+from simulators.flaws import (
+    EVEN_BOARD,
+    PERFECT_OPTICS,
+    PERFECT_SENSOR,
+    STEADY_LAMP,
+    BoardFlaws,
+    LampFlaws,
+    OpticsFlaws,
+    SensorFlaws,
+)
 
 Array = NDArray[np.floating]
 LAMPS = {
@@ -33,6 +44,8 @@ LAMPS = {
 }
 RAYS_PER_VIEW = 128
 WINDOW_MARGIN = 0.05
+KEPT_BYTES = 64_000_000
+"""Of readings already traced: the standings of a small bench's whole calibration."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +54,11 @@ class MountingErrors:
 
     skew: tangent of the angle by which a mask's columns lean. distance_share: relative error of
     their distance. distortion_um: third-order radial displacement of the rays at the corner of
-    the picture. edge_blur_um: standard deviation of the mask's edges.
+    the picture. edge_blur_um: standard deviation of the mask's edges. tilt_deg: of the mask's
+    plane, by which its distance grows with x and with y. bow_um: by which the mask is farther from
+    the sensor at the corner of the picture than in the middle. substrate_um: thickness of its
+    glass, of index `refractive_index`: positive between pattern and sensor, negative on the lens'
+    side.
     """
 
     offset_um: tuple[float, float] = (6.5, -4.0)
@@ -51,6 +68,10 @@ class MountingErrors:
     distance_share: float = 0.0
     distortion_um: float = 0.0
     edge_blur_um: float = 0.0
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
+    bow_um: float = 0.0
+    substrate_um: float = 0.0
+    refractive_index: float = 1.52
 
 
 NO_ERRORS = MountingErrors((0.0, 0.0), 0.0, 1.0)
@@ -65,6 +86,28 @@ def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.
     rngs = [np.random.default_rng(view) for view in range(views[0] * views[1])]
     points = [Sobol(axes, rng=rng).random(count) for rng in rngs]
     return np.reshape(points, (*views, count, axes))
+
+
+@njit(cache=True, fastmath=True)
+def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, index):
+    """Return where the ray from sensor point (x, y) to lens point (u, v) meets a mask.
+
+    The mask lies at distance_um + slope . (x, y) + sag (x^2 + y^2); its glass refracts by Snell's
+    law. Found by fixed point iteration: each step is better by the slopes, below 1e-2.
+    """
+    thickness = abs(glass_um)
+    reduced = lens_um - thickness + thickness / index
+    to_x, to_y = (u - x) / reduced, (v - y) / reduced
+    at_x, at_y = x, y
+    for _ in range(4):
+        squared = to_x * to_x + to_y * to_y
+        inside = 1 / np.sqrt(index * index * (1 + squared) - squared)
+        length = lens_um - thickness + thickness * inside
+        to_x, to_y = (u - x) / length, (v - y) / length
+        z = distance_um + slope_x * at_x + slope_y * at_y + sag * (at_x * at_x + at_y * at_y)
+        way = z if glass_um <= 0 else z - thickness + thickness * inside
+        at_x, at_y = x + to_x * way, y + to_y * way
+    return at_x, at_y
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -91,7 +134,8 @@ def trace(
     that the aperture plate leaves open. cells: (all cells, colour); starts, shapes: where each
     mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um, what turns um on
     the mask into cells (column from x and y, row from x and y), the displacement of its rays per
-    cubed um off the axis, and the width of its edges in um. falloff: (v, u, y, x), or all 1.
+    cubed um off the axis, the width of its edges in um, and the slopes, sag, glass and index that
+    `_met` takes. falloff: (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
@@ -139,8 +183,29 @@ def trace(
                         along = (1 - ratio) * pitch_um * column_x
                         across = (1 - ratio) * pitch_um * row_x
                         start = starts[mask]
+                        slope_x, slope_y, sag, glass_um, index = plates[mask, 9:]
+                        flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
                         for x in range(columns):
                             to_column, to_row = column + along * x, row + across * x
+                            if not flat:
+                                ray_x = first_x + x * pitch_um
+                                met_x, met_y = _met(
+                                    ray_x,
+                                    ray_y,
+                                    ray_u,
+                                    ray_v,
+                                    lens_um,
+                                    plates[mask, 0],
+                                    slope_x,
+                                    slope_y,
+                                    sag,
+                                    glass_um,
+                                    index,
+                                )
+                                more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
+                                more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
+                                to_column += column_x * more_x + column_y * more_y
+                                to_row += row_x * more_x + row_y * more_y
                             if bend != 0:
                                 ray_x = first_x + x * pitch_um
                                 cubed = bend * (ray_x * ray_x + ray_y * ray_y)
@@ -195,6 +260,9 @@ class Bench:
         rays_per_view: int = RAYS_PER_VIEW,
         optics: OpticsFlaws = PERFECT_OPTICS,
         sensor: SensorFlaws = PERFECT_SENSOR,
+        board: BoardFlaws = EVEN_BOARD,
+        lamp: LampFlaws = STEADY_LAMP,
+        seconds: Callable[[], float] = lambda: 0.0,
     ) -> None:
         views = camera.views
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
@@ -210,10 +278,11 @@ class Bench:
         self.target = "scene"
         self.shot = 0
         self.masks_in = True
+        self.board_turn_deg = 0.0
         self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
         self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
-        self._sensor = sensor
+        self._sensor, self._board, self._lamp, self._seconds = sensor, board, lamp, seconds
         axes = 4 if self._errors.edge_blur_um == 0 else 6
         self._points = ray_points(views, rays_per_view, axes)
         self._points[..., 4:] = norm.ppf(self._points[..., 4:])
@@ -221,33 +290,89 @@ class Bench:
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
         self._falloff = optics.falloff(size, views, lengths_um)
         self._plates = {
-            name: [(plate, *optics.soiled(frame, plate.cell_um)) for frame in plate.cells]
+            name: [
+                (plate, *optics.soiled(frame, plate.cell_um, plate.distance_mm * 1e3))
+                for frame in plate.cells
+            ]
             for name, plate in draw_plates(camera, size).items()
         }
-        self._response = sensor_response(camera, size)
+        response = sensor_response(camera, size)
+        self._response = sensor.mixed(response) if sensor.crosstalk else response
         self._light = pixel_light(camera, size)
-        self._seen: tuple[tuple, Array] | None = None
+        self._seen: dict[tuple, Array] = {}
 
     def readings(self) -> Array:
         """Return the noise-free readings (pixel_y, pixel_x) of the bench as it now stands."""
+        levels = np.array(LAMPS[self.lamp]) * self._lamp.levels(self._seconds())
+        lit = levels[levels > 0]
+        if lit.size == 0:
+            return np.zeros(self._light.shape[1:])
+        if lit.min() == lit.max():
+            return levels.max() * self._lit(LAMPS[self.lamp])
+        return np.sum([levels[c] * self._lit(tuple(np.eye(3)[c])) for c in range(3)], axis=0)
+
+    def _lit(self, lamp: tuple[float, ...]) -> Array:
+        """Return the readings under a lamp of this level in red, green and blue."""
         at_um = self._positions_um()
-        state = (self.lamp, self.target, self.shot, self.masks_in, *at_um.values())
-        if self._seen is None or self._seen[0] != state:
-            self._seen = (state, self._trace(at_um))
-        return self._seen[1]
+        state = (lamp, self.target, self.shot, self.masks_in, self.board_turn_deg, *at_um.values())
+        if state not in self._seen:
+            if sum(one.nbytes for one in self._seen.values()) > KEPT_BYTES:
+                self._seen.clear()
+            self._seen[state] = self._pixels(self._trace(at_um, lamp))
+        return self._seen[state]
+
+    def _pixels(self, samples: Array) -> Array:
+        k = self._camera.sensor.binning
+        rows, columns = self._size[0] // k, self._size[1] // k
+        return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
+
+    def true_psi(self, shot: int) -> NDArray[np.float32]:
+        """Return every coefficient of Psi of one shot, (v, u, y, colour, x), by integration.
+
+        Each is the mean over the rays between its pixel and its aperture cell of what masks, lens
+        and sensor pass of one colour, over what the open camera without masks passes of all: no
+        frame, no lamp and no whiteboard is in it. Masks stand where the stages are.
+        """
+        camera, size = self._camera, self._size
+        k = camera.sensor.binning
+        at_um = self._positions_um()
+        standing = self.shot, self.masks_in
+        psi = np.empty((*camera.views, size[0], 3, size[1]), np.float32)
+        try:
+            self.shot, self.masks_in = shot, False
+            whole = self._pixels(self._trace(at_um, LAMPS["white"], "all"))
+            share = 1 / (k**2 * whole).repeat(k, axis=0).repeat(k, axis=1)
+            self.masks_in = True
+            for v, u in np.ndindex(camera.views):
+                for colour in range(3):
+                    lamp = tuple(np.eye(3)[colour])
+                    psi[v, u, :, colour] = self._trace(at_um, lamp, (v, u)) * share
+        finally:
+            self.shot, self.masks_in = standing
+        return psi
 
     def expose(self, exposure_s: float) -> NDArray[np.uint16]:
         """Return one noisy frame (pixel_y, pixel_x) in DN."""
         noise, light = self._camera.sensor.noise, self._light[self.shot]
         if self._sensor is PERFECT_SENSOR:
             return noise.expose_dn(self.readings(), exposure_s, light, self.rng)
-        return self._sensor.expose_dn(noise, self.readings(), exposure_s, light, self.rng)
+        seconds = self._seconds()
+        return self._sensor.expose_dn(noise, self.readings(), exposure_s, light, self.rng, seconds)
 
     def light(self, shot: int) -> NDArray[np.float32]:
         """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
         return self._light[shot]
 
-    def _trace(self, at_um: Mapping[str, float]) -> Array:
+    def _trace(
+        self,
+        at_um: Mapping[str, float],
+        lamp: tuple[float, ...],
+        cell: tuple[int, int] | Literal["all"] | None = None,
+    ) -> Array:
+        """Return the readings of samples (y, x), through the aperture plate.
+
+        cell: (v, u), without plate and target: a constant light field through this aperture cell.
+        """
         camera = self._camera
         lens, sensor = camera.lens, camera.sensor
         cell_um = lens.aperture_cell_um
@@ -265,15 +390,23 @@ class Bench:
             )
             errors = NO_ERRORS if at_lens else self._errors
             plates.append(self._standing(errors, plate.distance_mm, grain_um, moved))
-        scene = np.ones((1, 1, 1, 1, 3), np.float32) if self.target == "whiteboard" else self._scene
+        board = self.target == "whiteboard" or cell is not None
+        scene = np.ones((1, 1, 1, 1, 3), np.float32) if board else self._scene
         response = self._response[self.shot]
         seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
         samples = np.empty(self._size)
+        falloff = self._falloff
+        if cell is None and self.target == "whiteboard" and self._board is not EVEN_BOARD:
+            turn_deg = self.board_turn_deg
+            falloff = falloff * self._board.radiance(self._size, camera.views, turn_deg)
+        openings = self._openings(at_um["aperture_x"], at_um["aperture_y"])
+        if cell is not None:
+            openings = self._cell(cell)
         trace(
             scene,
             self._finer,
             (response / seen).astype(np.float32),
-            np.array(LAMPS[self.lamp]),
+            np.array(lamp),
             self._points,
             (
                 lens.distance_mm * 1e3,
@@ -282,17 +415,23 @@ class Bench:
                 cell_um,
                 cell_um * lens.aperture_fill,
             ),
-            self._openings(at_um["aperture_x"], at_um["aperture_y"]),
+            openings,
             np.concatenate(cells),
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),
-            np.array(plates, dtype=np.float64).reshape(-1, 9),
-            self._falloff,
+            np.array(plates, dtype=np.float64).reshape(-1, 14),
+            falloff,
             samples,
         )
-        k = sensor.binning
-        rows, columns = self._size[0] // k, self._size[1] // k
-        return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
+        return samples
+
+    def _cell(self, cell: tuple[int, int] | Literal["all"]) -> Array:
+        """Return the opening (1, 3) of one aperture cell, or of all."""
+        cell_um, (rows, columns) = self._camera.lens.aperture_cell_um, self._camera.views
+        if cell == "all":
+            return np.array([(0.0, 0.0, max(rows, columns) * cell_um)])
+        y_um, x_um = centred_grid(rows, cell_um)[cell[0]], centred_grid(columns, cell_um)[cell[1]]
+        return np.array([(float(x_um), float(y_um), cell_um / 2)])
 
     def _standing(
         self,
@@ -317,6 +456,11 @@ class Bench:
             cosine * per_um,
             errors.distortion_um / corner_um**3,
             errors.edge_blur_um,
+            np.tan(np.deg2rad(errors.tilt_deg[0])),
+            np.tan(np.deg2rad(errors.tilt_deg[1])),
+            errors.bow_um / corner_um**2,
+            errors.substrate_um,
+            errors.refractive_index,
         )
 
     def _openings(self, x_um: float, y_um: float) -> Array:

@@ -36,8 +36,9 @@ def test_the_plan_written_is_one_that_captures(captured):
     assert True in kinds
     assert False in kinds
     metrics = json.loads((captured / "plan" / "metrics.json").read_text())
-    planned = [one["frames"] for one in metrics["parametric"]["whiteboards"] if not one["pinhole"]]
-    assert [b.repeats for b in plan.whiteboards.open if not b.held_out] == [n for n in planned if n]
+    planned = [one["frames"] for one in metrics["whiteboards"] if not one["pinhole"]]
+    assert [b.repeats for b in plan.whiteboards.open if not b.held_out] == planned
+    assert plan.whiteboards.views == "all"
 
 
 def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
@@ -67,12 +68,13 @@ def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
     assert np.isfinite(found.readings[found.usable]).all()
 
 
-def test_a_route_without_its_whiteboards_says_which_plan_has_them(captured, capsys):
-    code = exit_code("calibrate", captured / "session", "--route", "free", "--out", captured / "no")
-    told = capsys.readouterr().err
-    assert code == 1
-    assert "--plan" in told or "view" in told
-    assert not (captured / "no").exists()
+def test_the_free_route_takes_the_same_session(captured):
+    out = captured / "free"
+    assert exit_code("calibrate", captured / "session", "--route", "free", "--out", out) == 0
+    surest = json.loads((captured / "calibration" / "metrics.json").read_text())
+    assert surest["chosen"] in ("combined", "free")
+    free, both = (ImagingMatrix.load(one / "psi.h5") for one in (out, captured / "calibration"))
+    assert free.relative_difference(both) < 0.01
 
 
 def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path, capsys):

@@ -13,19 +13,35 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import MeanFrame, average
+from calibration.boards import BoardFrame, BoardSet, channels_of
+from calibration.frames import MeanFrame, average, before_and_after
+from calibration.levels import Check, check_of
 from calibration.sensor import Pair
-from calibration.whiteboard import IDEAL_DN, Whiteboards, lamps_needed, measure_psi
-from emmc_rig.model.camera import Camera
+from calibration.whiteboard import LAMP_COLOURS
+from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.sensing import ImagingMatrix
 from simulators.bench import Bench, MountingErrors
-from simulators.flaws import OpticsFlaws, SensorFlaws
+from simulators.flaws import (
+    EVEN_BOARD,
+    STEADY_LAMP,
+    BoardFlaws,
+    LampFlaws,
+    OpticsFlaws,
+    SensorFlaws,
+)
 
 Array = NDArray[np.floating]
 DARK_REPEATS = 2
+"""Before all whiteboards, and after them."""
 REFERENCE_REPEATS = 4
+CHECK_EVERY = 5
+"""Whiteboards between two looks at the same one, which tell what the lamp does."""
+SERIES_SHARES = (0.25, 0.5, 0.75)
+"""Of a reference's exposure: what tells whether the response is straight."""
+FRAME_S = 0.5
+"""Between two frames, for stage and readout."""
+COLOUR_REPEATS = 2
 BOARD_LEVEL = 0.7
 DARK_EXPOSURES_S = (0.01, 1.0, 4.0)
 FLAT_SHARES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.3)
@@ -57,7 +73,7 @@ class Setting:
     """One whiteboard to take: how the bench stands, and how many frames.
 
     stage_um: beyond the shot's own offset of the mask. came_from: the side, +1 where an axis moved
-    up to its place.
+    up to its place. board_turn_deg: how the white board is turned.
     """
 
     shot: int = 0
@@ -66,6 +82,7 @@ class Setting:
     stage_um: tuple[float, float] = (0.0, 0.0)
     repeats: int = 2
     came_from: tuple[int, int] = (1, 1)
+    board_turn_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +120,8 @@ class BenchTruth:
     sensor: SensorFlaws = HARSH_SENSOR
     rays_per_view: int = RAYS_PER_VIEW
     stage: StageFaults = StageFaults()
+    board: BoardFlaws = EVEN_BOARD
+    lamp: LampFlaws = STEADY_LAMP
 
 
 @dataclass
@@ -133,17 +152,18 @@ class WhiteboardBench:
             self.truth.rays_per_view,
             self.truth.optics,
             self.truth.sensor,
+            self.truth.board,
+            self.truth.lamp,
+            lambda: self.seconds,
         )
         self.bench.target = "whiteboard"
-        self._readings: dict[tuple[Setting, bool], Array] = {}
+        self.seconds = 0.0
+        self._channels = channels_of(psi_layout(self.camera, self.size))
 
     def reading(self, setting: Setting, masks_in: bool = True) -> Array:
-        """Return the noise-free reading of a setting, (pixel_y, pixel_x), the falloff in it."""
-        key = (replace(setting, repeats=1), masks_in)
-        if key not in self._readings:
-            self._stand(setting, masks_in)
-            self._readings[key] = self.bench.readings()
-        return self._readings[key]
+        """Return the noise-free reading of a setting now, (pixel_y, pixel_x), the falloff in it."""
+        self._stand(setting, masks_in)
+        return self.bench.readings()
 
     def _stand(self, setting: Setting, masks_in: bool) -> None:
         real = self.truth.stage.real_um(self.sent_um(setting), setting.came_from)
@@ -157,6 +177,7 @@ class WhiteboardBench:
             self._at_um["aperture_x"] = float(centred_grid(self.camera.views[1], cell_um)[u])
         self.bench.shot, self.bench.lamp = setting.shot, setting.lamp
         self.bench.masks_in = masks_in
+        self.bench.board_turn_deg = setting.board_turn_deg
 
     def board_exposure_s(self) -> float:
         """Return the exposure that fills BOARD_LEVEL of the range without masks."""
@@ -169,50 +190,98 @@ class WhiteboardBench:
     def _frames(
         self, setting: Setting, exposure_s: float, masks_in: bool, count: int, what: str
     ) -> MeanFrame:
-        sensor, noise = self.truth.sensor, self.camera.sensor.noise
-        reading = self.reading(setting, masks_in)
-        light = self.bench.light(setting.shot)
-        frames = (
-            sensor.expose_dn(noise, reading, exposure_s, light, self.bench.rng)
-            for _ in range(count)
+        noise = self.camera.sensor.noise
+        began_s = self.seconds
+        frames = (self._exposed(setting, exposure_s, masks_in) for _ in range(count))
+        lit = setting.lamp != "off"
+        mean = average(frames, exposure_s, noise.white_level_dn, what, lit=lit)
+        return replace(mean, taken_s=(began_s + self.seconds) / 2)
+
+    def _exposed(self, setting: Setting, exposure_s: float, masks_in: bool) -> NDArray[np.uint16]:
+        self.seconds += exposure_s + FRAME_S
+        return self.truth.sensor.expose_dn(
+            self.camera.sensor.noise,
+            self.reading(setting, masks_in),
+            exposure_s,
+            self.bench.light(setting.shot),
+            self.bench.rng,
+            self.seconds,
         )
-        return average(frames, exposure_s, noise.white_level_dn, what)
 
     def capture(
         self, settings: Sequence[Setting], on_frame: Callable[[str], None] = lambda label: None
     ) -> BoardSet:
-        """Return the dark frames, the references and the whiteboards asked for."""
+        """Return dark frames, references, and the whiteboards asked for, in their order.
+
+        Between them the first whiteboard of the open aperture is looked at again, and without masks
+        at several exposures before and at one after: the checks.
+        """
         board_s = self.board_exposure_s()
         views = self.camera.views[0] * self.camera.views[1]
         exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
-        darks = tuple(self._dark(exposure_s) for exposure_s in sorted({board_s, *exposures}))
-        references, frames = {}, []
-        # Every shot has its reference; shots behind the same filter share one.
-        lamps = sorted({one.lamp for one in settings})
-        for shot, lamp in product(range(len(self.camera.shots)), lamps):
-            alike = next(
-                (
-                    frame
-                    for (other, named), frame in references.items()
-                    if named == lamp
-                    and self.camera.shots[other].filter == self.camera.shots[shot].filter
-                ),
-                None,
-            )
-            if alike is None:
-                label = f"reference, shot {shot + 1}, {lamp} lamp"
-                setting = Setting(shot, lamp=lamp)
-                alike = self._frames(setting, board_s, False, REFERENCE_REPEATS, label)
-                on_frame(label)
-            references[shot, lamp] = alike
-        for setting in settings:
+        series = [board_s * share for share in SERIES_SHARES]
+        darks = {t: self._dark(t) for t in sorted({board_s, *exposures, *series})}
+        checks: list[Check] = []
+
+        turn = settings[0].board_turn_deg
+
+        def seen_again(board: str, frame: MeanFrame) -> None:
+            dark = darks[frame.exposure_s].mean_dn
+            checks.append(check_of(f"{board}, {turn:g}", frame, dark, self._channels))
+
+        references = self._references(settings, board_s, on_frame)
+        lamp = settings[0].lamp
+        plain = Setting(lamp=lamp, board_turn_deg=turn)
+        for exposure_s in (*series, board_s):
+            frame = self._frames(plain, exposure_s, False, 2, "response")
+            seen_again("without masks", frame)
+        frames = []
+        again = Setting(lamp=lamp, repeats=1, board_turn_deg=turn)
+        for place, setting in enumerate(settings):
+            if place % CHECK_EVERY == 0:
+                seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
             exposure_s = board_s if setting.pinhole is None else board_s * views
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
             frame = self._frames(setting, exposure_s, True, setting.repeats, label)
             on_frame(label)
             sent = self.sent_um(setting)
             frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
-        return BoardSet(darks, references, tuple(frames))
+        seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
+        seen_again("without masks", self._frames(plain, board_s, False, 2, "reference"))
+        both = tuple(before_and_after(dark, self._dark(t)) for t, dark in darks.items())
+        return BoardSet(both, references, tuple(frames), tuple(checks))
+
+    def _references(
+        self, settings: Sequence[Setting], board_s: float, on_frame: Callable[[str], None]
+    ) -> dict[tuple[int, str], MeanFrame]:
+        """Return the open whiteboards without masks; shots behind the same filter share one.
+
+        Where pixels see one colour each, the coloured lamps too: what else they see.
+        """
+        references: dict[tuple[int, str], MeanFrame] = {}
+        turn = settings[0].board_turn_deg
+
+        def taken(shot: int, lamp: str, repeats: int) -> MeanFrame:
+            label = f"reference, shot {shot + 1}, {lamp} lamp"
+            setting = Setting(shot, lamp=lamp, board_turn_deg=turn)
+            frame = self._frames(setting, board_s, False, repeats, label)
+            on_frame(label)
+            return frame
+
+        shots = self.camera.shots
+        for shot, lamp in product(range(len(shots)), sorted({one.lamp for one in settings})):
+            alike = [
+                frame
+                for (other, named), frame in references.items()
+                if named == lamp and shots[other].filter == shots[shot].filter
+            ]
+            known = alike[0] if alike else taken(shot, lamp, REFERENCE_REPEATS)
+            references[shot, lamp] = known
+        if self._channels.max() < len(LAMP_COLOURS) and turn == 0:
+            for lamp in LAMP_COLOURS:
+                if (0, lamp) not in references:
+                    references[0, lamp] = taken(0, lamp, COLOUR_REPEATS)
+        return references
 
     def sent_um(self, setting: Setting) -> tuple[float, float]:
         """Return where a setting sends the mask stage: the shot's offset and what is beyond."""
@@ -225,50 +294,34 @@ class WhiteboardBench:
 
     def sensor_pairs(self) -> tuple[list[Pair], list[Pair]]:
         """Return pairs of dark frames, and of whiteboards without masks from dim to saturated."""
-        noise, sensor = self.camera.sensor.noise, self.truth.sensor
-        white = self.reading(Setting(), False)
-        light = self.bench.light(0)
         full_s = self.board_exposure_s() / BOARD_LEVEL
 
-        def pairs(reading: Array, times: Sequence[float]) -> list[Pair]:
+        def pairs(setting: Setting, times: Sequence[float]) -> list[Pair]:
             return [
-                Pair(
-                    float(t),
-                    *(sensor.expose_dn(noise, reading, t, light, self.bench.rng) for _ in range(2)),
-                )
-                for t in times
+                Pair(float(t), *(self._exposed(setting, t, False) for _ in range(2))) for t in times
             ]
 
-        flats = pairs(white, [share * full_s for share in FLAT_SHARES])
-        return pairs(0 * white, DARK_EXPOSURES_S), flats
+        flats = pairs(Setting(), [share * full_s for share in FLAT_SHARES])
+        return pairs(Setting(lamp="off"), DARK_EXPOSURES_S), flats
 
     def _dark(self, exposure_s: float) -> MeanFrame:
-        noise = self.camera.sensor.noise
-        nothing = np.zeros_like(self.reading(Setting(), False))
-        frames = (
-            self.truth.sensor.expose_dn(noise, nothing, exposure_s, 1.0, self.bench.rng)
-            for _ in range(DARK_REPEATS)
-        )
-        return average(frames, exposure_s, noise.white_level_dn, "dark frame")
+        return self._frames(Setting(lamp="off"), exposure_s, False, DARK_REPEATS, "dark frame")
+
+    def true_psi(self) -> NDArray[np.float32]:
+        """Return `Bench.true_psi` of every shot, (shot, v, u, y, colour, x)."""
+        found = []
+        for shot in range(len(self.camera.shots)):
+            self._stand(Setting(shot), True)
+            found.append(self.bench.true_psi(shot))
+        return np.stack(found)
 
     def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
-        """Return the true Psi: what a noise-free sensor measures through the pinhole."""
-        lamps = lamps_needed(design)
-
-        def frame(reading: Array) -> MeanFrame:
-            return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
-
-        references = {
-            (shot, lamp): frame(self.reading(Setting(shot, lamp=lamp), False))
-            for shot, lamp in product(range(design.shots), lamps)
-        }
-        pinholes = {
-            (shot, v, u, lamp): frame(self.reading(Setting(shot, (v, u), lamp)))
-            for shot, v, u in np.ndindex(design.weights.shape[:3])
-            for lamp in lamps
-        }
-        dark = frame(np.zeros(design.frames_shape[1:]))
-        return measure_psi(Whiteboards(dark, references, pinholes), design).psi
+        """Return the true Psi in the form of a design: of the one colour that it stores, or all."""
+        true = self.true_psi()
+        if design.colour is not None:
+            own = design.colour[:, None, None, :, None, :].astype(np.int64)
+            true = np.take_along_axis(true, own, axis=4)
+        return replace(design, weights=np.ascontiguousarray(true))
 
     def capture_scene(self) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
         """Return the shots of the scene, (shot, pixel_y, pixel_x) in DN, and their exposures."""

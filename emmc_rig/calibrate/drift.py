@@ -93,7 +93,7 @@ def run_drift(
         settings,
     )
     mended = known.psi
-    if drift.drifted:
+    if drift.drifted and not drift.beyond_search:
         mended = psi_at(Shadow(known.mask, drift.placement), known.psi.layout, stages)
     mended.save(out / PSI)
     metrics = {**_figures(drift), "command": command_line(), "versions": versions()}
@@ -105,6 +105,7 @@ def _figures(drift: Drift) -> dict:
     return {
         "drifted": drift.drifted,
         "words": drift.words,
+        "beyond_search": drift.beyond_search,
         "displacement_px": drift.displacement_px,
         "by_kind_px": drift.by_kind_px,
         "values": drift.values,

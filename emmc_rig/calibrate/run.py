@@ -19,10 +19,13 @@ from calibration.boards import BoardSet, as_readings
 from calibration.fit import FitSettings
 from calibration.placement import SCALARS, Placement, designed_placement, labels
 from calibration.planning import (
+    MODEL_ERROR,
+    MOST_FRAMES,
+    REFERENCE_FRAMES,
     Kind,
     Light,
     PlannedFrames,
-    free_error,
+    free_noise,
     plan_free,
     plan_parametric,
 )
@@ -49,19 +52,23 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
 
+Array = NDArray[np.floating]
 PLAN, REPORT = "plan.yaml", "report.html"
 PLAN_HEAD = """\
-# Whiteboards for the parametric route, then the shots: emmc-rig capture plan.yaml --rig ...
+# Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
 # and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
 """
 ROUTES = {
-    "auto": ("parametric", "mixed"),
+    "auto": ("parametric", "mixed", "free", "combined"),
     "parametric": ("parametric",),
     "mixed": ("parametric", "mixed"),
     "free": ("free",),
-    "all": ("parametric", "mixed", "free"),
 }
 FREE_REPEATS = 2
+BOARD_TURN_DEG = 90.0
+PLANNED_DARKS = 4
+LONGER_DARK = 1.25
+"""Of the planned exposure through the pinhole: metering may choose a longer one."""
 TARGET = 0.005
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
@@ -70,7 +77,10 @@ STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
 
 @dataclass(frozen=True)
 class CalibrateSettings:
-    """What to calibrate: camera, size, route (a key of ROUTES), Psi's error to plan for, seed."""
+    """What to calibrate: camera, size, route (a key of ROUTES); what to plan for.
+
+    target: relative error of Psi. most_frames: of the plan, None: as many as it takes.
+    """
 
     camera_name: str
     camera: Camera
@@ -81,6 +91,7 @@ class CalibrateSettings:
     truth: BenchTruth = field(default_factory=BenchTruth)
     fit: FitSettings = field(default_factory=FitSettings)
     map_stage: bool = False
+    most_frames: int | None = None
 
 
 def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
@@ -135,87 +146,112 @@ def held_out_settings(camera: Camera) -> list[Setting]:
 
 
 def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Light) -> Plan:
-    """Return the plan of a capture: whiteboards of the parametric route, and the camera's shots."""
-    pinholes = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
+    """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
+    repeats = max(1, *(count for kind, count in planned.counts.items() if kind.pinhole))
     fitted = [
         OpenBoard(mask_um=kind.stage_um, repeats=count)
         for kind, count in planned.counts.items()
-        if kind.pinhole is None and count
+        if kind.pinhole is None
     ]
     judging = [
         OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
         for one in held_out_settings(settings.camera)
     ]
-    views = tuple(view for view, count in pinholes.items() if count)
+    # The metering chooses the real exposures; darks on both sides of them are interpolated.
+    longest_s = light.exposure_s * light.pinhole_times * LONGER_DARK
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
         camera=settings.camera_name,
         shots=tuple(PlannedShot() for _ in settings.camera.shots),
         whiteboards=Boards(
-            views=views,
+            views="all",
             shots=(0,),
-            repeats=max([1, *pinholes.values()]),
+            repeats=repeats,
             references=max(2, planned.reference_frames),
             open=(*fitted, *judging),
         ),
         darks=Darks(
-            exposure_s=(METERING_EXPOSURE_S, round(light.exposure_s, 4)),
-            repeats=max(2, planned.dark_frames),
+            exposure_s=(
+                METERING_EXPOSURE_S,
+                round(light.exposure_s, 4),
+                round(longest_s, 3),
+            ),
+            repeats=max(4, planned.dark_frames),
         ),
     )
 
 
+def combined_plan(
+    camera: Camera, mask: ShadowMask, light: Light, target: float, most_frames: int | None = None
+) -> PlannedFrames:
+    """Return the whiteboards for all routes in one: the same number of every view, and open ones.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with at
+    most `most_frames` frames in all (default: MOST_FRAMES before every view).
+    """
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    opened = {Kind(None, stage): 2 for stage in stages}
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    others = sum(opened.values()) + judging + REFERENCE_FRAMES + 3 * PLANNED_DARKS
+    views = camera.views[0] * camera.views[1]
+    most = MOST_FRAMES if most_frames is None else (most_frames - others) // views
+    if most < 1:
+        raise AppError(
+            f"--frames {most_frames}: a plan opens each of the {views} views at least once, and "
+            f"takes {others} frames beside: name at least {views + others}"
+        )
+    soft = soft_design(camera, mask)
+    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    if planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached"
+            f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
+            f"{planned.expected_error:.3%}, with {others + most * views}; raise --target"
+            f"{'' if most_frames is None else ' or --frames'}"
+        )
+    return replace(planned, counts={**opened, **planned.counts}, dark_frames=3 * PLANNED_DARKS)
+
+
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
-    kind reach the target by each route.
+    kind reach the target. Raises AppError where none do.
     """
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
     light = plan_light(bench, mask)
-    planned = parametric_plan(camera, mask, light, settings.target)
-    free = plan_free(mask, soft_design(camera, mask), light, settings.target, len(camera.shots))
-    repeats = max(free.counts.values()) // len(camera.shots)
-    lamps = lamps_needed(build_imaging_matrix(camera, (16, 16)))
-    exposures = {"open_s": light.exposure_s, "pinhole_s": light.exposure_s * light.pinhole_times}
-
-    def rows(plan: PlannedFrames) -> list[dict]:
-        return [
+    planned = combined_plan(camera, mask, light, settings.target, settings.most_frames)
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    metrics = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "target_relative_error": settings.target,
+        "model_error": MODEL_ERROR,
+        "exposures": {
+            "open_s": light.exposure_s,
+            "pinhole_s": light.exposure_s * light.pinhole_times,
+        },
+        "dark_frames": planned.dark_frames,
+        "reference_frames": planned.reference_frames,
+        "held_out_frames": judging,
+        "whiteboards": [
             {
                 "pinhole": None if kind.pinhole is None else list(kind.pinhole),
                 "stage_um": list(kind.stage_um),
                 "frames": count,
             }
-            for kind, count in plan.counts.items()
-        ]
-
-    plan = {
-        "camera": settings.camera_name,
-        "size": list(settings.size),
-        "target_relative_error": settings.target,
-        "exposures": exposures,
-        "parametric": {
-            "dark_frames": 2 * planned.dark_frames,
-            "reference_frames": planned.reference_frames,
-            "whiteboards": rows(planned),
-            "frames": planned.exposures + planned.dark_frames,
-            "expected_relative_error": planned.expected_error,
-        },
-        "free": {
-            "dark_frames": 2 * free.dark_frames,
-            "reference_frames": free.reference_frames,
-            "repeats": repeats,
-            "lamps": list(lamps),
-            "frames": free.exposures + free.dark_frames,
-            "expected_relative_error": free.expected_error,
-        },
+            for kind, count in planned.counts.items()
+        ],
+        "frames": planned.exposures + judging,
+        "expected_relative_error": planned.expected_error,
+        "command": command_line(),
+        "versions": versions(),
     }
     to_capture = capture_plan(settings, planned, light).model_dump(
         mode="json", exclude_defaults=True
     )
     text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
     (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
-    metrics = {**plan, "command": command_line(), "versions": versions()}
     write_metrics(folder, metrics)
     return metrics
 
@@ -248,19 +284,30 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     lamps = lamps_needed(design)
     few = pinholes = planned = None
     started = time.perf_counter()
+    fitted: list[Setting] = []
     if "parametric" in routes:
         mask = shadow_mask(camera, settings.size)
         planned = parametric_plan(camera, mask, plan_light(bench, mask), settings.target)
-        wanted = few_settings(planned)
-        watcher.begin("whiteboards for the fit", len(wanted))
-        few = bench.capture(wanted, watcher.step)
+        fitted = few_settings(planned)
+    through: list[Setting] = []
     if "free" in routes:
-        wanted = free_settings(camera, lamps, FREE_REPEATS)
-        watcher.begin("whiteboards through the pinhole", len(wanted))
-        pinholes = bench.capture(wanted, watcher.step)
-    watcher.begin("whiteboards to judge by", None)
+        through = free_settings(camera, lamps, FREE_REPEATS)
+        fitted = [one for one in fitted if one.pinhole is None]
     judges = held_out_settings(camera)[: 2 if "parametric" in routes else 1]
-    held_out = bench.capture(judges, watcher.step)
+    watcher.begin("whiteboards", len(fitted) + len(through) + len(judges))
+    boards = bench.capture([*fitted, *through, *judges], watcher.step)
+    first, last = len(fitted), len(fitted) + len(through)
+    held_out = boards.with_frames(boards.frames[last:])
+    if "free" in routes:
+        pinholes = boards.with_frames(boards.frames[first:last])
+    if "parametric" in routes:
+        few = boards.with_frames([one for one in boards.frames[:last] if one.shot == 0])
+    turned = {}
+    if "combined" in routes:
+        watcher.begin("whiteboards, the board turned", 1)
+        turned[BOARD_TURN_DEG] = bench.capture(
+            [Setting(lamp=lamps[0], repeats=4, board_turn_deg=BOARD_TURN_DEG)], watcher.step
+        )
     captured_s = time.perf_counter() - started
     started = time.perf_counter()
     outcome = calibrate(
@@ -272,6 +319,7 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         pinholes,
         settings.fit,
         on_stage=lambda name: watcher.begin(name, None),
+        turned=turned,
     )
     calibrated_s = time.perf_counter() - started
     watcher.begin("sensor", None)
@@ -283,9 +331,9 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
             raise AppError("--stage needs a parametric route: leave --route at auto")
         stage = measured_stage(bench, design, best, watcher)
     watcher.begin("the true Psi, for comparison", None)
-    exact = bench.exact_psi(design)
+    true = bench.true_psi()
     errors = {
-        name: psi_error(one.psi, exact, outcome.good) for name, one in outcome.calibrations.items()
+        name: true_error(one.psi, true, outcome.good) for name, one in outcome.calibrations.items()
     }
     metrics = {
         "camera": settings.camera_name,
@@ -293,7 +341,13 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         "route": settings.route,
         **outcome_figures(outcome),
         "psi_relative_error": errors,
-        "design_relative_error": psi_error(design, exact, outcome.good),
+        "psi_stated_error": {
+            name: stated_error(one, outcome.good) for name, one in outcome.calibrations.items()
+        },
+        "psi_coverage": {
+            name: coverage(one, true, outcome.good) for name, one in outcome.calibrations.items()
+        },
+        "design_relative_error": true_error(design, true, outcome.good),
         "held_out_frames": held_out.exposures,
         "sensor": {name: value for name, value, _, _ in sensor.rows()},
         "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
@@ -311,6 +365,7 @@ def outcome_figures(outcome: Outcome) -> dict:
     return {
         "chosen": outcome.chosen,
         "why": outcome.why,
+        "findings": list(outcome.findings),
         "advice": list(outcome.advice),
         "held_out": {
             name: {
@@ -318,6 +373,7 @@ def outcome_figures(outcome: Outcome) -> dict:
                 "chi2_without_worst_percent": one.trimmed,
                 "neighbour_correlation": one.whiteness,
                 "relative_error": one.relative_error,
+                "chi2_by_kind": dict(one.groups),
             }
             for name, one in outcome.judged.items()
         },
@@ -353,13 +409,47 @@ def measured_stage(
     return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
 
 
-def psi_error(psi: ImagingMatrix, exact: ImagingMatrix, good: NDArray[np.bool_]) -> float:
-    """Return |Psi - exact| / |exact| over the good pixels (pixel_y, pixel_x), Frobenius."""
-    samples = good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)
-    chosen = samples[:, None, :]
-    difference = np.where(chosen, psi.weights - exact.weights, 0)
-    whole = np.where(chosen, exact.weights, 0)
-    return float(np.linalg.norm(difference) / np.linalg.norm(whole))
+def in_three_colours(values: Array, psi: ImagingMatrix) -> NDArray[np.float32]:
+    """Return values shaped as Psi's weights for all three colours: 0 where it stores none."""
+    if psi.colour is None:
+        return np.asarray(values, dtype=np.float32)
+    own = np.arange(3)[:, None] == psi.colour[:, None, None, :, None, :]
+    return np.where(own, values, 0).astype(np.float32)
+
+
+def _of_good(psi: ImagingMatrix, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)[:, None, :]
+
+
+def true_error(psi: ImagingMatrix, true: Array, good: NDArray[np.bool_]) -> float:
+    """Return |Psi - true| / |true| in three colours over the good pixels, Frobenius.
+
+    true: (shot, v, u, y, colour, x). A colour that Psi does not store counts as 0.
+    """
+    chosen = _of_good(psi, good)
+    off = np.where(chosen, in_three_colours(psi.weights, psi) - true, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, true, 0)))
+
+
+def stated_error(known: Calibration, good: NDArray[np.bool_]) -> float:
+    """Return the relative error of Psi that a calibration states, as `true_error`."""
+    chosen = _of_good(known.psi, good)
+    off = np.where(chosen, known.deviation, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, known.psi.weights, 0)))
+
+
+def coverage(known: Calibration, true: Array, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the share of true coefficients within one and two stated deviations.
+
+    Coefficients that are 0 in truth and in Psi do not count.
+    """
+    psi = known.psi
+    chosen = np.broadcast_to(_of_good(psi, good), true.shape)
+    off = np.abs(in_three_colours(psi.weights, psi) - true)
+    stated = in_three_colours(known.deviation, psi)
+    counted = chosen & ((true != 0) | (stated != 0))
+    within = [float((off <= k * stated)[counted].mean()) for k in (1, 2)]
+    return within[0], within[1]
 
 
 def _defect_count(outcome: Outcome) -> int:
@@ -457,7 +547,10 @@ def run_calibrate(
 
 def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
     """Write psi.h5 and calibration.h5 of the calibration chosen into an existing folder."""
-    known = {"parametric": outcome.parametric, "mixed": outcome.mixed}.get(outcome.chosen)
+    best = outcome.mixed or outcome.parametric
+    known = {"parametric": outcome.parametric, "mixed": outcome.mixed, "combined": best}.get(
+        outcome.chosen
+    )
     chosen.psi.save(folder / PSI)
     save_calibration(folder / CALIBRATION, chosen, known)
 
@@ -466,4 +559,5 @@ def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
     """Return the error of Psi that the free route's formula expects of so many frames a view."""
     mask = shadow_mask(settings.camera, settings.size)
     bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
-    return free_error(mask, soft_design(settings.camera, mask), plan_light(bench, mask), repeats)
+    light = plan_light(bench, mask)
+    return free_noise(mask, soft_design(settings.camera, mask), light).error(repeats)

@@ -69,8 +69,8 @@ def calibrate(
 ) -> SessionCalibration:
     """Return Psi as a session's whiteboards measure it; `.save(folder)` writes it with a report.
 
-    session: itself, or its folder. route: parametric, mixed, free, or all to compare; `auto` takes
-    the parametric routes where the session has whiteboards for them, and the free one else.
+    session: itself, or its folder. route: parametric, mixed or free; `auto` takes every one that
+    the session has whiteboards for, and chooses.
     Raises AppError or CalibrationError.
     """
     session = session if isinstance(session, Session) else Session(Path(session))

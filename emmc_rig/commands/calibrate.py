@@ -25,7 +25,7 @@ def calibrate(
         str, typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of samples")
     ] = "192x256",
     route: Annotated[
-        str, typer.Option("--route", help="auto, parametric, mixed, free, or all to compare")
+        str, typer.Option("--route", help="auto (the surest), parametric, mixed or free")
     ] = "auto",
     plan: Annotated[
         bool, typer.Option("--plan", help="write how many whiteboards, of which kind, it takes")
@@ -35,7 +35,8 @@ def calibrate(
         typer.Option(
             "--check",
             help="measure what calibration reaches on the simulated bench: psi, bound, plan, "
-            "sensor, stage, drift, alarms, cost, frames, large; commas between, or all",
+            "sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, lamp, ...); "
+            "commas between, or all; exit code 1 where a target is missed",
         ),
     ] = None,
     drift: Annotated[
@@ -51,6 +52,9 @@ def calibrate(
     target: Annotated[
         float, typer.Option("--target", help="relative error of Psi to plan for")
     ] = 0.005,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="with --plan: at most so many")
+    ] = None,
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
@@ -98,6 +102,7 @@ def calibrate(
         seed,
         BenchTruth(rays_per_view=rays),
         map_stage=stage,
+        most_frames=frames,
     )
     if check is not None:
         from rich.console import Console
@@ -113,17 +118,18 @@ def calibrate(
             table.add_row(row["what"], row["measured"], row["asked"], row["verdict"])
         Console().print(table)
         typer.echo(f"read {out / 'metrics.json'}")
+        missed = [row["what"] for row in metrics["rows"] if row["verdict"] == "missed"]
+        if missed:
+            raise AppError(f"{len(missed)} of {len(metrics['rows'])} missed: {'; '.join(missed)}")
         return
     if plan:
         out = out or Path("emmc-calibration")
         with result_folder(out, "calibrate --plan") as folder:
             metrics = write_plan(settings, folder)
-        for name in ("parametric", "free"):
-            one = metrics[name]
-            typer.echo(
-                f"{name}: {one['frames']} frames for a relative error of Psi of "
-                f"{one['expected_relative_error']:.2%}"
-            )
+        typer.echo(
+            f"{metrics['frames']} frames for a relative error of Psi of "
+            f"{metrics['expected_relative_error']:.2%}, the model's own included"
+        )
         typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         return
     out = out or Path("emmc-bench")
@@ -135,6 +141,8 @@ def calibrate(
         f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
         f"(the design is off by {metrics['design_relative_error']:.0%})"
     )
+    for line in metrics["findings"]:
+        typer.echo(f"found: {line}")
     for line in metrics["advice"]:
         typer.echo(f"measure again: {line}")
     typer.echo(f"open {out / 'report.html'}")
@@ -158,6 +166,8 @@ def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
+    for line in metrics["findings"]:
+        typer.echo(f"found: {line}")
     for line in metrics["advice"]:
         typer.echo(f"measure again: {line}")
     typer.echo(f"open {out / 'report.html'}")

@@ -40,6 +40,10 @@ WORDS = {
     "leak": ("Transmittance, closed", ""),
     "vignetting": ("Vignetting", ""),
     "falloff": ("Falloff over the aperture", ""),
+    "tilt_x_rad": ("Tilt, x", "rad"),
+    "tilt_y_rad": ("Tilt, y", "rad"),
+    "bow_um": ("Bow at the corner", "um"),
+    "glass_um": ("Glass between mask and sensor", "um"),
 }
 
 
@@ -58,6 +62,7 @@ def write_calibration_report(
     """
     sections = [
         Section("choice", "Chosen", _choice(outcome, metrics)),
+        *_found(outcome.findings),
         Section("redo", "What to measure again", fragment("advice.html", lines=outcome.advice)),
     ]
     best = outcome.mixed or outcome.parametric
@@ -65,7 +70,7 @@ def write_calibration_report(
     if best is not None and first is not None:
         body = _fit(metrics, truth or {}, first.fit.history)
         sections.append(Section("fit", "Fit", body))
-    body = _residuals(list(outcome.judged.values()))
+    body = _kinds(outcome.judged[outcome.chosen]) + _residuals(list(outcome.judged.values()))
     sections += [Section("residuals", "Residual maps", body), Section("psi", "Psi", _psi(outcome))]
     if sensor is not None:
         sections.append(Section("sensor", "Sensor", _sensor(sensor)))
@@ -86,7 +91,7 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
         return "not known" if errors.get(route) is None else format(errors[route], form)
 
     cards = [
-        Card("Route", outcome.chosen, "the simplest at the noise", "good"),
+        Card("Route", outcome.chosen, "the surest at the noise", "good"),
         Card(
             "Held-out residual",
             f"{judged.chi2:.2f}",
@@ -111,6 +116,22 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
     ]
     chosen = list(outcome.judged).index(outcome.chosen)
     return fragment("calibration_choice.html", cards=cards, rows=rows, chosen=chosen)
+
+
+def _found(findings: Sequence[str]) -> list[Section]:
+    """Return the section of what was wrong with the bench and taken into account, if anything."""
+    if not findings:
+        return []
+    body = fragment("advice.html", lines=findings)
+    return [Section("found", "Found and taken into account", body)]
+
+
+def _kinds(judged: HeldOut) -> str:
+    """Return how every kind of whiteboard is predicted, the worst first."""
+    order = sorted(judged.groups.items(), key=lambda item: -item[1])
+    rows = [(name, f"{value:.2f}") for name, value in order]
+    heads = ("Whiteboards, by the route chosen", "Residual / noise")
+    return fragment("figures.html", heads=heads, rows=rows, pictures={})
 
 
 def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float]) -> str:

@@ -161,8 +161,9 @@ def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
         for frame, entry in zip(frames, entries, strict=True)
         if frame.id not in session.stored or entry["exposure_s"] == exposure_s
     ]
+    lit = frames[0].kind != "dark"
     mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
-    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id)
+    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id, lit=lit)
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
@@ -221,8 +222,9 @@ def session_outcome(
     routes: Sequence[str] | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
 ) -> Outcome:
-    """Return Psi by the routes named, by default the parametric ones, and by the free one too
-    where its whiteboards are there; with the choice among them.
+    """Return Psi by the routes named, with the choice among them.
+
+    By default by every route that the session has the whiteboards for.
 
     Raises AppError where the session has not what a route needs, or CalibrationError.
     """
@@ -230,6 +232,8 @@ def session_outcome(
     camera = camera_of(session)
     if routes is None:
         routes = ("parametric", "mixed") if few is not None else ("free",)
+        if few is not None and _opens_every_view(camera, pinholes):
+            routes = ("parametric", "mixed", "free", "combined")
     wanting = [
         what
         for needed, there, what in (
@@ -247,6 +251,15 @@ def session_outcome(
     assert held_out is not None
     design = designed_psi(session, held_out.dark)
     return calibrate(camera, design, routes, held_out, few, pinholes, on_stage=on_stage)
+
+
+def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
+    """Return whether whiteboards show every view of every shot, as the free route takes them."""
+    if pinholes is None:
+        return False
+    opened = {(one.shot, one.pinhole) for one in pinholes.frames}
+    shots = range(len(camera.shots))
+    return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
 
 
 def taken_shots(session: Session) -> tuple[int, ...]:

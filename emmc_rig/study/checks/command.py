@@ -11,6 +11,7 @@ from emmc_rig.calibrate.run import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.study.checks.bench import check_psi, check_sensor, check_stage
+from emmc_rig.study.checks.effects import check_effect, effects
 from emmc_rig.study.checks.large import check_large
 from emmc_rig.study.checks.rows import Row
 from emmc_rig.study.checks.scenes import (
@@ -33,20 +34,27 @@ CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "alarms": check_alarms,
     "large": check_large,
 }
+EFFECTS = "effects"
 
 
 def run_checks(settings: CalibrateSettings, names: str, folder: Path) -> dict:
-    """Run the checks named, commas between, and write metrics.json; return the metrics."""
-    wanted = list(CHECKS) if names == "all" else names.split(",")
+    """Run the checks named, commas between, and write metrics.json; return the metrics.
+
+    `effects` stands for every effect, which can be named alone too.
+    """
+    benches = list(effects(settings.truth))
+    known = [*CHECKS, EFFECTS, *benches]
+    wanted = [*CHECKS, EFFECTS] if names == "all" else names.split(",")
     for name in wanted:
-        if name not in CHECKS:
-            raise AppError(f"--check {name}: use all, or some of {', '.join(CHECKS)}")
+        if name not in known:
+            raise AppError(f"--check {name}: use all, or some of {', '.join(known)}")
+    wanted = [one for name in wanted for one in (benches if name == EFFECTS else [name])]
     rows: list[Row] = []
     details: dict[str, object] = {}
     seconds: dict[str, float] = {}
     for name in wanted:
         started = time.perf_counter()
-        found, detail = CHECKS[name](settings)
+        found, detail = CHECKS[name](settings) if name in CHECKS else check_effect(settings, name)
         rows += found
         details[name] = detail
         seconds[name] = time.perf_counter() - started

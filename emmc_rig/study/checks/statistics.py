@@ -122,7 +122,7 @@ def check_bound(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     for seed in range(FITS):
         truth = _drawn_truth(soft_design(camera, mask), seed)
         boards = _noise_boards(mask, settings, truth, wanted, 1000 + seed)
-        choice = FitSettings(first_pixels=4000, pixels_per_board=10**9, seed=seed)
+        choice = FitSettings(first_pixels=4000, pixels=10**9, seed=seed)
         fit = fit_placement(boards, camera, mask, choice, start=truth)
         errors.append(fit.placement.vector() - truth.vector())
         level = np.eye(len(errors[0]))

@@ -1,0 +1,141 @@
+"""Crosstalk of a colour filter: what its pixels see of the other colours, and Psi in three of them.
+
+Under a lamp of one colour after another, the whiteboard without masks tells the share K[f, c] that
+pixels behind filter f see of colour c. A mask of transmittances T_c then looks to them like
+sum_c K[f, c] T_c, which is what a fit under white light needs; and a coefficient of Psi has the
+part K[f, c] T_c in colour c. The parts in other colours than the pixel's own are the model's; its
+own is what they leave of the coefficient measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.boards import BoardSet
+from calibration.defects import mask_with_losses
+from calibration.errors import CalibrationError
+from calibration.parametric import Stages, psi_at
+from calibration.shadow import Shadow, ShadowMask
+from calibration.whiteboard import LAMP_COLOURS, Calibration
+from emmc_rig.model.sensing import ImagingMatrix
+
+if TYPE_CHECKING:
+    from calibration.routes import Parametric
+
+Array = NDArray[np.floating]
+LEAST_CROSSTALK = 2e-3
+LEAST_SHARE = 5e-4
+MEDIAN_DEVIATION = 1.2533
+"""Of a median of normal values, over that of their mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crosstalk:
+    """What every filter sees of the lamps' colours, (filter, colour): rows of sum 1, and their
+    deviations.
+    """
+
+    seen: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    @property
+    def largest(self) -> float:
+        """The largest share of a filter's light that is of other colours."""
+        return float(1 - np.diag(self.seen).min())
+
+
+def crosstalk(
+    boards: BoardSet, channels: NDArray[np.uint8], good: NDArray[np.bool_]
+) -> Crosstalk | None:
+    """Return what every filter sees of the lamps' colours.
+
+    None without whiteboards under coloured lamps, and where it is too little to matter.
+    """
+    references = [boards.references.get((0, lamp)) for lamp in LAMP_COLOURS]
+    if any(one is None for one in references) or channels.max() >= len(LAMP_COLOURS):
+        return None
+    seen, deviation = (np.empty((len(LAMP_COLOURS), len(LAMP_COLOURS))) for _ in range(2))
+    for colour, one in enumerate(references):
+        assert one is not None
+        rate = (one.mean_dn - boards.dark_at(one.exposure_s).mean_dn) / one.exposure_s
+        for f in range(len(LAMP_COLOURS)):
+            pixels = rate[good & (channels == f)]
+            if pixels.size == 0:
+                return None
+            level = float(np.median(pixels))
+            seen[f, colour] = max(level, 0.0)
+            spread = 1.4826 * float(np.median(np.abs(pixels - level)))
+            deviation[f, colour] = MEDIAN_DEVIATION * spread / np.sqrt(pixels.size)
+    total = seen.sum(axis=1, keepdims=True)
+    seen, deviation = seen / total, deviation / total
+    seen[seen < LEAST_SHARE] = 0
+    found = Crosstalk(seen / seen.sum(axis=1, keepdims=True), np.where(seen > 0, deviation, 0))
+    return found if found.largest > LEAST_CROSSTALK else None
+
+
+def mixing(mask: ShadowMask, filters: Crosstalk) -> ShadowMask:
+    """Return the mask as pixels see it whose filters let other colours through."""
+    cells = mask.cells.copy()
+    cells[..., :3] = mask.cells[..., :3] @ filters.seen.T.astype(np.float32)
+    return replace(mask, cells=cells)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherColours:
+    """What of every coefficient is in other colours than the pixel's own, and how sure.
+
+    weights, deviation: (shot, v, u, y, colour, x), 0 in a pixel's own colour, which `own` marks.
+    """
+
+    weights: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+    own: NDArray[np.bool_]
+
+
+def other_colours(
+    known: Parametric,
+    plain: ShadowMask,
+    crosstalk: Crosstalk,
+    design: ImagingMatrix,
+    stages: Stages,
+) -> OtherColours:
+    """Return what the model says of the colours that a pixel's filter lets through beside its own.
+
+    plain: the mask as designed. Raises CalibrationError where a pixel sums several samples.
+    """
+    if design.binning != 1 or design.colour is None:
+        raise CalibrationError("crosstalk is told on sensors whose pixels are samples")
+    at = known.fit.placement
+    lost = None if known.defects is None else known.defects.lost
+    mask = plain if lost is None else mask_with_losses(plain, at, lost)
+    layout = design.layout
+    shots, v, u, y, _, x = layout.shape
+    three = replace(layout, shape=(shots, v, u, y, 3, x), colour=None)
+    through = 3 * psi_at(Shadow(mask, at), three, stages).weights
+    own = np.arange(3)[:, None] == design.colour[:, None, None, :, None, :]
+    share, unsure = (
+        np.where(own, 0, np.moveaxis(matrix[design.colour], -1, 2)[:, None, None])
+        for matrix in (crosstalk.seen, crosstalk.deviation)
+    )
+    missed = np.zeros_like(through)
+    if known.misfit is not None:
+        for shot, row, column, colour in np.ndindex(shots, v, u, 3):
+            plane = through[shot, row, column, :, colour]
+            missed[shot, row, column, :, colour] = known.misfit[row, column].variance(plane)
+    deviation = np.sqrt(share**2 * missed + (unsure * through) ** 2)
+    return OtherColours((share * through).astype(np.float32), deviation.astype(np.float32), own)
+
+
+def in_three_colours(known: Calibration, others: OtherColours) -> Calibration:
+    """Return a calibration of one colour a pixel in three."""
+    mine = known.psi.weights - others.weights.sum(axis=4, keepdims=True)
+    weights = np.where(others.own, np.maximum(mine, 0), others.weights).astype(np.float32)
+    spread = np.square(others.deviation)
+    own = np.square(known.deviation) + spread.sum(axis=4, keepdims=True)
+    deviation = np.sqrt(np.where(others.own, own, spread))
+    psi = replace(known.psi, weights=weights, colour=None)
+    return replace(known, psi=psi, deviation=deviation.astype(np.float32))

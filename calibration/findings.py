@@ -1,0 +1,76 @@
+"""What the whiteboards say is wrong with the bench, in words; all of it is in Psi."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.board_angle import BoardAngle
+from calibration.levels import Levels
+
+if TYPE_CHECKING:
+    from calibration.routes import Parametric
+
+SIGNIFICANT = 5.0
+NOTEWORTHY = {
+    "tilt_x_rad": (
+        5e-4,
+        "the mask is tilted by {degrees:+.2f} +- {spread_degrees:.2f} degrees in x",
+    ),
+    "tilt_y_rad": (
+        5e-4,
+        "the mask is tilted by {degrees:+.2f} +- {spread_degrees:.2f} degrees in y",
+    ),
+    "bow_um": (1.0, "the mask is bowed by {value:+.1f} +- {spread:.1f} um at the picture's corner"),
+    "glass_um": (20.0, "{value:.0f} +- {spread:.0f} um of glass lie between mask and sensor"),
+    "distance_share": (0.02, "the mask's distance differs from the design by {percent:+.1f} %"),
+}
+
+
+def mask_findings(known: Parametric | None) -> list[str]:
+    """Return what of the mask's placement is off, and far outside its deviation."""
+    if known is None:
+        return []
+    found = []
+    for name, (least, words) in NOTEWORTHY.items():
+        value, spread = getattr(known.fit.placement, name), known.fit.deviation(name)
+        if abs(value) > max(least, SIGNIFICANT * spread):
+            found.append(
+                words.format(
+                    value=value,
+                    spread=spread,
+                    percent=100 * value,
+                    degrees=np.degrees(value),
+                    spread_degrees=np.degrees(spread),
+                )
+            )
+    return found
+
+
+def level_findings(levels: Levels | None) -> list[str]:
+    """Return what lamp and response did."""
+    if levels is None:
+        return []
+    found = []
+    if levels.drifting:
+        found.append(
+            f"the lamp drifted by {levels.drift:.2%} (its colours apart by "
+            f"{levels.colour_drift:.2%}): taken out; let it warm up"
+        )
+    if levels.bent:
+        loss = levels.bend_per_dn * levels.brightest_dn
+        found.append(
+            f"the sensor's response loses {loss:.2%} at {levels.brightest_dn:.0f} DN: straightened"
+        )
+    return found
+
+
+def angle_findings(board: BoardAngle) -> list[str]:
+    """Return how uneven the white board is over angle."""
+    if not board.uneven:
+        return []
+    return [
+        f"the white board is uneven by {np.ptp(board.radiance):.1%} over the directions into the "
+        "aperture: taken out; what is alike in every direction from its middle cannot be told"
+    ]

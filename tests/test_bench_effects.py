@@ -1,0 +1,135 @@
+"""What can be wrong with the simulated bench, each against its own optics; Psi by integration."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import fresnel
+
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from simulators.bench import NO_ERRORS, Bench, _met
+from simulators.flaws import BoardFlaws, LampFlaws, OpticsFlaws, SensorFlaws, diffracted
+
+SIZE = (12, 18)
+LENS_UM, DISTANCE_UM = 50_000.0, 400.0
+CAMERA = Camera.model_validate(
+    {
+        "title": "test",
+        "views": [3, 3],
+        "sensor": {"cfa": "rggb"},
+        "masks": {"code": {"distance_mm": 0.3, "cell_um": 40, "pattern": {"kind": "random_rgbw"}}},
+    }
+)
+OPEN = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 1e5, "aperture_y": 0.0}
+
+
+def bench_of(errors=NO_ERRORS, rays=256, at_um=OPEN, seconds=0.0, **flaws):
+    scene = np.ones((3, 3, *SIZE, 3), np.float32)
+    bench = Bench(
+        CAMERA, scene, SIZE, lambda: at_um, 1e5, np.random.default_rng(0), errors, rays,
+        seconds=lambda: seconds, **flaws,
+    )  # fmt: skip
+    bench.target, bench.lamp = "whiteboard", "white"
+    return bench
+
+
+def own_colour(psi, colour):
+    return np.take_along_axis(psi, colour[0][None, None, :, None, :].astype(int), axis=3)
+
+
+def test_psi_by_integration_is_the_imaging_matrix_of_a_perfect_bench():
+    design = build_imaging_matrix(CAMERA, SIZE)
+    true = bench_of(rays=1024).true_psi(0)
+    found = own_colour(true, design.colour)
+    off = np.linalg.norm(found - design.weights[0]) / np.linalg.norm(design.weights)
+    assert off < 0.01
+    assert np.count_nonzero(true) == np.count_nonzero(found)
+
+
+def test_true_coefficients_sum_to_the_open_whiteboard_whatever_is_wrong_with_the_optics():
+    errors = replace(NO_ERRORS, tilt_deg=(0.5, -0.3), bow_um=12.0, substrate_um=150.0)
+    optics = OpticsFlaws(0.05, 1.0, microlens_power=6.0, chief_ray_error=0.4)
+    bench = bench_of(errors, optics=optics)
+    open_board = bench.readings()
+    bench.masks_in = False
+    white = bench.readings()
+    bench.masks_in = True
+    np.testing.assert_allclose(bench.true_psi(0).sum(axis=(0, 1, 3)), open_board / white, rtol=2e-6)
+
+
+def test_psi_by_integration_knows_neither_lamp_nor_board_nor_sensor():
+    plain = bench_of().true_psi(0)
+    other = bench_of(
+        board=BoardFlaws(0.2, 0.3, 2.0), lamp=LampFlaws(0.1, 0.05),
+        sensor=SensorFlaws(response_spread=0.1), seconds=100.0,
+    )  # fmt: skip
+    np.testing.assert_array_equal(other.true_psi(0), plain)
+
+
+def test_crosstalk_gives_neighbouring_colours_their_share():
+    psi = bench_of(sensor=SensorFlaws(crosstalk=0.1)).true_psi(0)
+    bench = bench_of(sensor=SensorFlaws(crosstalk=0.1))
+    bench.masks_in, bench.lamp = False, "green"
+    assert bench.readings()[0, 0] == pytest.approx(0.1, rel=1e-5)
+    assert (psi[:, :, 0, 1, 0] <= 0.1 / 9 + 1e-6).all()
+
+
+def snell(x, u, thickness, index):
+    """Where the ray from x to u leaves glass that lies on the sensor, by Snell's law alone."""
+
+    def missed(sine):
+        inside = sine / index
+        above = (LENS_UM - thickness) * sine / np.sqrt(1 - sine**2)
+        return thickness * inside / np.sqrt(1 - inside**2) + above - (u - x)
+
+    sine = float(brentq(missed, -0.9, 0.9, xtol=1e-14))  # type: ignore[arg-type]
+    inside = sine / index
+    below = thickness * inside / np.sqrt(1 - inside**2)
+    return x + below + (DISTANCE_UM - thickness) * sine / np.sqrt(1 - sine**2)
+
+
+def test_glass_bends_rays_by_snells_law():
+    for x, u in ((0.0, 9_000.0), (2_500.0, -12_000.0)):
+        found = _met(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, 0.0, 0.0, 0.0, 300.0, 1.52)
+        assert found[0] == pytest.approx(snell(x, u, 300.0, 1.52), abs=1e-4)
+        assert found[1] == 0
+
+
+def test_a_tilted_mask_is_met_where_the_ray_crosses_its_plane():
+    x, u, slope = 2_000.0, -8_000.0, np.tan(np.deg2rad(1.0))
+    to = (u - x) / LENS_UM
+    # x + to z with z = d + slope (x + to z)
+    z = (DISTANCE_UM + slope * x) / (1 - slope * to)
+    found = _met(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, slope, 0.0, 0.0, 0.0, 1.52)
+    assert found[0] == pytest.approx(x + to * z, abs=1e-3)
+
+
+def test_an_edge_diffracts_as_fresnel_integrals_say():
+    grain_um, distance_um, wavelength_um = 2.0, 2_000.0, 0.55
+    edge = np.zeros((8, 4000), np.float32)
+    edge[:, 2000:] = 1
+    found = diffracted(edge, grain_um, distance_um, wavelength_um)[4, 1900:2100]
+    # Samples stand for cells: the edge lies half a grain before the first that is open.
+    x_um = (np.arange(-100, 100) + 0.5) * grain_um
+    s, c = fresnel(x_um * np.sqrt(2 / (wavelength_um * distance_um)))
+    expected = 0.5 * ((0.5 + c) ** 2 + (0.5 + s) ** 2)
+    np.testing.assert_allclose(found, expected, atol=0.03)
+    assert found.max() == pytest.approx(1.37, abs=0.02)
+
+
+def test_a_turned_board_turns_its_unevenness_and_keeps_its_mean():
+    flaws = BoardFlaws(angle_spread=0.1)
+    upright, turned = (flaws.radiance(SIZE, (5, 5), turn)[:, :, 0, 0] for turn in (0.0, 90.0))
+    assert upright.mean() == pytest.approx(1, abs=1e-6)
+    assert np.ptp(upright) == pytest.approx(0.1, rel=0.3)
+    np.testing.assert_allclose(turned, np.rot90(upright, -1), atol=1e-6)
+
+
+def test_the_lamp_warms_up_and_its_colours_drift_apart():
+    cold, warm = (bench_of(seconds=s, lamp=LampFlaws(0.02, 0.01)) for s in (0.0, 1e6))
+    for bench in (cold, warm):
+        bench.masks_in = False
+    ratio = warm.readings() / cold.readings()
+    assert ratio[0, 0] == pytest.approx(1.03, rel=1e-4)
+    assert ratio[1, 1] == pytest.approx(1.01, rel=1e-4)
