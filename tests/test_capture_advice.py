@@ -21,7 +21,6 @@ import pytest
 import typer
 import yaml
 from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
-from simulators.dng import encode_dng
 
 import drivers.errors
 import emmc_rig
