@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.study.stability.breaking import Span, below_best, below_view, strength_at, told
+from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.stability.fault_points import Point
-from emmc_rig.study.stability.faults import FAULTS, Fault
+from emmc_rig.study.stability.faults import FAULTS
 
 POOLED = "all scenes"
 

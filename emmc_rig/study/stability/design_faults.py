@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
+from emmc_rig.study.stability.fault import DESIGN, Fault
 from emmc_rig.study.stability.trial import Setup, Trial, taken
 from emmc_rig.study.sweep import NotApplicableError
 
@@ -69,3 +70,32 @@ def pixel_size(setup: Setup, r: float) -> Trial:
         return taken(setup.with_camera(sensor=sensor))
     except CameraError as fault:
         raise NotApplicableError(str(fault)) from fault
+
+
+FAULTS = (
+    Fault(
+        "mask-cell", "Mask cell", "px",
+        (0.1, 0.25, 0.5, 1, 1.5, 2, 3, 4, 8, 16, 32, 64), (0.1, 0.5, 1.5, 6, 32),
+        DESIGN, mask_cell,
+    ),
+    Fault(
+        "mask-distance", "Mask distance", "px of shadow per view",
+        (0, 0.125, 0.25, 0.5, 1, 2, 4, 8, 16), (0, 0.25, 1, 4, 16),
+        DESIGN, mask_distance, clean=False,
+    ),
+    Fault(
+        "shots", "Shots", "shots",
+        (6, 4, 3, 2, 1), (4, 2, 1),
+        DESIGN, shots, whole=True,
+    ),
+    Fault(
+        "views", "Views", "views a side",
+        (1, 3, 5, 7), (3, 5, 7),
+        DESIGN, views, whole=True,
+    ),
+    Fault(
+        "r", "Pixel size, r", "measurements per sample",
+        (1, 1 / 4, 1 / 16, 1 / 64), (1, 1 / 4, 1 / 16),
+        DESIGN, pixel_size, whole=True,
+    ),
+)  # fmt: skip

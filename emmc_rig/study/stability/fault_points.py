@@ -15,7 +15,8 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.settings import Settings
-from emmc_rig.study.stability.faults import FAULTS, Fault, find_fault, trial
+from emmc_rig.study.stability.fault import Fault
+from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import check_scene_names
 from reconstruction.methods import find_method

@@ -14,6 +14,7 @@ from calibration.placement import Placement, designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.stability.fault import MASK, Fault
 from emmc_rig.study.stability.trial import Setup, Trial, taken
 from emmc_rig.study.sweep import NotApplicableError
 from simulators.flaws import OpticsFlaws
@@ -107,3 +108,37 @@ def vignetting(setup: Setup, percent: float) -> Trial:
     power = math.log(1 - percent / 100) / math.log(float(natural.min()))
     passed = (natural**power).astype(psi.weights.dtype)
     return taken(setup, true_psi=replace(psi, weights=psi.weights * passed[None, :, :, :, None, :]))
+
+
+FAULTS = (
+    Fault(
+        "mask-shift", "Mask shift", "px",
+        (0, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8), (0, 0.25, 1, 4),
+        MASK, shift, repairable=True,
+    ),
+    Fault(
+        "mask-rotation", "Mask rotation", "degrees",
+        (0, 0.1, 0.25, 0.5, 1, 2, 4, 8), (0, 0.5, 2, 8),
+        MASK, rotation, repairable=True,
+    ),
+    Fault(
+        "mask-distance-error", "Error of the mask's distance", "%",
+        (0, 5, 10, 25, 50, 100, 200), (0, 10, 50, 200),
+        MASK, distance, repairable=True,
+    ),
+    Fault(
+        "mask-scale", "Error of the mask's scale", "%",
+        (0, 0.1, 0.25, 0.5, 1, 2, 5, 10), (0, 0.5, 2, 10),
+        MASK, scale, repairable=True,
+    ),
+    Fault(
+        "edge-blur", "Blur of the mask's edges", "px",
+        (0, 0.1, 0.2, 0.35, 0.5, 0.75, 1, 2), (0, 0.2, 0.5, 2),
+        MASK, edge_blur, repairable=True,
+    ),
+    Fault(
+        "vignetting", "Vignetting", "% lost by the outermost ray",
+        (0, 5, 10, 20, 40, 60, 80, 95), (0, 10, 40, 90),
+        MASK, vignetting, repairable=True,
+    ),
+)  # fmt: skip

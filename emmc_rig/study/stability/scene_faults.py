@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from emmc_rig.study.stability.fault import SCENE, Fault
 from emmc_rig.study.stability.trial import Setup, Trial, taken
 from simulators import changes
 from simulators.scenes import SCENES
@@ -47,3 +48,27 @@ def contrast(setup: Setup, percent: float) -> Trial:
     faded = np.asarray(mean + share * (seen.light_field - mean), dtype=np.float32)
     trial = taken(setup, scene=replace(seen, light_field=faded))
     return replace(trial, peak=share)
+
+
+FAULTS = (
+    Fault(
+        "disparity-range", "Disparity range", "px per view",
+        (0.5, 1, 2, 4, 8, 16, 32), (0.5, 2, 8, 32),
+        SCENE, disparity_range,
+    ),
+    Fault(
+        "occlusion", "Occlusion density", "% hidden",
+        (0, 5, 10, 20, 40, 60, 80), (0, 10, 30, 60),
+        SCENE, occlusion,
+    ),
+    Fault(
+        "specularity", "Specularity", "% mirrored",
+        (0, 5, 10, 20, 40, 60, 80), (0, 10, 40, 80),
+        SCENE, specularity,
+    ),
+    Fault(
+        "contrast", "Texture contrast", "%",
+        (100, 50, 25, 10, 5, 2.5, 1), (100, 25, 5, 1),
+        SCENE, contrast,
+    ),
+)  # fmt: skip

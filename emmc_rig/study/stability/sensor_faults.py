@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.camera import build_imaging_matrix, pixel_light
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.study.stability.fault import SENSOR, Fault
 from emmc_rig.study.stability.trial import Array, Setup, Trial, taken
 from simulators.flaws import SensorFlaws
 
@@ -87,3 +88,32 @@ def _bad(setup: Setup, percent: float, told: bool) -> Trial:
 
     bad: NDArray[np.bool_] = np.broadcast_to(hot | dead, (len(camera.shots), *pixels))
     return taken(setup, change_clean=spoilt, unusable=bad if told else None)
+
+
+FAULTS = (
+    Fault(
+        "exposure", "Exposure", "electrons at white",
+        (50_000, 15_500, 5_000, 1_500, 500, 150, 50, 15, 5), (15_500, 500, 50, 5),
+        SENSOR, exposure,
+    ),
+    Fault(
+        "read-noise", "Read noise", "electrons",
+        (0, 30, 100, 300, 1_000, 3_000), (0, 100, 1_000, 3_000),
+        SENSOR, read_noise,
+    ),
+    Fault(
+        "saturation", "Saturation", "% of readings",
+        (0, 1, 5, 10, 20, 40, 60, 80), (0, 10, 40, 80),
+        SENSOR, saturation,
+    ),
+    Fault(
+        "bad-pixels", "Bad pixels, not told", "% of pixels",
+        (0, 0.1, 0.3, 1, 3, 10, 30), (0, 0.3, 3, 20),
+        SENSOR, bad_pixels, repairable=True, screened=True,
+    ),
+    Fault(
+        "masked-pixels", "Bad pixels, masked", "% of pixels",
+        (0, 1, 3, 10, 30, 60, 90), (0, 10, 40, 80),
+        SENSOR, masked_pixels,
+    ),
+)  # fmt: skip

@@ -10,6 +10,7 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
+from emmc_rig.study.stability.fault import SEVERAL, SHOTS, Fault
 from emmc_rig.study.stability.trial import Array, Setup, Trial, taken
 from emmc_rig.study.sweep import NotApplicableError
 from simulators import changes
@@ -112,3 +113,34 @@ def _count(setup: Setup, count: float) -> int:
     if count >= shots:
         raise NotApplicableError(f"{count:g} of {shots} shots: one at least must be whole")
     return round(count)
+
+
+FAULTS = (
+    Fault(
+        "flicker", "Lamp flicker between shots", "%",
+        (0, 1, 2, 5, 10, 20, 40, 80), (0, 2, 10, 40),
+        SHOTS, flicker, repairable=True, screened=True, shots=SEVERAL,
+    ),
+    Fault(
+        "scene-motion", "Scene motion", "px a shot",
+        (0, 0.1, 0.25, 0.5, 1, 2, 4, 8), (0, 0.5, 2, 8),
+        SHOTS, scene_motion, repairable=True, shots=SEVERAL,
+    ),
+    Fault(
+        "camera-motion", "Camera motion", "px a shot",
+        (0, 0.1, 0.25, 0.5, 1, 2, 4, 8), (0, 0.25, 1, 4),
+        SHOTS, camera_motion, repairable=True, shots=SEVERAL,
+    ),
+    Fault(
+        "missing-shot", "Missing shots", "shots",
+        (0, 1, 2), (0, 1, 2),
+        SHOTS, missing_shot, repairable=True, screened=True, shots=SEVERAL,
+        whole=True,
+    ),
+    Fault(
+        "repeated-shot", "Repeated shots", "shots",
+        (0, 1, 2), (0, 1, 2),
+        SHOTS, repeated_shot, repairable=True, screened=True, shots=SEVERAL,
+        whole=True,
+    ),
+)  # fmt: skip

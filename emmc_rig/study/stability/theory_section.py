@@ -24,7 +24,8 @@ from emmc_rig.pages.drawing import (
 from emmc_rig.pages.page import Section, embedded, fragment, number
 from emmc_rig.study.stability.breaking import Span, below_best, strength_at, told
 from emmc_rig.study.stability.curve_drawing import shown
-from emmc_rig.study.stability.faults import FAULTS, Fault
+from emmc_rig.study.stability.fault import Fault
+from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.stability.theory import TheoryPoint
 
 BOUND, FOUND, ORACLE = "bound_db", "found_db", "oracle_db"
