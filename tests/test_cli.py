@@ -212,14 +212,15 @@ def test_wrong_usage_is_exit_code_2(run):
 
 
 def test_the_version_and_help_are_told(run):
-    assert run("--version")[:2] == (0, "emmc-rig 0.1.0\n")
+    assert run("--version")[:2] == (0, f"emmc-rig {__version__}\n")
     code, out, _ = run("--help")
     assert code == 0
     assert "demo" in out
 
 
 def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
-    command = [sys.executable, "-c", "from emmc_rig.cli import main; main()"]
+    command = [sys.executable, "-c", "from emmc_rig.version import __version__
+from emmc_rig.cli import main; main()"]
     process = subprocess.Popen(
         [*command, "demo", "--size", "96x128", "--out", "r"],
         cwd=tmp_path,
