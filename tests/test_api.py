@@ -94,7 +94,7 @@ def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, 
     calibration.save("psi")
     saved = ImagingMatrix.load(tmp_path / "psi" / "psi.h5")
     np.testing.assert_array_equal(saved.weights, calibration.psi.weights)
-    assert "parametric" in repr(calibration)
+    assert "route, whiteboard held out" in repr(calibration)
     assert "32x48" in repr(calibration)
     psi, frames = emmc.open_frames(session.folder)
     assert frames.shape == psi.frames_shape == (1, 32, 48)
@@ -133,6 +133,7 @@ def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
     result = emmc.reconstruct(psi, frames, "dict-omp", dictionary="dct")
     result.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "files.json",
         "light_field.h5",
         "metrics.json",
         "pictures",

@@ -228,7 +228,6 @@ def test_the_schema_is_printed(run):
         (["capture", "plan.yaml"], "say which rig"),
         (["capture", "plan.yaml", "--rig", "real"], "name of a YAML file of devices"),
         (["capture", "plan.yaml", "--rig", "no.yaml"], "no.yaml: no such file"),
-        (["capture", "plan.yaml", "--rig", "simulated", "--size", "x"], "write ROWSxCOLUMNS"),
         (["capture", "plan.yaml", "--rig", "simulated", "--scene", "drak"], "did you mean 'dark'"),
         (["capture", "--new", "rgbw"], "did you mean"),
         (["capture", "plan.yaml", *RIG, "--out", "occupied"], "something else than a session"),
@@ -249,6 +248,16 @@ def test_bad_input_gives_one_line_and_makes_nothing(run, tmp_path, arguments, li
     assert code == 1
     assert line in one_line(err)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "line"), [("--size", "write ROWSxCOLUMNS"), ("--until", "write a PSNR")]
+)
+def test_an_option_that_cannot_be_read_is_wrong_usage(run, tmp_path, option, line):
+    plan_file(tmp_path)
+    code, _, err = run("capture", "plan.yaml", "--rig", "simulated", option, "nan")
+    assert code == 2
+    assert line in one_line(err)
 
 
 def test_a_misspelt_key_in_a_plan_names_the_nearest(run, tmp_path):
