@@ -167,7 +167,9 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
     except error:
         raise
     except _FAULTS as fault:
-        raise error(f"{path}: cannot be read ({_one_line(fault)}); {remedy}") from fault
+        raise error(
+            f"{path}: cannot be read, damaged or incomplete ({_one_line(fault)}); {remedy}"
+        ) from fault
 
 
 def check_png_size(content: bytes, source: str, error: type[Exception]) -> None:
