@@ -46,15 +46,22 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(path: Path, error: type[Exception]) -> object:
     """Return the content of a YAML file; raises `error` when it cannot be read."""
+    name = shown_path(path)
     try:
         with open(path, "rb") as file:
             data = file.read(MOST_YAML_BYTES + 1)
     except FileNotFoundError as fault:
-        raise error(f"{path}: no such file") from fault
+        raise error(f"{name}: no such file") from fault
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
-        raise error(f"{str(path)[:200]}: cannot be read ({why})") from fault
-    return parse_yaml(data, str(path), error)
+        raise error(f"{name}: cannot be read ({why})") from fault
+    return parse_yaml(data, name, error)
+
+
+def shown_path(path: Path) -> str:
+    """Return a path on one line: control characters escaped, no longer than a name can be."""
+    text = "".join(one if one.isprintable() else repr(one)[1:-1] for one in str(path))
+    return text if len(text) <= 300 else f"{text[:300]}..."
 
 
 def parse_yaml(data: bytes | str, source: str, error: type[Exception]) -> object:
@@ -157,10 +164,10 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
     try:
         size = path.stat().st_size
     except FileNotFoundError as fault:
-        raise error(f"{path}: no such file; {remedy}") from fault
+        raise error(f"{shown_path(path)}: no such file; {remedy}") from fault
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
-        raise error(f"{str(path)[:200]}: cannot be read ({why})") from fault
+        raise error(f"{shown_path(path)}: cannot be read ({why})") from fault
     try:
         with h5py.File(path, "r") as file:
             yield StoredArrays(file, size)
