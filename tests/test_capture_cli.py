@@ -228,6 +228,7 @@ def test_the_schema_is_printed(run):
         (["capture", "plan.yaml"], "say which rig"),
         (["capture", "plan.yaml", "--rig", "real"], "name of a YAML file of devices"),
         (["capture", "plan.yaml", "--rig", "no.yaml"], "no.yaml: no such file"),
+        (["capture", "plan.yaml", "--rig", "simulated", "--size", "16x24"], "use 22x22 or more"),
         (["capture", "plan.yaml", "--rig", "simulated", "--scene", "drak"], "did you mean 'dark'"),
         (["capture", "--new", "rgbw"], "did you mean"),
         (["capture", "plan.yaml", *RIG, "--out", "occupied"], "something else than a session"),

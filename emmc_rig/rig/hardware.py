@@ -25,6 +25,7 @@ from drivers.errors import DriverError, TransportTimeoutError
 from drivers.folder import FolderCamera
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
+from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.ports import find_port, list_serial_ports
 from drivers.ptp import PtpCamera, PtpSession
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
@@ -167,8 +168,16 @@ def simulated_rig(
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
-    pixel; few are quick, and grainy beside a good sensor's noise.
+    pixel; few are quick, and grainy beside a good sensor's noise. Raises AppError for a size that
+    the camera's RAW files cannot hold.
     """
+    k = camera.sensor.binning
+    if min(size) // k < SMALLEST_SIDE_PX:
+        least = SMALLEST_SIDE_PX * k
+        raise AppError(
+            f"--size {size[0]}x{size[1]}: the simulated camera's RAW files hold at least "
+            f"{SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels: use {least}x{least} or more"
+        )
     clock = clock or ManualClock()
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
     travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um}
