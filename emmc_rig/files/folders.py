@@ -138,7 +138,9 @@ def new_file(path: Path) -> Iterator[Path]:
                 # It came meanwhile, or the file system has no links, as on a memory stick.
                 os.rename(place / path.name, _free(path))
     except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+        raise AppError(
+            f"{path}: cannot be written ({fault.strerror or fault}); choose another place"
+        ) from fault
 
 
 def refuse_new_file(path: Path) -> None:
@@ -147,7 +149,9 @@ def refuse_new_file(path: Path) -> None:
         with _workplace(_place_beside(_free(path))):
             pass
     except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror or fault})") from fault
+        raise AppError(
+            f"{path}: cannot be written ({fault.strerror or fault}); choose another place"
+        ) from fault
 
 
 def _free(path: Path) -> Path:
