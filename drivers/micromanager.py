@@ -541,10 +541,14 @@ class MicroManagerStage(HostStage):
                 return math.inf
             return core.getPropertyUpperLimit(label, setup.speed_property) * setup.speed_unit_um_s
 
+    def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
+        """As every stage; raises `SpeedFixedError` where no property holds the speed."""
+        if not self._setup.speed_property:
+            raise SpeedFixedError(axis, "name the property that holds it: speed_property")
+        super().set_speed_um_s(axis, speed_um_s)
+
     def _apply_speed(self, axis: str, speed_um_s: float) -> None:
         setup = self._setup
-        if not setup.speed_property:
-            raise SpeedFixedError(axis, "name the property that holds it: speed_property")
         label, _ = self._place(axis)
         with calling(f"set {setup.speed_property}"):
             shown = speed_um_s / setup.speed_unit_um_s

@@ -21,7 +21,7 @@ from emmc_rig.model.lightfield import save_hdf5
 
 SIZE = ("--size", "24x32")
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
-ONE_FILE = {"capture --new", "session export", "train", "devices serve"}
+ONE_FILE = {"capture --new", "session export", "train", "devices scale", "devices serve"}
 WRITERS = {
     "cameras": ("rgbw-mono",),
     "capture": ("other.yaml", *RIG),
@@ -33,12 +33,14 @@ WRITERS = {
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
     "chart --ablation": (*SIZE,),
+    "chart --guard": (*SIZE,),
     "chart --kernels": (*SIZE,),
     "chart --next-shot": (*SIZE,),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
     "demo": (*SIZE,),
     "devices bench": (),
+    "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
@@ -57,8 +59,8 @@ WRITERS = {
               "--sparsity", 2, "--iterations", 1),
 }  # fmt: skip
 READERS = {
-    "devices camera", "devices home", "devices info", "devices jog", "devices list",
-    "devices probe", "devices udev-rule", "live", "session list", "session prune", "session show",
+    "devices camera", "devices conform", "devices home", "devices info", "devices jog",
+    "devices list", "devices probe", "devices udev-rule", "live", "session list", "session prune", "session show",
     "session verify",
 }  # fmt: skip
 JOURNALS = {
@@ -95,7 +97,7 @@ def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world")
     shots = {"camera": "rgbw-bayer-1shot", "shots": [{}], "whiteboards": None, "darks": None}
     (folder / "plan.yaml").write_text(yaml.safe_dump(shots))
-    (folder / "other.yaml").write_text(yaml.safe_dump({**shots, "title": "another"}))
+    (folder / "other.yaml").write_text(yaml.safe_dump({**shots, "camera": "rgbw-mono"}))
     (folder / "held").mkdir()
     done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session")
     assert done[0] == 0, done

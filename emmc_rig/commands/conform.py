@@ -26,7 +26,7 @@ def conform(
     """Check that a stage or camera does what every one must do; exit code 1 unless it does.
 
     A stage is homed again and again, and moved through the middle of its travel, after a question;
-    a camera is exposed some twenty times. Needs pytest: pip install "emmc-rig[test]".
+    a camera is exposed some twenty times. Needs the extra `test`.
     """
     if find_spec("pytest") is None:
         raise AppError('conform needs pytest: pip install "emmc-rig[test]"')
