@@ -191,14 +191,28 @@ def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
 
 
 def test_a_line_that_is_torn_anywhere_does_not_count():
-    line = encode_line({"kind": "frame", "id": "a", "x": 1.5})
-    assert decode_line(line[:-1]) == {"kind": "frame", "id": "a", "x": 1.5}
+    line = encode_line({"kind": "retry", "id": "a", "x": 1.5})
+    assert decode_line(line[:-1]) == {"kind": "retry", "id": "a", "x": 1.5}
     for length in range(len(line) - 1):
         assert decode_line(line[:length]) is None
 
 
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12},
+        {"kind": "frame", "id": "a", "file": 3, "bytes": 12, "sha256": "0"},
+        {"kind": "created", "frames": 3},
+        {"kind": 3},
+        {"id": "a"},
+    ],
+)
+def test_a_line_without_what_its_kind_needs_does_not_count(entry):
+    assert decode_line(encode_line(entry)[:-1]) is None
+
+
 def test_a_line_with_any_flipped_bit_does_not_count():
-    line = encode_line({"kind": "frame", "id": "a"})[:-1]
+    line = encode_line({"kind": "retry", "id": "a"})[:-1]
     for place in range(len(line)):
         for bit in range(8):
             damaged = bytearray(line)
@@ -209,9 +223,9 @@ def test_a_line_with_any_flipped_bit_does_not_count():
 def test_the_heads_of_a_journal_agree_with_all_of_it():
     """Lines with awkward names, torn and damaged ones among them."""
     entries = [
-        {"kind": "created", "frames": 3},
-        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12, "figures": {"x": [1, 2.5]}},
-        {"kind": "frame", "id": 'b"\\', "file": "\u00e9.dng", "bytes": 0},
+        {"kind": "created", "frames": 3, "sha256": {}},
+        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12, "sha256": "0", "x": [1, 2.5]},
+        {"kind": "frame", "id": 'b"\\', "file": "\u00e9.dng", "bytes": 0, "sha256": "1"},
         {"kind": "retry", "id": "a", "fault": "x"},
     ]
     data = b"".join(encode_line(entry) for entry in entries)
@@ -225,8 +239,9 @@ def test_the_heads_of_a_journal_agree_with_all_of_it():
 
 def test_a_line_after_a_torn_one_is_read(tmp_path):
     path = tmp_path / "j"
-    path.write_bytes(encode_line({"n": 1}) + encode_line({"n": 2})[:-9])
-    Journal(SYSTEM_DISK, path).append({"n": 3})
+    one, two, three = ({"kind": "retry", "n": n} for n in (1, 2, 3))
+    path.write_bytes(encode_line(one) + encode_line(two)[:-9])
+    Journal(SYSTEM_DISK, path).append(three)
     again = Journal(SYSTEM_DISK, path)
     assert [entry["n"] for entry in again.entries] == [1, 3]
     assert again.unreadable == 1

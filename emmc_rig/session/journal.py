@@ -76,7 +76,7 @@ def heads(data: bytes) -> list[Entry]:
             continue
         head = _FRAME_HEAD.match(body)
         entry = _decoded(body if head is None else head[0])
-        if entry is not None:
+        if entry is not None and (head is not None or _whole(entry)):
             found.append(entry)
     return found
 

@@ -273,10 +273,16 @@ def reconstruct_adaptive(
     unexplained = misfit_of(left, given.noise, fitted)
     if settings.rest and unexplained.times > UNEXPLAINED:
         more = rest(
-            given.psi, given.frames, left, given.typical, fitted, held, settings.start_steps
+            given.psi,
+            bright.frames,
+            left / np.float32(scale),
+            bright.typical,
+            fitted,
+            held,
+            settings.start_steps,
         )
         if more is not None:
-            light_field = np.clip(light_field + more, 0, 1)
+            light_field = np.clip(light_field + np.float32(scale) * more, 0, 1)
             left = (given.frames - given.psi.forward(light_field)).astype(np.float32)
             unexplained = misfit_of(left, given.noise, fitted)
     if unexplained.times > FAR_OFF:
