@@ -135,4 +135,5 @@ def validated(cls: type[S], data: object, source: str, error: type[Exception]) -
     try:
         return cls.model_validate(data)
     except ValidationError as fault:
-        raise error(f"{source}: {explain(fault, cls)}") from fault
+        # A key may hold line breaks; a message is one line.
+        raise error(" ".join(f"{source}: {explain(fault, cls)}".split())) from fault
