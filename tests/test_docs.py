@@ -20,13 +20,16 @@ ROOT = Path(__file__).parents[1]
 REASONS = ("hardware", "real files", "minutes")
 NOT_OURS = ("pip", "pytest")
 """Programs that brought the tests here, or are the tests."""
-BLOCK = re.compile(r"^(?:<!-- (?P<why>[^\n]*) -->\n)?```\n(?P<text>.*?)^```$", re.M | re.S)
+BLOCK = re.compile(
+    r"^(?:<!-- (?P<why>[^\n]*) -->\n)?```(?P<language>[^\n]*)\n(?P<text>.*?)^```$", re.M | re.S
+)
+"""Of any language, so that the end of one is never taken for the beginning of the next."""
 
 
 def blocks(document):
     """Yield (why it is not run, its commands) of every block that begins with a program."""
     for found in BLOCK.finditer(document.read_text(encoding="utf-8")):
-        if found["text"].split()[0] in ("emmc-rig", *NOT_OURS):
+        if not found["language"] and found["text"].split()[0] in ("emmc-rig", *NOT_OURS):
             yield found["why"], list(commands(found["text"]))
 
 
@@ -54,6 +57,13 @@ def test_every_command_of_the_documentation_is_one_of_the_program(document):
             while (group := getattr(command, "commands", None)) is not None:
                 command = group[rest.pop(0)]
             command.make_context(words[0], rest)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_no_line_that_is_a_command_is_passed_over(document):
+    lines = re.findall(r"^(?:pip install .* && )?emmc-rig .*$", document.read_text(), re.M)
+    found = [words for _, commands in blocks(document) for words in commands]
+    assert len(found) == len(lines) > 0
 
 
 @pytest.fixture
