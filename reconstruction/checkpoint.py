@@ -11,7 +11,7 @@ from typing import TypeVar
 import h5py
 
 from emmc_rig.model.files import whole_file
-from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.reading import one_line, stored_arrays
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import Iteration, LearningState
 from reconstruction.online import OnlineState
@@ -38,7 +38,7 @@ def save_checkpoint(path: Path, state: State, purpose: Mapping[str, object]) -> 
                         field.name, data=getattr(state, field.name), chunks=True, fletcher32=True
                     )
     except OSError as fault:
-        raise DictionaryError(f"{path}: cannot be written ({_one_line(fault)})") from fault
+        raise DictionaryError(f"{path}: cannot be written ({one_line(fault)})") from fault
 
 
 def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) -> S:
@@ -63,7 +63,3 @@ def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) ->
         names = [field.name for field in fields(kind) if field.name != "history"]
         arrays = {name: stored.array(name) for name in names}
     return kind(**arrays, history=history)
-
-
-def _one_line(fault: Exception) -> str:
-    return " ".join(str(fault).split())

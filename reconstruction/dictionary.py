@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from emmc_rig.model.files import whole_file
-from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.reading import one_line, stored_arrays
 from reconstruction.errors import DictionaryError
 
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
@@ -125,7 +125,7 @@ class Dictionary:
                 )
                 file["provenance"] = self.provenance
         except OSError as fault:
-            raise DictionaryError(f"{path}: cannot be written ({_one_line(fault)})") from fault
+            raise DictionaryError(f"{path}: cannot be written ({one_line(fault)})") from fault
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Dictionary:
@@ -165,10 +165,6 @@ def _norms(atoms: NDArray[np.floating], kind: str) -> NDArray[np.float64]:
     if wrong.size:
         raise DictionaryError(f"atom {wrong[0]} holds values that are not finite")
     return norms
-
-
-def _one_line(fault: Exception) -> str:
-    return " ".join(str(fault).split())
 
 
 Textures = NDArray[np.float32]

@@ -20,6 +20,7 @@ import numpy as np
 from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.results import parse_psnr
+from emmc_rig.model.reading import one_line
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.methods import METHODS, MethodSettings
 
@@ -115,9 +116,10 @@ def read_rows(folder: Path | None) -> list[Row]:
         rows = [Row(**row) for row in content["rows"]]
         for row in rows:
             MethodSettings.model_validate(row.settings)
-    except (ValueError, KeyError, TypeError) as fault:
-        why = " ".join(str(fault).split())
-        raise AppError(f"{source}: not a chart's advice ({why}); chart again") from fault
+    except (ValueError, KeyError, TypeError, RecursionError) as fault:
+        raise AppError(
+            f"{source}: not a chart's advice ({one_line(fault)}); chart again"
+        ) from fault
     return [row for row in rows if row.method in METHODS]
 
 

@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 
 from emmc_rig.model.errors import SceneError
-from emmc_rig.model.reading import check_png_size, stored_arrays
+from emmc_rig.model.files import whole_file
+from emmc_rig.model.reading import check_png_size, one_line, stored_arrays
 
 _DATASET = "light_field"
 _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
@@ -160,16 +161,13 @@ def save_hdf5(
     """
     path = Path(path)
     lf = check_light_field(np.clip(lf, 0, 1), str(path))
-    partial = _make_folder(path.parent) / f".{path.name}.{os.getpid()}.partial"
+    _make_folder(path.parent)
     try:
-        with h5py.File(partial, "w") as file:
+        with whole_file(path) as partial, h5py.File(partial, "w") as file:
             dataset = file.create_dataset(_DATASET, data=lf)
             dataset.attrs.update(attributes)
-        os.replace(partial, path)
     except OSError as error:
-        raise SceneError(f"{path}: cannot be written ({_one_line(error)})") from error
-    finally:
-        partial.unlink(missing_ok=True)
+        raise SceneError(f"{path}: cannot be written ({one_line(error)})") from error
 
 
 def centre_view(lf: np.ndarray) -> np.ndarray:
@@ -454,10 +452,6 @@ def _make_folder(folder: str | os.PathLike) -> Path:
     except OSError as error:
         raise SceneError(f"{folder}: cannot be made a folder ({error.strerror})") from error
     return folder
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _aligned_view(lf: np.ndarray, v: int, u: int, disparity_px: float) -> np.ndarray:

@@ -77,11 +77,11 @@ def parse_yaml(data: bytes | str, source: str, error: type[Exception]) -> object
         mark = getattr(fault, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         problem = getattr(fault, "problem", None) or "malformed"
-        raise error(f"{source}: not valid YAML{where}: {_one_line(problem)}") from fault
+        raise error(f"{source}: not valid YAML{where}: {one_line(problem)}") from fault
     except RecursionError as fault:
         raise error(f"{source}: nested too deeply") from fault
     except (ValueError, TypeError, AttributeError, OverflowError) as fault:
-        raise error(f"{source}: not valid YAML: {_one_line(fault)}") from fault
+        raise error(f"{source}: not valid YAML: {one_line(fault)}") from fault
     if _unfolded(content) > MOST_VALUES:
         raise error(f"{source}: more than {MOST_VALUES} values once its aliases are written out")
     return content
@@ -112,7 +112,7 @@ def parse_json(data: bytes | str, source: str, error: type[Exception]) -> Any:
     except RecursionError as fault:
         raise error(f"{source}: nested too deeply") from fault
     except ValueError as fault:
-        raise error(f"{source}: not JSON ({_one_line(fault)})") from fault
+        raise error(f"{source}: not JSON ({one_line(fault)})") from fault
 
 
 class StoredArrays:
@@ -174,9 +174,8 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
     except error:
         raise
     except _FAULTS as fault:
-        raise error(
-            f"{path}: cannot be read, damaged or incomplete ({_one_line(fault)}); {remedy}"
-        ) from fault
+        why = f"cannot be read, damaged or incomplete ({one_line(fault)})"
+        raise error(f"{shown_path(path)}: {why}; {remedy}") from fault
 
 
 def check_png_size(content: bytes, source: str, error: type[Exception]) -> None:
@@ -188,6 +187,7 @@ def check_png_size(content: bytes, source: str, error: type[Exception]) -> None:
         raise error(f"{source}: {columns} x {rows} pixels, more than any picture here can have")
 
 
-def _one_line(fault: object) -> str:
+def one_line(fault: object) -> str:
+    """Return what a fault says on one line, cut where it goes on and on."""
     text = fault.args[0] if isinstance(fault, KeyError) and fault.args else fault
     return " ".join(str(text).split())[:300]

@@ -14,6 +14,7 @@ from typing import Any
 
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
+from emmc_rig.model.reading import one_line
 
 STAGES, CAMERAS = "emmc_rig.stages", "emmc_rig.cameras"
 
@@ -43,7 +44,7 @@ def open_plug_in(group: str, name: str, *arguments: object, **options: Any) -> A
     except (DriverError, AppError):
         raise
     except Exception as fault:
-        text = " ".join(str(fault).split()) or type(fault).__name__
+        text = one_line(fault) or type(fault).__name__
         raise AppError(f"{package} could not open its device: {text}") from fault
 
 

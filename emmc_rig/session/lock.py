@@ -142,7 +142,7 @@ def _holder(data: bytes) -> str:
     try:
         name = json.loads(data)
         return "`{command}` (process {process} on {host}, since {since})".format(**name)
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return ""
 
 
