@@ -6,12 +6,14 @@ as 1/125 or 0.0080s. Source: python-gphoto2 2.5, libgphoto2 2.5.
 
 from __future__ import annotations
 
+import ctypes
+import ctypes.util
 import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
@@ -71,6 +73,7 @@ class GphotoCamera:
                 "be loaded", 0, "not installed", 'pip install "emmc-rig[gphoto2]"'
             ) from error
         self._gp: Any = gphoto2
+        self._library = _loaded(Path(gphoto2.__file__).parent)
         self._clock = clock
         self._delete = delete
         self._lock = threading.RLock()
@@ -232,10 +235,10 @@ class GphotoCamera:
         with self._lock:
             try:
                 widget = self._camera.get_single_config(name)
+                if widget is None or widget.get_readonly():
+                    return {}
                 words = list(widget.get_choices())
             except self._gp.GPhoto2Error:
-                return {}
-            if widget.get_readonly():
                 return {}
         found = {number(word): word for word in words}
         return {value: word for value, word in found.items() if value}
@@ -246,7 +249,7 @@ class GphotoCamera:
             if self._closed:
                 raise CameraClosedError(self.identity.model)
             try:
-                return str(self._camera.get_single_config(name).get_value())
+                return self._value(self._camera.get_single_config(name)) or ""
             except self._gp.GPhoto2Error:
                 return ""
 
@@ -257,6 +260,8 @@ class GphotoCamera:
                 raise CameraClosedError(self.identity.model)
             try:
                 widget = self._camera.get_single_config(name)
+                if widget is None:
+                    raise CameraSettingError(name, f"cannot become {word}: the camera has none")
                 widget.set_value(word)
                 self._camera.set_single_config(name, widget)
             except self._gp.GPhoto2Error as error:
@@ -267,8 +272,26 @@ class GphotoCamera:
         for child in widget.get_children():
             yield from self._values(child)
             with suppress(self._gp.GPhoto2Error):
-                if not child.count_children():
-                    yield child.get_name(), str(child.get_value())
+                value = None if child.count_children() else self._value(child)
+                if value is not None:
+                    yield child.get_name(), value
+
+    def _value(self, widget: Any) -> str | None:
+        """Return a setting's value; None for no setting, or one that was given no value.
+
+        A camera whose value is none of its own choices leaves the setting without, and
+        python-gphoto2 2.6 ends the process when it is asked for a word that is not there.
+        """
+        gp = self._gp
+        if widget is None:
+            return None
+        if widget.get_type() in (gp.GP_WIDGET_TEXT, gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
+            word = ctypes.c_void_p()
+            here = ctypes.c_void_p(int(widget.this))
+            self._library.gp_widget_get_value(here, ctypes.byref(word))
+            if not word.value:
+                return None
+        return str(widget.get_value())
 
     @contextmanager
     def _asking(self, what: str) -> Iterator[None]:
@@ -281,6 +304,12 @@ class GphotoCamera:
             except self._gp.GPhoto2Error as error:
                 advice = ADVICE.get(error.code, "switch the camera off and on, then try again")
                 raise GphotoError(what, error.code, error.string, advice) from error
+
+
+def _loaded(package: Path) -> ctypes.CDLL:
+    """Return the libgphoto2 that python-gphoto2 uses: in its wheel, or else the system's."""
+    inside = sorted((package / "libgphoto2").glob("libgphoto2.*"))
+    return ctypes.CDLL(str(inside[0]) if inside else ctypes.util.find_library("gphoto2"))
 
 
 def _is_raw(name: str) -> bool:

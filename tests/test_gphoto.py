@@ -22,6 +22,7 @@ from drivers.errors import (
 )
 from drivers.gphoto import GphotoCamera, seconds_of
 from drivers.ptp_canon import EosOperation
+from drivers.ptp_codec import Property
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
 from emmc_rig.rig.hardware import open_camera
@@ -41,6 +42,8 @@ from simulators.ptpip import PtpIpServer
 mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 told = json.loads(sys.argv[1])
 make = EosCameraSimulator if told["eos"] else PtpCameraSimulator
+if told["hidden"] is not None:
+    make.hidden = tuple(told["hidden"])
 settings = {"old": True} if told["eos"] == "old" else {}
 camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=told["quality"], **settings)
 asked, respond = [], camera.respond
@@ -61,11 +64,12 @@ MOSAIC = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 
 
 @contextmanager
-def served(quality="raw", faults=(), eos=""):
+def served(quality="raw", faults=(), eos="", hidden=None):
     """A simulated camera on a port; yields libgphoto2's name of it, and a list of what is known
-    of it when it ended: the number of files left on its card, and all that it was asked.
+    of it when it ended: the number of files left on its card, and all that it was asked. hidden:
+    properties that it does not have, instead of those that such a camera usually has not.
     """
-    told = json.dumps({"quality": quality, "faults": faults, "eos": eos})
+    told = json.dumps({"quality": quality, "faults": faults, "eos": eos, "hidden": hidden})
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, told],
         stdin=subprocess.PIPE,
@@ -130,6 +134,23 @@ def test_settings_are_set_by_libgphoto2s_names_and_all_are_listed(address):
         camera.set_gain(1.0)
     with pytest.raises(CameraSettingError, match="no_such cannot become 1"):
         GphotoCamera(address, settings={"no_such": 1})
+
+
+def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
+    with served(eos="new", hidden=()) as (name, _), closing(GphotoCamera(name)) as camera:
+        # It lists the shutter twice, first by the standard's property, whose value is no choice.
+        assert camera.details()["shutterspeed"] == "1/60"
+        assert camera.exposure_s == pytest.approx(1 / 60)
+
+
+def test_a_camera_without_any_settings_is_refused_in_one_line():
+    every = [int(one) for one in Property]
+    with served(hidden=every) as (name, _), closing(GphotoCamera(name)) as camera:
+        assert camera.gain_limits == (1.0, 1.0)
+        with pytest.raises(CameraSettingError, match="mode dial"):
+            camera.set_exposure_s(0.01)
+        with pytest.raises(CameraSettingError, match="iso cannot become 100"):
+            GphotoCamera(name, settings={"iso": 100})
 
 
 def test_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
