@@ -140,15 +140,19 @@ def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
     with served(eos="new", hidden=()) as (name, _), closing(GphotoCamera(name)) as camera:
         # It lists the shutter twice, first by the standard's property, whose value is no choice.
         assert camera.details()["shutterspeed"] == "1/60"
-        assert camera.exposure_s == pytest.approx(1 / 60)
+        with pytest.raises(CameraSettingError, match="is not known"):
+            camera.snap()
+        camera.set_exposure_s(0.008)
+        assert camera.snap().exposure_s == pytest.approx(0.008)
 
 
 def test_a_camera_without_any_settings_is_refused_in_one_line():
     every = [int(one) for one in Property]
-    with served(hidden=every) as (name, _), closing(GphotoCamera(name)) as camera:
-        assert camera.gain_limits == (1.0, 1.0)
-        with pytest.raises(CameraSettingError, match="mode dial"):
-            camera.set_exposure_s(0.01)
+    with served(hidden=every) as (name, _):
+        with closing(GphotoCamera(name)) as camera:
+            assert camera.gain_limits == (1.0, 1.0)
+            with pytest.raises(CameraSettingError, match="mode dial"):
+                camera.set_exposure_s(0.01)
         with pytest.raises(CameraSettingError, match="iso cannot become 100"):
             GphotoCamera(name, settings={"iso": 100})
 
