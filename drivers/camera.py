@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -94,6 +95,21 @@ class StreamingCamera(Camera, Protocol):
 
     def stream(self) -> Iterator[RawFrame]:
         """Yield frames as they come; closing the generator stops the acquisition."""
+        ...
+
+
+class TriggeredCamera(Camera, Protocol):
+    """A camera that begins an exposure at an edge on a line."""
+
+    def armed(
+        self, line: str, delay_s: float
+    ) -> AbstractContextManager[Callable[[float], RawFrame]]:
+        """Wait for an edge on a line: yields what returns the frame that it exposes.
+
+        That takes the longest wait for the edge, in seconds. `delay_s` is waited by the camera
+        between edge and exposure. Raises `CameraSettingError` for a camera without such a line
+        or delay.
+        """
         ...
 
 

@@ -111,7 +111,7 @@ class ZaberStage(HostStage):
         self._stated_um = _by_axis(microstep_um, axes)
         self._stated_resolution = _by_axis(resolution, axes)
         self._in_microsteps = in_microsteps
-        self._signal: tuple[str, float, int] | None = None
+        self._signal: tuple[str, float, int | str] | None = None
         for axis in (*self._stated_um, *self._stated_resolution):
             self._require_axis(axis)
         self._start_up()
@@ -126,20 +126,25 @@ class ZaberStage(HostStage):
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
 
-    def move_and_signal_um(self, axis: str, target_um: float, output: int = 1) -> float:
-        """As `move_to_um`; a digital output of the axis's device rises the moment it arrives.
+    def check_output(self, axis: str, output: int | str) -> None:
+        """Lower a digital output of the axis's device; raises `CommandRefusedError` for none such.
 
-        The device raises it by itself, without the host; it falls at the next such move. A
-        camera that it triggers must wait out the vibration by a delay of its own. Raises as
-        `move_to_um`, and `CommandRefusedError` for a device without outputs or triggers.
-        Source: Zaber ASCII Protocol Manual, "trigger", "io set do"; firmware 7.
+        Source: Zaber ASCII Protocol Manual, "io set do".
         """
         self._require_axis(axis)
+        self._chain.query(self._addresses[axis][0], 0, f"io set do {output} 0", axis)
+
+    def move_and_signal_um(self, axis: str, target_um: float, output: int | str = 1) -> float:
+        """As `SignallingStage` says; the device raises its output by itself, without the host.
+
+        Raises as `move_to_um`, and `CommandRefusedError` for a device without outputs or triggers.
+        Source: Zaber ASCII Protocol Manual, "trigger", "io set do"; firmware 7.
+        """
+        self.check_output(axis, output)
         device, _ = self._addresses[axis]
-        self._chain.query(device, 0, f"io set do {output} 0", axis)
         self._signal = (axis, target_um, output)
         try:
-            return self.move_to_um({axis: target_um})[axis]
+            return self._move_without_settling({axis: target_um})[axis]
         finally:
             self._signal = None
             with suppress(DriverError):  # of a move that failed, the first fault is the one to tell

@@ -279,7 +279,7 @@ class Bench:
         self.shot = 0
         self.masks_in = True
         self.board_turn_deg = 0.0
-        self._camera, self._scene, self._size, self._finer = camera, scene, size, finer
+        self.camera, self._scene, self._size, self._finer = camera, scene, size, finer
         self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
         self._sensor, self._board, self._lamp, self._seconds = sensor, board, lamp, seconds
@@ -322,7 +322,7 @@ class Bench:
         return self._seen[state]
 
     def _pixels(self, samples: Array) -> Array:
-        k = self._camera.sensor.binning
+        k = self.camera.sensor.binning
         rows, columns = self._size[0] // k, self._size[1] // k
         return samples.reshape(rows, k, columns, k).mean(axis=(1, 3))
 
@@ -333,7 +333,7 @@ class Bench:
         and sensor pass of one colour, over what the open camera without masks passes of all: no
         frame, no lamp and no whiteboard is in it. Masks stand where the stages are.
         """
-        camera, size = self._camera, self._size
+        camera, size = self.camera, self._size
         k = camera.sensor.binning
         at_um = self._positions_um()
         standing = self.shot, self.masks_in
@@ -353,7 +353,7 @@ class Bench:
 
     def expose(self, exposure_s: float) -> NDArray[np.uint16]:
         """Return one noisy frame (pixel_y, pixel_x) in DN."""
-        noise, light = self._camera.sensor.noise, self._light[self.shot]
+        noise, light = self.camera.sensor.noise, self._light[self.shot]
         if self._sensor is PERFECT_SENSOR:
             return noise.expose_dn(self.readings(), exposure_s, light, self.rng)
         seconds = self._seconds()
@@ -373,7 +373,7 @@ class Bench:
 
         cell: (v, u), without plate and target: a constant light field through this aperture cell.
         """
-        camera = self._camera
+        camera = self.camera
         lens, sensor = camera.lens, camera.sensor
         cell_um = lens.aperture_cell_um
         names = camera.shot_masks(self.shot) if self.masks_in else ()
@@ -427,7 +427,7 @@ class Bench:
 
     def _cell(self, cell: tuple[int, int] | Literal["all"]) -> Array:
         """Return the opening (1, 3) of one aperture cell, or of all."""
-        cell_um, (rows, columns) = self._camera.lens.aperture_cell_um, self._camera.views
+        cell_um, (rows, columns) = self.camera.lens.aperture_cell_um, self.camera.views
         if cell == "all":
             return np.array([(0.0, 0.0, max(rows, columns) * cell_um)])
         y_um, x_um = centred_grid(rows, cell_um)[cell[0]], centred_grid(columns, cell_um)[cell[1]]
@@ -444,7 +444,7 @@ class Bench:
         turn = np.deg2rad(errors.rotation_deg)
         cosine, sine = np.cos(turn), np.sin(turn)
         per_um = 1 / (cell_um * errors.stretch)
-        pitch_um = self._camera.sensor.sample_pitch_um
+        pitch_um = self.camera.sensor.sample_pitch_um
         corner_um = np.hypot(*self._size) / 2 * pitch_um
         return (
             distance_mm * 1e3 * (1 + errors.distance_share),
@@ -465,8 +465,8 @@ class Bench:
 
     def _openings(self, x_um: float, y_um: float) -> Array:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
-        cell_um = self._camera.lens.aperture_cell_um
-        window_half_um = max(self._camera.views) * cell_um / 2
+        cell_um = self.camera.lens.aperture_cell_um
+        window_half_um = max(self.camera.views) * cell_um / 2
         return np.array(
             [
                 (x_um, y_um, cell_um / 2),

@@ -2,9 +2,9 @@
 
 Simplified: every move of the queue starts and ends at rest; homing takes all its axes to their
 switches together, pulls off, touches the switch again slowly and pulls off. What is not modelled
-(arcs, probing, spindle, ...) is refused as an unsupported command, and logged. The axes have no
-encoders: a stall loses steps unnoticed. Bytes that come while the receive buffer is full are lost,
-as on the real controller.
+(arcs, probing, spindle speeds, ...) is refused as an unsupported command, and logged. The axes have
+no encoders: a stall loses steps unnoticed. Bytes that come while the receive buffer is full are
+lost, as on the real controller.
 Source of the messages: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Realtime
 commands"; the order of a report's fields and its counters from report.c.
 """
@@ -13,7 +13,7 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from drivers import grbl_codec as codec
@@ -33,8 +33,18 @@ OVERRIDES_EVERY = {True: 20, False: 10}
 """Reports between two with WCO and Ov, while moving and while not (config.h)."""
 PULL_OFF_MM = 1.0
 LOCATE_MM_MIN = 25.0
-SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 5, 9, 30)}
+SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 30)}
 """Words that are accepted and change nothing here."""
+OUTPUTS = {
+    "M3": {"spindle": 1},
+    "M4": {"spindle": 1},
+    "M5": {"spindle": 0},
+    "M7": {"mist": 1},
+    "M8": {"coolant": 1},
+    "M9": {"coolant": 0, "mist": 0},
+}
+"""Pins that a word switches, once the moves before it have ended (coolant_control.c)."""
+ACCESSORIES = {"spindle": "S", "coolant": "F", "mist": "M"}
 OFFSETS = (10, 92, 92.1)
 """G words that shift the work coordinates."""
 
@@ -74,7 +84,8 @@ class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
-    `lost_bytes` counts what came while the receive buffer was full.
+    `lost_bytes` counts what came while the receive buffer was full. `on_output` is told of every
+    pin that changes: coolant, mist or spindle, its level and when.
     """
 
     def __init__(
@@ -90,6 +101,8 @@ class GrblController(SimulatedController):
         self.settings = _default_settings(axes) | dict(settings or {})
         self.work_offset_mm = dict.fromkeys(axes, 0.0)
         self.lost_bytes = 0
+        self.outputs: dict[str, int] = dict.fromkeys(ACCESSORIES, 0)
+        self.on_output: Callable[[str, int, float], None] = lambda *change: None
         self._motors = {letter: Motor(spec, clock) for letter, spec in axes.items()}
         self._boot()
 
@@ -129,6 +142,8 @@ class GrblController(SimulatedController):
         self._homing_letters: tuple[str, ...] = ()
         self._held = False
         self._modes = _Modes()
+        self._stood_s, self._pin_waits = 0.0, False
+        self._switch(dict.fromkeys(self.outputs, 0))
         self._reports_to_offset = 0
         self._reports_to_overrides = 1
         self._status_asked = False
@@ -220,6 +235,7 @@ class GrblController(SimulatedController):
     def _end_block(self, ended_s: float | None) -> None:
         block, self._block = self._block, None
         assert block is not None
+        self._stood_s = self._clock.now_s() if ended_s is None else ended_s
         if self._held:
             self._blocks.appendleft(block)
             self._state = "Hold"
@@ -319,6 +335,9 @@ class GrblController(SimulatedController):
             and not self._homing_letters
             and len(self._blocks) < PLANNER_BLOCKS
         ):
+            if self._switching(self._lines[0][0]) and (self._block or self._blocks):
+                self._pin_waits = True
+                return
             line, _ = self._lines.popleft()
             if self.faults.strikes("door", line):
                 self._state = "Door"
@@ -353,7 +372,7 @@ class GrblController(SimulatedController):
             modes = self._modes
             units, distance = ("G20", "G21")[not modes.inches], ("G91", "G90")[modes.absolute]
             self._say(
-                f"[GC:{modes.motion} G54 G17 {units} {distance} G94 M5 M9 T0 "
+                f"[GC:{modes.motion} G54 G17 {units} {distance} G94 {self._accessories()} T0 "
                 f"F{modes.feed_mm_min:g} S0]"
             )
         elif line == "$X":
@@ -392,6 +411,10 @@ class GrblController(SimulatedController):
             self._execute_home(line[2:])
         else:
             self._execute_setting(line)
+
+    def _accessories(self) -> str:
+        coolant = [word for pin, word in (("mist", "M7"), ("coolant", "M8")) if self.outputs[pin]]
+        return " ".join((("M5", "M3")[self.outputs["spindle"]], *(coolant or ["M9"])))
 
     def _toggle_check(self) -> None:
         """Switch the mode that parses programs and moves nothing; leaving it resets."""
@@ -500,6 +523,7 @@ class GrblController(SimulatedController):
         if any(letter == "G" and value in OFFSETS for letter, value in words):
             self._set_offsets(words)
             return
+        switched = self._switching(line)
         for letter, value in words:
             word = f"{letter}{value:g}"
             if word in ("G0", "G1"):
@@ -510,6 +534,9 @@ class GrblController(SimulatedController):
                 modes.absolute = word == "G90"
             elif word == "G53":
                 machine = True
+            elif word in OUTPUTS:
+                if word == "M7" and "M" not in self.options:
+                    raise _RefusedError(20)
             elif letter in SILENT_WORDS:
                 if value not in SILENT_WORDS[letter]:
                     raise _not_modelled(line)
@@ -520,7 +547,11 @@ class GrblController(SimulatedController):
             if letter == "F":
                 modes.feed_mm_min = value * unit
         targets_mm = self._targets_mm(words, unit, modes.absolute, machine)
-        if not targets_mm or self._state == "Check":
+        if self._state == "Check":
+            return
+        if switched:
+            self._switch(switched)
+        if not targets_mm:
             return
         rapid = (motion or modes.motion) == "G0"
         if not rapid and modes.feed_mm_min <= 0:
@@ -530,6 +561,21 @@ class GrblController(SimulatedController):
             return
         fastest = max(self._setting(codec.MAX_RATE, letter) for letter in self.axes) * 10
         self._queue(_Block(targets_mm, fastest if rapid else modes.feed_mm_min, jog=False))
+
+    def _switching(self, line: str) -> dict[str, int]:
+        """Return the pins that a line switches, with their new levels."""
+        if line.startswith("$"):
+            return {}
+        words = [f"{letter}{float(value):g}" for letter, value in _WORD.findall(line)]
+        return {pin: level for word in words for pin, level in OUTPUTS.get(word, {}).items()}
+
+    def _switch(self, levels: Mapping[str, int]) -> None:
+        at_s = self._stood_s if self._pin_waits else self._clock.now_s()
+        self._pin_waits = False
+        for pin, level in levels.items():
+            if self.outputs[pin] != level:
+                self.outputs[pin] = level
+                self.on_output(pin, level, at_s)
 
     def _set_offsets(self, words: list[tuple[str, float]]) -> None:
         """Shift the work coordinates: G92 until a reset, G10 L2 and L20 as G54 (P0 or P1)."""
@@ -640,6 +686,9 @@ class GrblController(SimulatedController):
         else:
             self._reports_to_overrides = OVERRIDES_EVERY[moving] - 1
             fields.append("Ov:100,100,100")
+            on = "".join(letter for pin, letter in ACCESSORIES.items() if self.outputs[pin])
+            if on:
+                fields.append(f"A:{on}")
         self._say(f"<{'|'.join(fields)}>")
 
     def _coordinates(self, position_mm: Mapping[str, float], unit: float) -> str:

@@ -393,4 +393,10 @@ def test_a_jog_raises_an_output_on_arrival_where_the_stage_can(run):
     code, _, err = run("jog", "--rig", "simulated", "--home", "--signal", 9, "mask_x", 100)
     assert (code, "BADDATA" in one_line(err)) == (1, True)
     code, _, err = run("jog", "--rig", "simulated:grbl", "--home", "--signal", 1, "x", "--", -100)
+    assert (code, "no such pin" in one_line(err)) == (1, True)
+    code, out, _ = run(
+        "jog", "--rig", "simulated:grbl", "--home", "--signal", "coolant", "x", "--", -100
+    )
+    assert (code, out.startswith("x at -")) == (0, True)
+    code, _, err = run("jog", "--rig", "simulated:apt", "--home", "--signal", 1, "x", 100)
     assert (code, "only Zaber" in one_line(err)) == (1, True)

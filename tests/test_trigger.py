@@ -1,8 +1,12 @@
 """Exposure on the stage's arrival, by a line: after the move, at the place, sooner than asked."""
 
 from contextlib import closing
+from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
+from capture_rigs import begun, plan_and_camera
 
 from drivers.errors import (
     CameraSettingError,
@@ -12,7 +16,22 @@ from drivers.errors import (
     StalledError,
 )
 from drivers.stage import StageSettings
-from emmc_rig.study.benchmarks.trigger import EXPOSURE_S, MOVE_S, TriggeredRig, trigger_timing
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import fine_scene
+from emmc_rig.rig.hardware import simulated_rig
+from emmc_rig.rig.rig_config import ImagedRig, opened_rig, rig_description
+from emmc_rig.rig.trigger import SimulatedTrigger, check_trigger
+from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.study.benchmarks.trigger import (
+    EXPOSURE_S,
+    MOVE_S,
+    TriggeredRig,
+    capture_timing,
+    trigger_timing,
+)
+from simulators.clock import ManualClock
+from simulators.disk import SimulatedDisk
 
 BACKLASH_UM = 3.0
 
@@ -81,6 +100,127 @@ def test_an_output_that_the_device_lacks_is_refused_before_it_moves(rig):
 
 
 def test_a_triggered_frame_takes_less_time_than_one_that_is_asked_for():
-    timing = trigger_timing(frames=5)
-    assert timing.triggered_ms < timing.asked_ms
-    assert timing.triggered_ms > timing.vibration_ms + timing.exposure_ms
+    for timing in (trigger_timing(frames=5), capture_timing()):
+        assert timing.triggered_ms < timing.asked_ms
+        assert timing.triggered_ms > timing.vibration_ms + timing.exposure_ms
+
+
+STEPS = """
+camera: rgbw-bayer-1shot
+shots:
+  - {mask_um: [0, 0], exposure_s: 0.01}
+  - {mask_um: [120, 0], exposure_s: 0.01}
+  - {mask_um: [60, 0], exposure_s: 0.01}
+  - {mask_um: [60, 96], exposure_s: 0.01}
+whiteboards: {views: [[2, 2], [2, 3]], repeats: 2, references: 2}
+darks: {repeats: 2}
+settle_s: 0.01
+"""
+EVERY_AXIS = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 1)
+SIZE = (24, 32)
+
+
+def stepped_session(outputs, cut=False):
+    """Capture STEPS on the simulated rig; returns its session and how the run ended."""
+    camera = plan_and_camera(STEPS)[1]
+    scene = fine_scene("near-planar", 1, 1, size=SIZE).samples
+    trigger = None if outputs is None else SimulatedTrigger(outputs=outputs, delay_s=0.02)
+    rig, _ = simulated_rig(camera, scene, SIZE, 0, ManualClock(), 16, trigger)
+    if trigger is not None:
+        check_trigger(trigger, rig.stage, rig.camera)
+    if cut:
+        rig.chain.on_output = lambda *change: None
+    session, plan = begun(Path("/disk"), SimulatedDisk(), rig, STEPS)
+    return session, Sequencer(session, plan, rig).run()
+
+
+@pytest.fixture(scope="module")
+def asked():
+    return stepped_session(None)[0]
+
+
+def mosaics(session):
+    return {
+        frame.id: decode_frame(session.read(frame.id), session.stored[frame.id]).mosaic
+        for frame in session.frames
+    }
+
+
+def test_a_session_triggered_on_arrival_holds_the_very_frames_of_one_that_is_asked_for(asked):
+    session, outcome = stepped_session(EVERY_AXIS)
+    assert outcome.complete
+    assert outcome.retries == 0
+    triggered = {name for name, entry in session.stored.items() if entry["triggered"]}
+    # Of several axes at once, frames at one place, and metering nothing is triggered.
+    assert {"shot-1-e0-r0", "shot-2-e0-r0"} <= triggered
+    assert any(name.startswith("board-") for name in triggered)
+    assert not any(name.startswith("meter-") for name in triggered)
+    ours, theirs = mosaics(session), mosaics(asked)
+    for name, entry in session.stored.items():
+        if entry["exposure_s"] == asked.stored[name]["exposure_s"]:
+            np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+        else:  # the other camera's nearest to what was metered
+            assert entry["exposure_s"] == pytest.approx(asked.stored[name]["exposure_s"], rel=0.02)
+
+
+def test_without_its_wire_a_frame_is_lost_and_then_asked_for():
+    session, outcome = stepped_session(EVERY_AXIS, cut=True)
+    assert outcome.complete
+    assert outcome.retries > 0
+    assert not any(entry["triggered"] for entry in session.stored.values())
+    faults = [entry["fault"] for entry in session.journal.entries if entry["kind"] == "retry"]
+    assert all("check the trigger" in fault for fault in faults)
+
+
+@pytest.mark.parametrize(
+    ("trigger", "said"),
+    [
+        ({"outputs": {"mask_z": 1}}, "trigger.outputs.mask_z: the stage has no such axis"),
+        ({"outputs": {"mask_x": 9}}, "trigger.outputs.mask_x: .*BADDATA"),
+        ({"outputs": {"mask_x": 1}, "line": "Line7"}, "trigger.line Line7.*offers Software, Line0"),
+        ({"outputs": {"mask_x": 1}, "lin": "Line0"}, "lin.*did you mean 'line'"),
+        ({"outputs": {}}, "outputs"),
+        ({"outputs": {"mask_x": 1}, "delay_s": -1}, "delay_s"),
+        (None, "trigger"),
+    ],
+)
+def test_a_trigger_that_cannot_be_is_refused_in_one_line_when_the_rig_is_opened(
+    tmp_path, trigger, said
+):
+    file = tmp_path / "rig.yaml"
+    file.write_text(yaml.safe_dump({"kind": "simulated", "trigger": trigger}))
+    camera = plan_and_camera(STEPS)[1]
+
+    def open_it():
+        imaged = ImagedRig(scene="near-planar", size=SIZE)
+        with opened_rig(rig_description(str(file), imaged), camera, print):
+            pass
+
+    with pytest.raises(AppError, match=said) as refused:
+        open_it()
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("stage", "camera", "said"),
+    [
+        ("simulated:apt", "simulated", "this stage raises no output"),
+        ("simulated:grbl", "simulated", "no such pin"),
+        ("simulated", "simulated", "this camera waits for no line"),
+    ],
+)
+def test_devices_that_cannot_be_wired_are_refused_when_a_real_rig_is_opened(
+    tmp_path, stage, camera, said
+):
+    axis = "x" if ":" in stage else "mask_x"
+    file = tmp_path / "rig.yaml"
+    wire = {"outputs": {axis: 1}}
+    file.write_text(yaml.safe_dump({"stage": stage, "camera": camera, "trigger": wire}))
+    design = plan_and_camera(STEPS)[1]
+    described = rig_description(str(file), ImagedRig(scene="dark"))
+    with pytest.raises(AppError, match=said), opened_rig(described, design, print):
+        pass
+
+
+def test_a_rig_without_a_trigger_is_frozen_as_it_was_before_there_were_any():
+    assert "trigger" not in rig_description("simulated", ImagedRig(scene="dark"))

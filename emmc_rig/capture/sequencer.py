@@ -44,6 +44,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.rig.hardware import Rig
 from emmc_rig.rig.registration import Shift, registered
+from emmc_rig.rig.trigger import EDGE_WAIT_S, signalling, triggered
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
@@ -111,6 +112,7 @@ class Sequencer:
         self._writer = Writer()
         self._before: NDArray[np.uint16] | None = None
         self._metered: dict[str, Entry] = {}
+        self._triggered = False
         self._began_s = 0.0
         self._taken = self._run = 0
         # How long the frame before took to hand over: its own line is written by then.
@@ -244,14 +246,20 @@ class Sequencer:
         rig = self._rig
         with self._span("attend", planned, spans):
             self._attend(planned)
-        with self._span("move", planned, spans):
-            moved = self._move(planned)
-        if moved and self._plan.settle_s:
-            with self._span("settle", planned, spans):
-                rig.clock.sleep(self._plan.settle_s)
-        with self._span("expose", planned, spans):
-            exposure_s = self._exposure_s(planned)
-            frame, found = self._expose(planned, exposure_s)
+        axis = self._axis_that_triggers(planned)
+        self._triggered = axis is not None
+        if axis is not None:
+            frame = self._arrive_and_expose(planned, axis, spans)
+            found = figures(frame)
+        else:
+            with self._span("move", planned, spans):
+                moved = self._move(planned)
+            if moved and self._plan.settle_s:
+                with self._span("settle", planned, spans):
+                    rig.clock.sleep(self._plan.settle_s)
+            with self._span("expose", planned, spans):
+                exposure_s = self._exposure_s(planned)
+                frame, found = self._expose(planned, exposure_s)
         with self._span("read back", planned, spans):
             read_um = self._read_back(planned)
         with self._span("check", planned, spans):
@@ -274,9 +282,7 @@ class Sequencer:
     def _move(self, planned: PlannedFrame) -> bool:
         """Bring the stage to its place; returns whether it moved."""
         applied, zero_um = self._applied.offsets_um, self._rig.zero_um
-        wanted = {
-            axis: um for axis, um in planned.bench.offsets_um.items() if applied.get(axis) != um
-        }
+        wanted = self._wanted_um(planned)
         if not wanted:
             return False
         for axis in wanted:
@@ -284,6 +290,44 @@ class Sequencer:
         self._rig.stage.move_to_um({axis: zero_um[axis] + um for axis, um in wanted.items()})
         applied |= wanted
         return True
+
+    def _wanted_um(self, planned: PlannedFrame) -> dict[str, float]:
+        """Return by axis where the stage does not stand yet, from each axis's zero."""
+        applied = self._applied.offsets_um
+        return {
+            axis: um for axis, um in planned.bench.offsets_um.items() if applied.get(axis) != um
+        }
+
+    def _axis_that_triggers(self, planned: PlannedFrame) -> str | None:
+        """Return the axis whose arrival begins the exposure; None: the program asks for it.
+
+        A controller raises its output when one axis arrives, so that it must be the only one that
+        moves. Metering looks at a frame before it takes the next.
+        """
+        wanted = list(self._wanted_um(planned))
+        trigger = self._rig.trigger
+        if trigger is None or planned.kind == "metering" or len(wanted) != 1:
+            return None
+        return wanted[0] if wanted[0] in trigger.outputs else None
+
+    def _arrive_and_expose(
+        self, planned: PlannedFrame, axis: str, spans: dict[str, list[float]]
+    ) -> RawFrame:
+        rig, applied = self._rig, self._applied.offsets_um
+        assert rig.trigger is not None
+        offset_um = planned.bench.offsets_um[axis]
+        self._set_camera(planned, self._exposure_s(planned))
+        rig.about_to_expose(planned.id)
+        delay_s = rig.trigger.delay_s + self._plan.settle_s
+        with triggered(self._camera).armed(rig.trigger.line, delay_s) as receive:
+            with self._span("move", planned, spans):
+                applied.pop(axis, None)
+                target_um = rig.zero_um[axis] + offset_um
+                output = rig.trigger.outputs[axis]
+                signalling(rig.stage).move_and_signal_um(axis, target_um, output)
+                applied[axis] = offset_um
+            with self._span("expose", planned, spans):
+                return receive(EDGE_WAIT_S)
 
     def _read_back(self, planned: PlannedFrame) -> dict[str, float]:
         """Return where the axes stand after the exposure; raises when they do not stand there."""
@@ -320,6 +364,12 @@ class Sequencer:
         return frame, found
 
     def _snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
+        self._set_camera(planned, exposure_s)
+        self._rig.about_to_expose(planned.id)
+        frame = self._camera.snap()
+        return frame, figures(frame)
+
+    def _set_camera(self, planned: PlannedFrame, exposure_s: float) -> None:
         camera, applied = self._camera, self._applied
         if applied.gain != planned.gain:
             applied.gain = None
@@ -336,9 +386,6 @@ class Sequencer:
                     "set the camera to manual exposure",
                 )
             applied.exposure_s = exposure_s
-        self._rig.about_to_expose(planned.id)
-        frame = camera.snap()
-        return frame, figures(frame)
 
     def _hand_over(
         self,
@@ -360,6 +407,7 @@ class Sequencer:
             "commanded_um": dict(planned.bench.offsets_um),
             "read_um": dict(read_um),
             "figures": found.as_dict(),
+            "triggered": self._triggered,
             "attempts": attempts,
             "wall": self._wall(),
         }

@@ -159,14 +159,14 @@ def jog(
     home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
     signal_on: Annotated[
-        int | None,
-        typer.Option("--signal", min=1, help="digital output that rises on arrival (Zaber)"),
+        str | None,
+        typer.Option("--signal", help="output that rises on arrival: 1 (Zaber), coolant (Grbl)"),
     ] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
     """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
-    from drivers.zaber import ZaberStage
+    from drivers.stage import SignallingStage
 
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
@@ -174,8 +174,8 @@ def jog(
         if home_first:
             opened.home([axis])
         if signal_on is not None:
-            if not isinstance(opened, ZaberStage):
-                raise AppError("--signal: only Zaber devices raise an output on arrival")
+            if not isinstance(opened, SignallingStage):
+                raise AppError("--signal: only Zaber and Grbl raise an output on arrival")
             target_um = distance_um + (0.0 if to else opened.position_um(axis))
             at_um = opened.move_and_signal_um(axis, target_um, signal_on)
         else:
@@ -242,7 +242,7 @@ def bench(
     from emmc_rig.files.results import command_line, versions, write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
-    from emmc_rig.study.benchmarks.trigger import trigger_timing
+    from emmc_rig.study.benchmarks.trigger import capture_timing, trigger_timing
     from emmc_rig.study.benchmarks.u3v import u3v_timings
 
     with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
@@ -269,17 +269,22 @@ def bench(
                 f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
                 f"{one.gigabytes_per_s:.2f} GB/s"
             )
-        trigger = trigger_timing()
-        typer.echo(
-            f"a frame at each step, {trigger.vibration_ms:g} ms of vibration, "
-            f"{trigger.exposure_ms:g} ms of exposure (simulated): {trigger.asked_ms:.1f} ms asked "
-            f"for, {trigger.triggered_ms:.1f} ms triggered by the stage's arrival"
-        )
+        trigger, session = trigger_timing(), capture_timing()
+        for what, one in (
+            ("a frame at each step", trigger),
+            ("shots of `emmc-rig capture`", session),
+        ):
+            typer.echo(
+                f"{what}, {one.vibration_ms:g} ms of vibration, {one.exposure_ms:g} ms of exposure "
+                f"(simulated): {one.asked_ms:.1f} ms a frame asked for, {one.triggered_ms:.1f} ms "
+                "triggered by the stage's arrival"
+            )
         if folder is not None:
             metrics = {
                 "stage_commands": [one.as_dict() for one in timings],
                 "picture": picture.as_dict(),
                 "trigger": trigger.as_dict(),
+                "triggered_session": session.as_dict(),
                 "usb3_vision": [one.as_dict() for one in streams],
                 "command": command_line(),
                 "versions": versions(),

@@ -57,13 +57,15 @@ from emmc_rig.rig.stage_config import (
     ZaberConfig,
     parse_stage,
 )
+from emmc_rig.rig.trigger import SimulatedTrigger, Trigger
 from simulators.apt import AptController
 from simulators.bench import RAYS_PER_VIEW, Bench
 from simulators.clock import ManualClock
 from simulators.firmware import SimulatedController
 from simulators.grbl import GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
-from simulators.usb import SimulatedUsb
+from simulators.u3v import COLOURS, U3vCameraSimulator
+from simulators.usb import SimulatedUsb, UsbFunction
 from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
@@ -114,7 +116,8 @@ class Rig:
     zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
-    about_to_expose: told the name of each frame before its exposure.
+    about_to_expose: told the name of each frame before its exposure. trigger: the line by which
+    the stage's arrival begins an exposure; None: the program waits and asks.
     """
 
     stage: Stage
@@ -125,11 +128,15 @@ class Rig:
     clock: Clock = SYSTEM_CLOCK
     reopen_camera: Callable[[], CameraDevice] | None = None
     about_to_expose: Callable[[str], None] = _unheard
+    trigger: Trigger | None = None
 
 
 @dataclass(frozen=True)
 class SimulatedRig(Rig):
-    """A rig, and the firmware behind its devices, whose faults can be armed."""
+    """A rig, and the firmware behind its devices, whose faults can be armed.
+
+    still: of the PTP camera that the rig has unless its stage triggers the exposures.
+    """
 
     chain: ZaberChain = field(kw_only=True)
     still: PtpCameraSimulator = field(kw_only=True)
@@ -162,14 +169,16 @@ def simulated_rig(
     seed: int,
     clock: Clock | None = None,
     rays_per_view: int = RAYS_PER_VIEW,
+    trigger: SimulatedTrigger | None = None,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
-    pixel; few are quick, and grainy beside a good sensor's noise. Raises AppError for a size that
-    the camera's RAW files cannot hold.
+    pixel; few are quick, and grainy beside a good sensor's noise. trigger: the stage's arrival
+    begins the exposures of a USB3 Vision camera. Raises AppError for a size that the camera's RAW
+    files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -212,16 +221,20 @@ def simulated_rig(
     simulator = PtpCameraSimulator(
         bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
     )
-    k = camera.sensor.binning
-    function = PtpUsbFunction(simulator)
+    shape = (size[0] // k, size[1] // k)
+    function: UsbFunction = PtpUsbFunction(simulator)
+    if trigger is not None:
+        function = _triggered_camera(bench, shape, clock, chain, trigger.latency_s)
     bus = SimulatedUsb(clock, function)
 
     def opened() -> CameraDevice:
         """Open the camera; one whose cable is out is plugged in first."""
         if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
             bus.plug(function)
+        if trigger is not None:
+            return open_u3v(backend=bus, clock=clock)
         # The card lies in this computer's memory, hence from_card.
-        return _ptp_camera(clock, bus, shape=(size[0] // k, size[1] // k), cfa=cfa, from_card=True)
+        return _ptp_camera(clock, bus, shape=shape, cfa=cfa, from_card=True)
 
     def announced(name: str) -> None:
         digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
@@ -236,10 +249,42 @@ def simulated_rig(
         clock,
         opened,
         announced,
+        trigger,
         chain=chain,
         still=simulator,
     )
     return rig, bench
+
+
+def _triggered_camera(
+    bench: Bench, shape: tuple[int, int], clock: Clock, chain: ZaberChain, latency_s: float
+) -> U3vCameraSimulator:
+    """Return a USB3 Vision camera before the bench, output 1 of every controller on its line 0."""
+    sensor = bench.camera.sensor
+    bits = sensor.noise.white_level_dn.bit_length()
+    wants = []
+    if sensor.cfa_name not in COLOURS:
+        wants.append(f"a sensor of colours {', '.join(COLOURS)}, not {sensor.cfa_name}")
+    if sensor.noise.white_level_dn != 2**bits - 1 or bits not in (8, 10, 12, 16):
+        wants.append(f"white at the top of 8 to 16 bits, not at {sensor.noise.white_level_dn}")
+    if shape[0] % 2 or shape[1] % 2:
+        wants.append(f"an even number of rows and columns, not {shape[0]}x{shape[1]}")
+    if wants:
+        raise AppError(f"trigger: the simulated USB3 Vision camera needs {' and '.join(wants)}")
+    made = U3vCameraSimulator(
+        bench.expose,
+        clock,
+        shape,
+        sensor.cfa_name,
+        sensor.noise.black_level_dn,
+        bits,
+        depths=(str(bits),),
+        exposure_us=(10.0, 2e9),
+    )
+    chain.on_output = lambda device, output, level, at_s: (
+        made.raise_line(at_s + latency_s) if (output, level) == (1, 1) else None
+    )
+    return made
 
 
 def open_stage(

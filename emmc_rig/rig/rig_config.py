@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -17,6 +17,7 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
 from emmc_rig.rig.hardware import Rig, open_camera, open_stage, simulated_rig
+from emmc_rig.rig.trigger import SimulatedTrigger, Trigger, check_trigger
 from simulators.bench import RAYS_PER_VIEW
 
 SIMULATED = "simulated"
@@ -30,7 +31,8 @@ class RealRig(Settings):
     far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
     the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
     plate's open window. by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
-    not, nothing of that changes, as in a recording that is replayed.
+    not, nothing of that changes, as in a recording that is replayed. trigger: the wire by which
+    the stage's arrival begins an exposure, where there is one.
     """
 
     stage: str
@@ -38,12 +40,21 @@ class RealRig(Settings):
     zero_um: dict[str, float] = Field(default_factory=dict)
     window_um: float = 0.0
     by_hand: bool = True
+    trigger: Trigger | None = None
+
+
+class WiredRig(Settings):
+    """A YAML file for the simulated rig with a line from the stage to its camera."""
+
+    kind: Literal["simulated"]
+    trigger: SimulatedTrigger
 
 
 class ImagedRig(Settings):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
-    rays: per view and pixel; calibration to a per cent needs 1024 or more.
+    rays: per view and pixel; calibration to a per cent needs 1024 or more. trigger: the line from
+    its stage to its camera, which it has not by default.
     """
 
     scene: str
@@ -51,6 +62,7 @@ class ImagedRig(Settings):
     seed: int = Field(default=0, ge=0)
     real_time: bool = False
     rays: int = Field(default=RAYS_PER_VIEW, ge=16)
+    trigger: SimulatedTrigger | None = None
 
 
 class AskingAttendant:
@@ -99,20 +111,33 @@ class NoAttendant:
 
 
 def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
-    """Return what a session freezes of a rig: `simulated`, or a YAML file of real devices.
+    """Return what a session freezes of a rig: `simulated`, or a YAML file of devices.
 
-    Raises AppError with one line.
+    A file of `kind: simulated` is the simulated rig with the file's trigger. Raises AppError with
+    one line.
     """
     if spec == SIMULATED:
-        return {"kind": SIMULATED, **imaged.model_dump(mode="json")}
+        return _described(SIMULATED, imaged)
     if not spec.endswith((".yaml", ".yml")):
         raise AppError(f"--rig {spec}: write simulated, or the name of a YAML file of devices")
-    config = validated(RealRig, read_yaml(Path(spec), AppError), spec, AppError)
-    described = config.model_dump(mode="json")
+    read = read_yaml(Path(spec), AppError)
+    if isinstance(read, dict) and read.get("kind") == SIMULATED:
+        wired = validated(WiredRig, read, spec, AppError)
+        return _described(SIMULATED, imaged.model_copy(update={"trigger": wired.trigger}))
+    config = validated(RealRig, read, spec, AppError)
+    described = _described("real", config)
     beside = Path(spec).parent / config.stage
     if beside.is_file():
         described["stage"] = str(beside.resolve())
-    return {"kind": "real", **described}
+    return described
+
+
+def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
+    """Return a rig as plain data; one without a trigger reads as before there were any."""
+    described = config.model_dump(mode="json")
+    if config.trigger is None:
+        del described["trigger"]
+    return {"kind": kind, **described}
 
 
 @dataclass(frozen=True)
@@ -174,12 +199,22 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         height, width = fine.scene.light_field.shape[2:4]
         clock = SYSTEM_CLOCK if imaged.real_time else None
         rig, _ = simulated_rig(
-            camera, fine.samples, (height, width), imaged.seed, clock, imaged.rays
+            camera,
+            fine.samples,
+            (height, width),
+            imaged.seed,
+            clock,
+            imaged.rays,
+            imaged.trigger,
         )
+        if imaged.trigger is not None:
+            check_trigger(imaged.trigger, rig.stage, rig.camera)
         yield rig
         return
     real = validated(RealRig, settings, "the rig", AppError)
     with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:
+        if real.trigger is not None:
+            check_trigger(real.trigger, stage, device)
         yield Rig(
             stage,
             device,
@@ -187,4 +222,5 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             real.zero_um,
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),
+            trigger=real.trigger,
         )

@@ -8,25 +8,42 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
 from drivers.stage import StageSettings
 from drivers.u3v import U3vCamera, open_u3v
 from drivers.zaber import ZaberStage
+from emmc_rig.capture.expand import expand
+from emmc_rig.capture.order import ordered
+from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
+from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.rig.hardware import simulated_rig
+from emmc_rig.rig.trigger import LINE_LATENCY_S, SimulatedTrigger
+from emmc_rig.session.session import Frozen, Session
 from simulators.clock import ManualClock
+from simulators.disk import SimulatedDisk
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 from simulators.zaber import AxisSpec, ZaberChain
 
-LINE_LATENCY_S = 20e-6
-"""Of the output, the cable and the camera's input, as opto-isolated ones are specified."""
 EXPOSURE_S = 0.01
 STEP_UM = 120.0
 MOVE_S = 10.0
 """Longest wait for the edge."""
 FRAMES = 25
 SHAPE = (24, 32)
+SCENE = (5, 5, *SHAPE, 3)
+STEPPED = Plan(
+    camera="rgbw-bayer-1shot",
+    shots=tuple(
+        PlannedShot(mask_um=(STEP_UM * number, 0.0), exposure_s=(EXPOSURE_S,))
+        for number in range(FRAMES)
+    ),
+    whiteboards=None,
+    darks=None,
+)
 
 
 @dataclass(frozen=True)
@@ -97,3 +114,26 @@ def trigger_timing(frames: int = FRAMES, settle_s: float = 0.05) -> TriggerTimin
         triggered_s = rig.clock.now_s() - start_s
     ms = 1e3 / frames
     return TriggerTiming(frames, EXPOSURE_S * 1e3, settle_s * 1e3, asked_s * ms, triggered_s * ms)
+
+
+def capture_timing(settle_s: float = 0.05) -> TriggerTiming:
+    """Capture shots at equal steps on the simulated rig, asked for and triggered on arrival."""
+    # The same camera both times: without an output on the axis that moves nothing is triggered.
+    asked_s, triggered_s = (
+        _frame_s(SimulatedTrigger(outputs={axis: 1}, delay_s=settle_s))
+        for axis in ("aperture_x", "mask_x")
+    )
+    return TriggerTiming(FRAMES, EXPOSURE_S * 1e3, settle_s * 1e3, asked_s * 1e3, triggered_s * 1e3)
+
+
+def _frame_s(trigger: SimulatedTrigger) -> float:
+    """Return how long the devices take from the end of one frame of a session to the next."""
+    camera, clock = planned_camera(STEPPED), ManualClock()
+    scene = np.full(SCENE, 0.5, np.float32)
+    rig, _ = simulated_rig(camera, scene, SHAPE, 0, clock, rays_per_view=16, trigger=trigger)
+    frames = ordered(expand(STEPPED, camera, rig.window_um), STEPPED.order)
+    frozen = Frozen("", camera.model_dump(mode="json"), {}, frames)
+    session = Session.create(Path("/bench/session"), frozen, {"title": "steps"}, SimulatedDisk())
+    Sequencer(session, STEPPED, rig, timer=clock.now_s).run()
+    ends_s = [entry["spans_s"]["check"][1] for entry in session.stored.values()]
+    return (ends_s[-1] - ends_s[0]) / (len(ends_s) - 1)
