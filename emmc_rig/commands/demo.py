@@ -12,7 +12,6 @@ from emmc_rig.commands.options import (
     DEFAULT_SCENE,
     CameraOption,
     DictionaryOption,
-    MethodOption,
     OutOption,
     SceneOption,
     SeedOption,
@@ -35,19 +34,27 @@ def demo(
     chroma_weight: Annotated[
         float, typer.Option("--chroma-weight", help="of chrominance differences; 1: DV_1")
     ] = 2.0,
-    method: MethodOption = "tv",
+    method: Annotated[
+        str | None,
+        typer.Option("--method", help="see `emmc-rig reconstruct --list` (default: adaptive)"),
+    ] = None,
+    exact_psi: Annotated[
+        bool, typer.Option("--exact-psi", help="reconstruct with the exact Psi too, to compare")
+    ] = False,
     dictionary: DictionaryOption = None,
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     import emmc_rig as emmc
     from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.commands.first_run import compiled_ahead
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
     from emmc_rig.model.settings import validated
-    from reconstruction.methods import MethodSettings
+    from reconstruction.methods import DEFAULT_METHOD, MethodSettings
 
+    method = method or DEFAULT_METHOD
     described = emmc.camera(camera, shots)
     chosen = {"tv": {"mu": mu, "chroma_weight": chroma_weight}}
     solver = validated(MethodSettings, chosen, "solver settings", AppError)
@@ -60,11 +67,16 @@ def demo(
         method=method,
         dictionary=dictionary,
         solver=solver,
+        exact_psi=exact_psi,
     )
     for warning in described.warnings():
         say("warning", warning)
-    with result_folder(out, "demo") as folder, shown_bars() as bars:
-        metrics = run_demo(settings, folder, bars)
+    with (
+        result_folder(out, "demo") as folder,
+        shown_bars() as bars,
+        compiled_ahead(bars, method, camera, shots) as watcher,
+    ):
+        metrics = run_demo(settings, folder, watcher)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     typer.echo(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
