@@ -10,14 +10,10 @@ import yaml
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
+from emmc_rig.calibrate.comparison import in_three_colours, true_error
 from emmc_rig.calibrate.drift import run_drift
-from emmc_rig.calibrate.run import (
-    CalibrateSettings,
-    in_three_colours,
-    run_calibrate,
-    run_calibration,
-    true_error,
-)
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.calibrate.simulated import run_calibrate, run_calibration
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.results import save_frames

@@ -16,14 +16,13 @@ from calibration.drift import Drift, DriftSettings, find_drift
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import SCALARS, Placement
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
+from emmc_rig.calibrate.stored import CALIBRATION
 from emmc_rig.errors import AppError
 from emmc_rig.files.frames import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
-
-CALIBRATION = "calibration.h5"
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ from typing import Any
 
 from calibration.routes import Outcome
 from calibration.whiteboard import Calibration
-from emmc_rig.calibrate.run import REPORT, ROUTES, outcome_figures, save_outcome
+from emmc_rig.calibrate.settings import ROUTES
+from emmc_rig.calibrate.stored import REPORT, outcome_figures, save_outcome
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics

@@ -73,7 +73,9 @@ def calibrate(
 ) -> None:
     """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
     from emmc_rig.calibrate.bench import BenchTruth
-    from emmc_rig.calibrate.run import CalibrateSettings, run_calibrate, write_plan
+    from emmc_rig.calibrate.board_plan import write_plan
+    from emmc_rig.calibrate.settings import CalibrateSettings
+    from emmc_rig.calibrate.simulated import run_calibrate
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder

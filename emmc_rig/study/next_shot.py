@@ -19,7 +19,8 @@ import yaml
 
 from calibration.shadow import shadow_mask
 from emmc_rig.calibrate.bench import WhiteboardBench
-from emmc_rig.calibrate.run import CalibrateSettings, capture_plan, parametric_plan, plan_light
+from emmc_rig.calibrate.board_plan import capture_plan, parametric_plan, plan_light
+from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.capture.command import Wish, run_capture
 from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera

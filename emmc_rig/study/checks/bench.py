@@ -15,12 +15,9 @@ from emmc_rig.calibrate.bench import (
     StageFaults,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.run import (
-    CalibrateSettings,
-    measured_stage,
-    run_calibration,
-    true_parameters,
-)
+from emmc_rig.calibrate.comparison import true_parameters
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.calibrate.simulated import measured_stage, run_calibration
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.progress import Silent
 from emmc_rig.study.checks.rows import Row, judged

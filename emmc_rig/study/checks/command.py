@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from emmc_rig.calibrate.run import CalibrateSettings
+from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.study.checks.bench import check_psi, check_sensor, check_stage

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from emmc_rig.calibrate.bench import HARSH_MOUNTING, HARSH_OPTICS, HARSH_SENSOR, BenchTruth
-from emmc_rig.calibrate.run import CalibrateSettings, run_calibration
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.calibrate.simulated import run_calibration
 from emmc_rig.study.checks.rows import Row, judged
 from simulators.flaws import BoardFlaws, LampFlaws
 

@@ -16,10 +16,8 @@ from calibration.frames import MeanFrame
 from calibration.parametric import coefficient_planes
 from calibration.shadow import Shadow, shadow_mask
 from calibration.whiteboard import Whiteboards, measured_planes
-from emmc_rig.calibrate.run import (
-    CalibrateSettings,
-    soft_design,
-)
+from emmc_rig.calibrate.board_plan import soft_design
+from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import psi_layout
 from emmc_rig.study.checks.rows import Row, judged

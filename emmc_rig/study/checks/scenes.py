@@ -22,14 +22,14 @@ from emmc_rig.calibrate.bench import (
     BenchTruth,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.run import (
-    CalibrateSettings,
+from emmc_rig.calibrate.board_plan import (
     few_settings,
     free_settings,
     held_out_settings,
     parametric_plan,
     plan_light,
 )
+from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix

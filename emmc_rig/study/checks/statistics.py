@@ -28,8 +28,7 @@ from emmc_rig.calibrate.bench import (
     Setting,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.run import (
-    CalibrateSettings,
+from emmc_rig.calibrate.board_plan import (
     few_settings,
     free_route_error,
     free_settings,
@@ -37,6 +36,7 @@ from emmc_rig.calibrate.run import (
     plan_light,
     soft_design,
 )
+from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
 from emmc_rig.study.checks.rows import Row, judged
 

@@ -1,0 +1,211 @@
+"""How many whiteboards of which kind to take, and the plan that `emmc-rig capture` executes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from calibration.placement import Placement, designed_placement
+from calibration.planning import (
+    MODEL_ERROR,
+    MOST_FRAMES,
+    REFERENCE_FRAMES,
+    Kind,
+    Light,
+    PlannedFrames,
+    free_noise,
+    plan_free,
+    plan_parametric,
+)
+from calibration.shadow import ShadowMask, shadow_mask
+from emmc_rig.calibrate.bench import Setting, WhiteboardBench
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.capture.plan import METERING_EXPOSURE_S, Boards, Darks, OpenBoard, Plan, PlannedShot
+from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.model.camera import Camera
+
+PLAN = "plan.yaml"
+PLAN_HEAD = """\
+# Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
+# and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
+"""
+PLANNED_DARKS = 4
+LONGER_DARK = 1.25
+"""Of the planned exposure through the pinhole: metering may choose a longer one."""
+STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
+VERIFY_UM = (-207.0, 118.0)
+
+
+def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
+    """Return what the plan counts on: the exposure of a whiteboard, and how many pixels see it."""
+    rows, columns = mask.pixel_shape()
+    views = bench.camera.views
+    single = bench.camera.sensor.cfa_name != "mono"
+    light = (1 if single else 3) * bench.camera.sensor.binning**2
+    return Light(
+        bench.camera.sensor.noise,
+        bench.board_exposure_s(),
+        views[0] * views[1],
+        light,
+        rows * columns,
+    )
+
+
+def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
+    """Return the design with edges as soft as a bench's may be: what a plan is made for."""
+    return replace(designed_placement(camera), blur_um=0.1 * mask.cell_um)
+
+
+def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: float) -> PlannedFrames:
+    """Return the whiteboards for the parametric route."""
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    kinds = [Kind(None, stage) for stage in stages]
+    kinds += [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    return plan_parametric(mask, soft_design(camera, mask), kinds, light, target)
+
+
+def few_settings(planned: PlannedFrames, lamp: str = "white") -> list[Setting]:
+    """Return a plan as settings of the bench, in shot 0."""
+    return [
+        Setting(0, kind.pinhole, lamp, kind.stage_um, count)
+        for kind, count in planned.counts.items()
+    ]
+
+
+def free_settings(camera: Camera, lamps: Sequence[str], repeats: int) -> list[Setting]:
+    """Return the settings of the free route: every shot, view and lamp."""
+    return [
+        Setting(shot, (v, u), lamp, repeats=repeats)
+        for shot in range(len(camera.shots))
+        for v, u in np.ndindex(camera.views)
+        for lamp in lamps
+    ]
+
+
+def held_out_settings(camera: Camera) -> list[Setting]:
+    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
+    return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
+
+
+def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Light) -> Plan:
+    """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
+    repeats = max(1, *(count for kind, count in planned.counts.items() if kind.pinhole))
+    fitted = [
+        OpenBoard(mask_um=kind.stage_um, repeats=count)
+        for kind, count in planned.counts.items()
+        if kind.pinhole is None
+    ]
+    judging = [
+        OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
+        for one in held_out_settings(settings.camera)
+    ]
+    # The metering chooses the real exposures; darks on both sides of them are interpolated.
+    longest_s = light.exposure_s * light.pinhole_times * LONGER_DARK
+    return Plan(
+        title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
+        camera=settings.camera_name,
+        shots=tuple(PlannedShot() for _ in settings.camera.shots),
+        whiteboards=Boards(
+            views="all",
+            shots=(0,),
+            repeats=repeats,
+            references=max(2, planned.reference_frames),
+            open=(*fitted, *judging),
+        ),
+        darks=Darks(
+            exposure_s=(
+                METERING_EXPOSURE_S,
+                round(light.exposure_s, 4),
+                round(longest_s, 3),
+            ),
+            repeats=max(4, planned.dark_frames),
+        ),
+    )
+
+
+def combined_plan(
+    camera: Camera, mask: ShadowMask, light: Light, target: float, most_frames: int | None = None
+) -> PlannedFrames:
+    """Return the whiteboards for all routes in one: the same number of every view, and open ones.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with at
+    most `most_frames` frames in all (default: MOST_FRAMES before every view).
+    """
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    opened = {Kind(None, stage): 2 for stage in stages}
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    others = sum(opened.values()) + judging + REFERENCE_FRAMES + 3 * PLANNED_DARKS
+    views = camera.views[0] * camera.views[1]
+    most = MOST_FRAMES if most_frames is None else (most_frames - others) // views
+    if most < 1:
+        raise AppError(
+            f"--frames {most_frames}: a plan opens each of the {views} views at least once, and "
+            f"takes {others} frames beside: name at least {views + others}"
+        )
+    soft = soft_design(camera, mask)
+    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    if planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached"
+            f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
+            f"{planned.expected_error:.3%}, with {others + most * views}; raise --target"
+            f"{'' if most_frames is None else ' or --frames'}"
+        )
+    return replace(planned, counts={**opened, **planned.counts}, dark_frames=3 * PLANNED_DARKS)
+
+
+def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
+    """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
+    kind reach the target. Raises AppError where none do.
+    """
+    camera = settings.camera
+    mask = shadow_mask(camera, settings.size)
+    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
+    light = plan_light(bench, mask)
+    planned = combined_plan(camera, mask, light, settings.target, settings.most_frames)
+    judging = sum(one.repeats for one in held_out_settings(camera))
+    metrics = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "target_relative_error": settings.target,
+        "model_error": MODEL_ERROR,
+        "exposures": {
+            "open_s": light.exposure_s,
+            "pinhole_s": light.exposure_s * light.pinhole_times,
+        },
+        "dark_frames": planned.dark_frames,
+        "reference_frames": planned.reference_frames,
+        "held_out_frames": judging,
+        "whiteboards": [
+            {
+                "pinhole": None if kind.pinhole is None else list(kind.pinhole),
+                "stage_um": list(kind.stage_um),
+                "frames": count,
+            }
+            for kind, count in planned.counts.items()
+        ],
+        "frames": planned.exposures + judging,
+        "expected_relative_error": planned.expected_error,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    to_capture = capture_plan(settings, planned, light).model_dump(
+        mode="json", exclude_defaults=True
+    )
+    text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
+    (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
+    write_metrics(folder, metrics)
+    return metrics
+
+
+def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
+    """Return the error of Psi that the free route's formula expects of so many frames a view."""
+    mask = shadow_mask(settings.camera, settings.size)
+    bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
+    light = plan_light(bench, mask)
+    return free_noise(mask, soft_design(settings.camera, mask), light).error(repeats)
