@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from calibration.board_angle import BoardAngle
@@ -64,6 +66,34 @@ def level_findings(levels: Levels | None) -> list[str]:
             f"the sensor's response loses {loss:.2%} at {levels.brightest_dn:.0f} DN: straightened"
         )
     return found
+
+
+UNWATCHED = {
+    "lamp": (
+        "whether the lamp drifted: plan lamp_checks",
+        "{LAMP} of Psi for every 1 % of drift",
+    ),
+    "response": (
+        "whether the sensor's response bends: plan response",
+        "{RESPONSE} of Psi for every 1 % of loss at full well",
+    ),
+    "colours": (
+        "what the colour filters let through of other colours: plan colours, with a lamp that has "
+        "them",
+        "{COLOURS} of Psi for every 1 % of crosstalk",
+    ),
+    "turned": (
+        "whether the white board is even over angle: plan turned",
+        "{BOARD} of Psi for every 1 % of unevenness over the aperture",
+    ),
+}
+"""What no whiteboard told, and what it costs: `calibrate --check lamp,response,crosstalk,board
+--leave-out lamp,response,colours,turned --size 48x64 --rays 1024`, less what is missed without."""
+
+
+def unwatched(missing: Sequence[str]) -> list[str]:
+    """Return what these whiteboards were not there to tell, and how much that may cost."""
+    return [f"not measured: {what}; costs {cost}" for what, cost in map(UNWATCHED.get, missing)]
 
 
 def angle_findings(board: BoardAngle) -> list[str]:

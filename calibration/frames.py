@@ -80,8 +80,12 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
     count = before.count + after.count
     share = before.count / count
     mean = share * before.mean_dn + (1 - share) * after.mean_dn
-    change = float(np.mean(after.mean_dn - before.mean_dn))
+    difference = (after.mean_dn - before.mean_dn).astype(np.float64)
+    change = float(np.mean(difference))
     variance = share * before.variance_dn2 + (1 - share) * after.variance_dn2
+    if np.isnan(variance):
+        # Single frames: their difference has the noise of both.
+        variance = float(np.var(difference)) / (1 / before.count + 1 / after.count)
     # Anywhere between the two with the same chance.
     return MeanFrame(
         mean.astype(np.float32),

@@ -63,7 +63,7 @@ class QuietAttendant:
     def set_lamp(self, colour):
         self.told.append(("lamp", colour))
 
-    def place(self, target):
+    def place(self, target, turn_deg=0.0):
         self.told.append(("place", target))
 
     def fit_masks(self, shot, fitted=True):

@@ -16,8 +16,7 @@ from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.calibrate.bench import (
-    HARSH_OPTICS,
-    HARSH_SENSOR,
+    ORDINARY_BENCH,
     BenchTruth,
     Setting,
     WhiteboardBench,
@@ -48,8 +47,8 @@ HELD_OUT = [Setting(repeats=4), Setting(stage_um=(-207.0, 118.0), repeats=4)]
 
 @pytest.fixture(scope="module")
 def bench():
-    optics = replace(HARSH_OPTICS, dust_specks=4, seed=3)
-    truth = BenchTruth(MOUNTING, optics, HARSH_SENSOR, rays_per_view=1024)
+    optics = replace(ORDINARY_BENCH.optics, dust_specks=4, seed=3)
+    truth = BenchTruth(MOUNTING, optics, ORDINARY_BENCH.sensor, rays_per_view=1024)
     return WhiteboardBench(CAMERA, SIZE, truth)
 
 
@@ -75,8 +74,8 @@ def test_the_fit_finds_where_the_mask_sits(outcome):
     assert np.degrees(at.rotation_rad) == pytest.approx(0.15, abs=0.005)
     assert 1 + at.distance_share == pytest.approx(1.05, rel=0.005)
     assert at.scale == pytest.approx(1.002, abs=1e-4)
-    assert at.clear == pytest.approx(HARSH_OPTICS.clear, abs=0.003)
-    assert at.leak == pytest.approx(HARSH_OPTICS.leak, abs=0.003)
+    assert at.clear == pytest.approx(ORDINARY_BENCH.optics.clear, abs=0.003)
+    assert at.leak == pytest.approx(ORDINARY_BENCH.optics.leak, abs=0.003)
     assert outcome.parametric.fit.status == "converged"
 
 
@@ -92,7 +91,7 @@ def test_dust_is_found_and_psi_is_better_for_it(bench, design, outcome):
 
 
 def test_bad_pixels_are_found_and_left_out(bench, outcome):
-    hot, dead = HARSH_SENSOR.bad(SIZE)
+    hot, dead = ORDINARY_BENCH.sensor.bad(SIZE)
     assert not outcome.good[hot | dead].any()
     assert (~outcome.good).sum() <= (hot | dead).sum() + 3
     usable = outcome.calibration.usable(np.zeros(design_shape := (1, *SIZE)), 65_535)

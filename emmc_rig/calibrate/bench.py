@@ -6,7 +6,7 @@ session makes the same `BoardSet`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -22,14 +22,8 @@ from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.sensing import ImagingMatrix
 from simulators.bench import Bench, MountingErrors
-from simulators.flaws import (
-    EVEN_BOARD,
-    STEADY_LAMP,
-    BoardFlaws,
-    LampFlaws,
-    OpticsFlaws,
-    SensorFlaws,
-)
+from simulators.effects import ORDINARY, Flaws, flawed
+from simulators.flaws import OpticsFlaws, SensorFlaws
 
 Array = NDArray[np.floating]
 DARK_REPEATS = 2
@@ -47,25 +41,7 @@ DARK_EXPOSURES_S = (0.01, 1.0, 4.0)
 FLAT_SHARES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.3)
 """Of the exposure that fills the well."""
 RAYS_PER_VIEW = 512
-HARSH_MOUNTING = MountingErrors(
-    offset_um=(23.7, -14.2),
-    rotation_deg=0.11,
-    stretch=1.0012,
-    skew=0.0006,
-    distance_share=0.045,
-    distortion_um=1.5,
-    edge_blur_um=2.5,
-)
-HARSH_OPTICS = OpticsFlaws(
-    aperture_spread=0.04, vignetting=2.0, clear=0.94, leak=0.03, dust_specks=6
-)
-HARSH_SENSOR = SensorFlaws(
-    response_spread=0.01,
-    offset_spread_dn=1.0,
-    dark_electrons_per_s=20.0,
-    bad_share=0.002,
-    full_well_electrons=80_000.0,
-)
+ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
 
 
 @dataclass(frozen=True)
@@ -112,16 +88,14 @@ class StageFaults:
 
 
 @dataclass(frozen=True)
-class BenchTruth:
-    """What is wrong with the simulated bench."""
+class BenchTruth(Flaws):
+    """What is wrong with the simulated bench, and how finely its rays are traced."""
 
-    mounting: MountingErrors = HARSH_MOUNTING
-    optics: OpticsFlaws = HARSH_OPTICS
-    sensor: SensorFlaws = HARSH_SENSOR
+    mounting: MountingErrors = ORDINARY_BENCH.mounting
+    optics: OpticsFlaws = ORDINARY_BENCH.optics
+    sensor: SensorFlaws = ORDINARY_BENCH.sensor
     rays_per_view: int = RAYS_PER_VIEW
     stage: StageFaults = StageFaults()
-    board: BoardFlaws = EVEN_BOARD
-    lamp: LampFlaws = STEADY_LAMP
 
 
 @dataclass
@@ -209,12 +183,15 @@ class WhiteboardBench:
         )
 
     def capture(
-        self, settings: Sequence[Setting], on_frame: Callable[[str], None] = lambda label: None
+        self,
+        settings: Sequence[Setting],
+        on_frame: Callable[[str], None] = lambda label: None,
+        leave_out: Collection[str] = (),
     ) -> BoardSet:
         """Return dark frames, references, and the whiteboards asked for, in their order.
 
         Between them the first whiteboard of the open aperture is looked at again, and without masks
-        at several exposures before and at one after: the checks.
+        at several exposures before and at one after: the checks. leave_out: of WATCHES.
         """
         board_s = self.board_exposure_s()
         views = self.camera.views[0] * self.camera.views[1]
@@ -229,16 +206,17 @@ class WhiteboardBench:
             dark = darks[frame.exposure_s].mean_dn
             checks.append(check_of(f"{board}, {turn:g}", frame, dark, self._channels))
 
-        references = self._references(settings, board_s, on_frame)
+        references = self._references(settings, board_s, on_frame, "colours" not in leave_out)
+        watched = "lamp" not in leave_out
         lamp = settings[0].lamp
         plain = Setting(lamp=lamp, board_turn_deg=turn)
-        for exposure_s in (*series, board_s):
+        for exposure_s in series * ("response" not in leave_out) + [board_s] * watched:
             frame = self._frames(plain, exposure_s, False, 2, "response")
             seen_again("without masks", frame)
         frames = []
         again = Setting(lamp=lamp, repeats=1, board_turn_deg=turn)
         for place, setting in enumerate(settings):
-            if place % CHECK_EVERY == 0:
+            if watched and place % CHECK_EVERY == 0:
                 seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
             exposure_s = board_s if setting.pinhole is None else board_s * views
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
@@ -246,13 +224,18 @@ class WhiteboardBench:
             on_frame(label)
             sent = self.sent_um(setting)
             frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
-        seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
-        seen_again("without masks", self._frames(plain, board_s, False, 2, "reference"))
+        if watched:
+            seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
+            seen_again("without masks", self._frames(plain, board_s, False, 2, "reference"))
         both = tuple(before_and_after(dark, self._dark(t)) for t, dark in darks.items())
         return BoardSet(both, references, tuple(frames), tuple(checks))
 
     def _references(
-        self, settings: Sequence[Setting], board_s: float, on_frame: Callable[[str], None]
+        self,
+        settings: Sequence[Setting],
+        board_s: float,
+        on_frame: Callable[[str], None],
+        coloured: bool,
     ) -> dict[tuple[int, str], MeanFrame]:
         """Return the open whiteboards without masks; shots behind the same filter share one.
 
@@ -277,7 +260,7 @@ class WhiteboardBench:
             ]
             known = alike[0] if alike else taken(shot, lamp, REFERENCE_REPEATS)
             references[shot, lamp] = known
-        if self._channels.max() < len(LAMP_COLOURS) and turn == 0:
+        if coloured and self._channels.max() < len(LAMP_COLOURS) and turn == 0:
             for lamp in LAMP_COLOURS:
                 if (0, lamp) not in references:
                     references[0, lamp] = taken(0, lamp, COLOUR_REPEATS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,6 @@ from calibration.placement import Placement, designed_placement
 from calibration.planning import (
     MODEL_ERROR,
     MOST_FRAMES,
-    REFERENCE_FRAMES,
     Kind,
     Light,
     PlannedFrames,
@@ -22,8 +22,9 @@ from calibration.planning import (
     plan_parametric,
 )
 from calibration.shadow import ShadowMask, shadow_mask
-from emmc_rig.calibrate.bench import Setting, WhiteboardBench
-from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.calibrate.bench import SERIES_SHARES, Setting, WhiteboardBench
+from emmc_rig.calibrate.settings import WATCHES, CalibrateSettings
+from emmc_rig.capture.expand import expand
 from emmc_rig.capture.plan import METERING_EXPOSURE_S, Boards, Darks, OpenBoard, Plan, PlannedShot
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
@@ -34,9 +35,8 @@ PLAN_HEAD = """\
 # Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
 # and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
 """
-PLANNED_DARKS = 4
-LONGER_DARK = 1.25
-"""Of the planned exposure through the pinhole: metering may choose a longer one."""
+METERING_DARKS, BOARD_DARKS = 2, 1
+LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
 
@@ -92,7 +92,7 @@ def held_out_settings(camera: Camera) -> list[Setting]:
     return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
 
 
-def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Light) -> Plan:
+def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
     repeats = max(1, *(count for kind, count in planned.counts.items() if kind.pinhole))
     fitted = [
@@ -104,8 +104,7 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Lig
         OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
         for one in held_out_settings(settings.camera)
     ]
-    # The metering chooses the real exposures; darks on both sides of them are interpolated.
-    longest_s = light.exposure_s * light.pinhole_times * LONGER_DARK
+    coloured = camera_colours(settings.camera) and "colours" not in settings.leave_out
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
         camera=settings.camera_name,
@@ -116,36 +115,45 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames, light: Lig
             repeats=repeats,
             references=max(2, planned.reference_frames),
             open=(*fitted, *judging),
+            lamp_checks=0 if "lamp" in settings.leave_out else LAMP_CHECKS,
+            response=() if "response" in settings.leave_out else SERIES_SHARES,
+            colours=COLOUR_REPEATS if coloured else 0,
+            turned=0 if "turned" in settings.leave_out else TURNED_REPEATS,
         ),
         darks=Darks(
-            exposure_s=(
-                METERING_EXPOSURE_S,
-                round(light.exposure_s, 4),
-                round(longest_s, 3),
-            ),
-            repeats=max(4, planned.dark_frames),
+            exposure_s=(METERING_EXPOSURE_S,), repeats=METERING_DARKS, of_boards=BOARD_DARKS
         ),
     )
 
 
-def combined_plan(
-    camera: Camera, mask: ShadowMask, light: Light, target: float, most_frames: int | None = None
-) -> PlannedFrames:
+def camera_colours(camera: Camera) -> bool:
+    """Return whether the sensor's pixels see one colour each, so that crosstalk matters."""
+    return camera.sensor.cfa_name != "mono" and camera.sensor.binning == 1
+
+
+def frames_by_kind(settings: CalibrateSettings, planned: PlannedFrames) -> Counter[str]:
+    """Return how many frames of each kind a capture takes before the shots of the scene."""
+    frames = expand(capture_plan(settings, planned), settings.camera, 0.0)
+    return Counter(frame.kind for frame in frames if frame.kind != "shot")
+
+
+def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
     """Return the whiteboards for all routes in one: the same number of every view, and open ones.
 
-    Raises AppError, with the best there is, where the error asked for cannot be reached with at
-    most `most_frames` frames in all (default: MOST_FRAMES before every view).
+    Raises AppError, with the best there is, where the error asked for cannot be reached with the
+    frames that the settings allow (default: MOST_FRAMES before every view).
     """
+    camera, most_frames, target = settings.camera, settings.most_frames, settings.target
     stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
     opened = {Kind(None, stage): 2 for stage in stages}
-    judging = sum(one.repeats for one in held_out_settings(camera))
-    others = sum(opened.values()) + judging + REFERENCE_FRAMES + 3 * PLANNED_DARKS
-    views = camera.views[0] * camera.views[1]
-    most = MOST_FRAMES if most_frames is None else (most_frames - others) // views
+    views = [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    least = PlannedFrames(opened | dict.fromkeys(views, 1), 0.0)
+    others = frames_by_kind(settings, least).total() - len(views)
+    most = MOST_FRAMES if most_frames is None else (most_frames - others) // len(views)
     if most < 1:
         raise AppError(
-            f"--frames {most_frames}: a plan opens each of the {views} views at least once, and "
-            f"takes {others} frames beside: name at least {views + others}"
+            f"--frames {most_frames}: a plan opens each of the {len(views)} views at least once, "
+            f"and takes {others} frames beside: name at least {len(views) + others}, or --leave-out"
         )
     soft = soft_design(camera, mask)
     planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
@@ -153,10 +161,10 @@ def combined_plan(
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached"
             f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
-            f"{planned.expected_error:.3%}, with {others + most * views}; raise --target"
+            f"{planned.expected_error:.3%}, with {others + most * len(views)}; raise --target"
             f"{'' if most_frames is None else ' or --frames'}"
         )
-    return replace(planned, counts={**opened, **planned.counts}, dark_frames=3 * PLANNED_DARKS)
+    return replace(planned, counts={**opened, **planned.counts})
 
 
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
@@ -167,8 +175,8 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
     light = plan_light(bench, mask)
-    planned = combined_plan(camera, mask, light, settings.target, settings.most_frames)
-    judging = sum(one.repeats for one in held_out_settings(camera))
+    planned = combined_plan(settings, mask, light)
+    counts = frames_by_kind(settings, planned)
     metrics = {
         "camera": settings.camera_name,
         "size": list(settings.size),
@@ -178,9 +186,6 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
             "open_s": light.exposure_s,
             "pinhole_s": light.exposure_s * light.pinhole_times,
         },
-        "dark_frames": planned.dark_frames,
-        "reference_frames": planned.reference_frames,
-        "held_out_frames": judging,
         "whiteboards": [
             {
                 "pinhole": None if kind.pinhole is None else list(kind.pinhole),
@@ -189,14 +194,14 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
             }
             for kind, count in planned.counts.items()
         ],
-        "frames": planned.exposures + judging,
+        "frames_by_kind": dict(counts),
+        "frames": counts.total(),
+        "left_out": {name: WATCHES[name] for name in sorted(settings.leave_out)},
         "expected_relative_error": planned.expected_error,
         "command": command_line(),
         "versions": versions(),
     }
-    to_capture = capture_plan(settings, planned, light).model_dump(
-        mode="json", exclude_defaults=True
-    )
+    to_capture = capture_plan(settings, planned).model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
     (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
     write_metrics(folder, metrics)

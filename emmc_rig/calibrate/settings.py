@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from calibration.fit import FitSettings
 from emmc_rig.calibrate.bench import BenchTruth
+from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 
 ROUTES = {
@@ -15,13 +16,21 @@ ROUTES = {
     "free": ("free",),
 }
 TARGET = 0.005
+WATCHES = {
+    "lamp": "open whiteboards between the others, and the reference again at the end",
+    "response": "references at several exposures",
+    "colours": "references under red, green and blue lamps",
+    "turned": "the white board turned by 90 degrees",
+}
+"""Whiteboards that tell what else is wrong than the mask: each may be left out of a plan."""
 
 
 @dataclass(frozen=True)
 class CalibrateSettings:
     """What to calibrate: camera, size, route (a key of ROUTES); what to plan for.
 
-    target: relative error of Psi. most_frames: of the plan, None: as many as it takes.
+    target: relative error of Psi. most_frames: of the plan, None: as many as it takes. leave_out:
+    names of WATCHES that the rig cannot take.
     """
 
     camera_name: str
@@ -34,3 +43,9 @@ class CalibrateSettings:
     fit: FitSettings = field(default_factory=FitSettings)
     map_stage: bool = False
     most_frames: int | None = None
+    leave_out: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        for name in sorted(self.leave_out):
+            if name not in WATCHES:
+                raise AppError(f"--leave-out {name}: use some of {', '.join(WATCHES)}")

@@ -79,7 +79,8 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
         fitted = [one for one in fitted if one.pinhole is None]
     judges = held_out_settings(camera)[: 2 if "parametric" in routes else 1]
     watcher.begin("whiteboards", len(fitted) + len(through) + len(judges))
-    boards = bench.capture([*fitted, *through, *judges], watcher.step)
+    every = [*fitted, *through, *judges]
+    boards = bench.capture(every, watcher.step, settings.leave_out)
     first, last = len(fitted), len(fitted) + len(through)
     held_out = boards.with_frames(boards.frames[last:])
     if "free" in routes:
@@ -87,7 +88,7 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     if "parametric" in routes:
         few = boards.with_frames([one for one in boards.frames[:last] if one.shot == 0])
     turned = {}
-    if "combined" in routes:
+    if "combined" in routes and "turned" not in settings.leave_out:
         watcher.begin("whiteboards, the board turned", 1)
         turned[BOARD_TURN_DEG] = bench.capture(
             [Setting(lamp=lamps[0], repeats=4, board_turn_deg=BOARD_TURN_DEG)], watcher.step

@@ -5,10 +5,13 @@ Source of the whiteboard procedure: see `calibration.whiteboard`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from calibration.whiteboard import LAMP_COLOURS
-from emmc_rig.capture.plan import METERING_EXPOSURE_S, Plan
+from emmc_rig.capture.order import spread
+from emmc_rig.capture.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
@@ -16,6 +19,9 @@ from emmc_rig.model.masks import cfa_tile
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 OPEN_LAMP = "white"
+TURN_DEG = 90.0
+"""Of the white board: what maps no gradient and no saddle over the aperture onto itself."""
+RESPONSE_REPEATS = 2
 
 
 def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...]]:
@@ -33,11 +39,23 @@ def expand(plan: Plan, camera: Camera, window_um: float) -> tuple[PlannedFrame, 
     window_um: what the stage's aperture_x adds to open the aperture. Raises AppError for views
     that the camera does not have, and for a shot whose masks stand at several places.
     """
+    boards = [*_boards(plan, camera), *_open_boards(plan, camera, window_um)]
+    lit = [
+        *_references(plan, camera, window_um),
+        *_response(plan, window_um),
+        *spread(boards, list(_lamp_checks(plan, camera, window_um))),
+        *_turned_boards(plan, camera, window_um),
+        *_last_references(plan, window_um),
+    ]
+    references = [frame for frame in lit if not frame.bench.masks_in and not frame.part]
+    others = [frame for frame in lit if frame.bench.masks_in or frame.part]
+    last = max((frame.part for frame in lit), default=0)
     frames = [
         *_darks(plan),
-        *_references(plan, camera, window_um),
-        *_boards(plan, camera),
-        *_open_boards(plan, camera, window_um),
+        *references,
+        *_board_darks(plan, lit, "before", 0),
+        *others,
+        *_board_darks(plan, lit, "after", last),
         *_shots(plan, camera, window_um),
     ]
     return tuple(frames)
@@ -51,6 +69,35 @@ def _darks(plan: Plan) -> Iterator[PlannedFrame]:
         for repeat in range(plan.darks.repeats):
             name = f"dark-{place}-r{repeat}"
             yield PlannedFrame(name, "dark", bench, exposure_s, repeat=repeat)
+
+
+def _board_darks(
+    plan: Plan, boards: Sequence[PlannedFrame], when: str, part: int
+) -> Iterator[PlannedFrame]:
+    """Yield darks at every exposure under white light, metered as the whiteboards are.
+
+    At shorter ones the dark current is little, and lies on a line.
+    """
+    if plan.darks is None or not plan.darks.of_boards:
+        return
+    bench = Bench("whiteboard", "off", 0, 0, masks_in=True)
+    exposures = dict.fromkeys(
+        (one.exposure_s, one.metered_by, one.light)
+        for one in boards
+        if one.kind != "metering" and one.bench.lamp == OPEN_LAMP and one.light >= 1
+    )
+    for place, (exposure_s, metered_by, light) in enumerate(exposures):
+        for repeat in range(plan.darks.of_boards):
+            yield PlannedFrame(
+                f"dark-{when}-{place}-r{repeat}",
+                "dark",
+                bench,
+                exposure_s,
+                repeat=repeat,
+                metered_by=metered_by,
+                light=light,
+                part=part,
+            )
 
 
 def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
@@ -76,13 +123,16 @@ def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[Planne
     if boards.open and OPEN_LAMP not in lamps:
         lamps = (*lamps, OPEN_LAMP)
     for shot in range(len(camera.shots)):
-        for lamp in lamps:
+        repeats = dict.fromkeys(lamps, boards.references)
+        if shot == 0 and boards.colours:
+            repeats |= {lamp: boards.colours for lamp in LAMP_COLOURS if lamp not in repeats}
+        for lamp, count in repeats.items():
             bench = Bench("whiteboard", lamp, shot, fitted[shot], False, window)
             metered_by = None
             if boards.exposure_s is None:
                 metered_by = _metering_id(shot, lamp)
                 yield PlannedFrame(metered_by, "metering", bench, METERING_EXPOSURE_S)
-            for repeat in range(boards.references):
+            for repeat in range(count):
                 yield PlannedFrame(
                     f"reference-s{shot}-{lamp}-r{repeat}",
                     "reference",
@@ -167,6 +217,72 @@ def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[Plann
                 repeat=repeat,
                 metered_by=_metering_id(0, OPEN_LAMP) if metered else None,
             )
+
+
+def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
+    """Return how a whiteboard of the first shot is exposed; light: so many times less."""
+    boards = plan.whiteboards or Boards()
+    if boards.exposure_s is not None:
+        return {"exposure_s": boards.exposure_s * light, "light": light}
+    return {"exposure_s": None, "metered_by": _metering_id(0, OPEN_LAMP), "light": light}
+
+
+def _response(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    bench = _open_bench(window_um, masks_in=False)
+    for share in sorted(boards.response):
+        for repeat in range(RESPONSE_REPEATS):
+            name = f"response-{share:g}-r{repeat}"
+            yield PlannedFrame(name, "check", bench, repeat=repeat, **_white(plan, share))
+
+
+def _lamp_checks(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    bench = _open_bench(window_um, True, mask_offsets_um(camera, 0))
+    for repeat in range(boards.lamp_checks):
+        yield PlannedFrame(f"check-r{repeat}", "check", bench, repeat=repeat, **_white(plan))
+
+
+def _turned_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    """Yield the board turned: through the masks, which are in the beam, then without them."""
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    for masks_in in (True, False):
+        offsets_um = mask_offsets_um(camera, 0) if masks_in else {}
+        bench = replace(_open_bench(window_um, masks_in, offsets_um), board_turn_deg=TURN_DEG)
+        name = "open" if masks_in else "reference"
+        for repeat in range(boards.turned):
+            yield PlannedFrame(
+                f"turned-{name}-r{repeat}",
+                "turned",
+                bench,
+                repeat=repeat,
+                part=1,
+                **_white(plan),
+            )
+
+
+def _last_references(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None or not boards.lamp_checks:
+        return
+    bench = _open_bench(window_um, masks_in=False)
+    for repeat in range(RESPONSE_REPEATS):
+        name = f"reference-again-r{repeat}"
+        yield PlannedFrame(name, "check", bench, repeat=repeat, part=2, **_white(plan))
+
+
+def _open_bench(
+    window_um: float, masks_in: bool, offsets_um: Mapping[str, float] | None = None
+) -> Bench:
+    """Return the bench of an open whiteboard of the first shot."""
+    window = {"aperture_x": window_um, "aperture_y": 0.0}
+    return Bench("whiteboard", OPEN_LAMP, 0, 0, masks_in, {**(offsets_um or {}), **window})
 
 
 def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:

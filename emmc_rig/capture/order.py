@@ -9,7 +9,7 @@ overshoots to come up again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +30,37 @@ def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, .
         return frames
     groups: dict[object, list[PlannedFrame]] = {}
     for frame in frames:
-        groups.setdefault((frame.bench.lamp == "off", *frame.bench.set_by_hand), []).append(frame)
+        key = (frame.part, frame.bench.lamp == "off", *frame.bench.set_by_hand)
+        groups.setdefault(key, []).append(frame)
     found: list[PlannedFrame] = []
     at_um: dict[str, float] = {}
     for group in groups.values():
         places: dict[tuple[tuple[str, float], ...], list[PlannedFrame]] = {}
+        checks = [frame for frame in group if frame.kind == "check" and frame.bench.masks_in]
+        toured: list[PlannedFrame] = []
         for frame in group:
+            if frame in checks:
+                continue
             places.setdefault(tuple(sorted(frame.bench.offsets_um.items())), []).append(frame)
         for place in _tour(list(places), at_um):
-            found += places[place]
+            toured += places[place]
             at_um |= dict(place)
+        found += spread(toured, checks)
     return tuple(found)
+
+
+def spread(frames: Sequence[PlannedFrame], checks: Sequence[PlannedFrame]) -> list[PlannedFrame]:
+    """Return frames with the checks among them: the first before all, the last after all.
+
+    Frames of one whiteboard, which are averaged, stay together.
+    """
+    found = list(frames)
+    for place, one in reversed(list(enumerate(checks))):
+        at = round(place * len(frames) / max(len(checks) - 1, 1))
+        while 0 < at < len(frames) and frames[at].repeat:
+            at += 1
+        found.insert(at, one)
+    return found
 
 
 def travel_um(frames: Iterable[PlannedFrame]) -> float:

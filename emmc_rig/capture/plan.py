@@ -95,6 +95,22 @@ class Boards(Settings):
     )
     repeats: Repeats = 2
     references: Annotated[int, Field(ge=2, le=10_000)] = 4
+    lamp_checks: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="the open whiteboard of the first shot again, so often, spread over the "
+        "others, and the reference once more at the end: how the lamp drifts",
+    )
+    response: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
+        default=(), description="references at these shares of their exposure too: the response"
+    )
+    colours: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0, description="references under red, green, blue lamps: crosstalk of the filters"
+    )
+    turned: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="open whiteboards and references with the board turned by 90 degrees: how "
+        "uneven the board is over angle",
+    )
     level: float = Field(default=0.7, gt=0, lt=1, description="of white, where metering aims")
     exposure_s: Positive | None = Field(
         default=None, description="of the references; default: metered"
@@ -106,6 +122,10 @@ class Darks(Settings):
 
     exposure_s: Exposures = (METERING_EXPOSURE_S,)
     repeats: Annotated[int, Field(ge=2, le=10_000)] = 4
+    of_boards: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="at every exposure of the whiteboards too, so many before and after them",
+    )
 
 
 class Retries(Settings):

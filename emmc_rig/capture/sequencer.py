@@ -271,7 +271,7 @@ class Sequencer:
         rig, bench, applied = self._rig, planned.bench, self._applied
         if bench.lamp != "off" and applied.bench != bench.set_by_hand:
             applied.bench = None
-            rig.attendant.place(bench.target)
+            rig.attendant.place(bench.target, bench.board_turn_deg)
             rig.attendant.fit_masks(bench.fitting, bench.masks_in)
             applied.bench = bench.set_by_hand
         if applied.lamp != bench.lamp:

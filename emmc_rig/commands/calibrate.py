@@ -55,6 +55,14 @@ def calibrate(
     frames: Annotated[
         int | None, typer.Option("--frames", min=1, help="with --plan: at most so many")
     ] = None,
+    leave_out: Annotated[
+        str | None,
+        typer.Option(
+            "--leave-out",
+            help="what the rig cannot take, with --plan or on the simulated bench: some of lamp, "
+            "response, colours, turned; commas between",
+        ),
+    ] = None,
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
@@ -105,6 +113,7 @@ def calibrate(
         BenchTruth(rays_per_view=rays),
         map_stage=stage,
         most_frames=frames,
+        leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
     if check is not None:
         from rich.console import Console

@@ -35,6 +35,12 @@ def capture(
     rays: Annotated[
         int | None, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
     ] = None,
+    flaws: Annotated[
+        str | None,
+        typer.Option(
+            "--flaws", help="what is wrong with the simulated rig, as tilt,lamp,crosstalk; together"
+        ),
+    ] = None,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
     ] = False,
@@ -64,10 +70,14 @@ def capture(
     if plan is None:
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
     from emmc_rig.files.results import parse_psnr, parse_size
+    from emmc_rig.model.settings import validated
     from emmc_rig.rig.rig_config import ImagedRig
 
-    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
-    imaged = ImagedRig(scene=scene, size=parse_size(size), seed=seed, real_time=real_time, **traced)
+    given: dict[str, Any] = {} if rays is None else {"rays": rays}
+    if flaws is not None:
+        given["flaws"] = flaws.split(",")
+    settings = {"scene": scene, "size": parse_size(size), "seed": seed, "real_time": real_time}
+    imaged = validated(ImagedRig, settings | given, "the simulated rig", AppError)
     until_db = None if until is None else parse_psnr(until, "--until")
     _run(plan, rig, imaged, until_db, dry_run, out)
 

@@ -53,6 +53,8 @@ HEADINGS = {
     "whiteboard": "Whiteboards: the pinhole before each view",
     "open": "Open whiteboards: masks in, whole aperture",
     "held-out": "Held out: open whiteboards that judge the calibration",
+    "check": "Checks: whiteboards seen again, for lamp and response",
+    "turned": "The white board turned by 90 degrees",
     "shot": "Shots of the scene",
 }
 

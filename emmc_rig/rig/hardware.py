@@ -61,6 +61,7 @@ from emmc_rig.rig.trigger import SimulatedTrigger, Trigger
 from simulators.apt import AptController
 from simulators.bench import RAYS_PER_VIEW, Bench
 from simulators.clock import ManualClock
+from simulators.effects import Flaws
 from simulators.firmware import SimulatedController
 from simulators.grbl import GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
@@ -81,6 +82,8 @@ MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
 SIMULATED = "simulated"
 PROBE_TIMEOUT_S = 0.2
+NO_FLAWS = Flaws()
+"""But for a mask that sits a few um off, as every one does."""
 SIMULATED_SCALES = {
     "zaber": f",microstep_um={AxisSpec().microstep_um}",
     "grbl": "",
@@ -96,8 +99,8 @@ class Attendant(Protocol):
         """Light the scene or the board: off, white, red, green or blue."""
         ...
 
-    def place(self, target: str) -> None:
-        """Put the "scene" or the "whiteboard" before the camera."""
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Put the "scene" or the "whiteboard" before the camera; the board turned in its plane."""
         ...
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
@@ -152,9 +155,9 @@ class SimulatedAttendant:
         """Switch the bench's lamp."""
         self._bench.lamp = colour
 
-    def place(self, target: str) -> None:
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
         """Change what the camera looks at."""
-        self._bench.target = target
+        self._bench.target, self._bench.board_turn_deg = target, turn_deg
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
         """Change what is in the beam."""
@@ -170,6 +173,7 @@ def simulated_rig(
     clock: Clock | None = None,
     rays_per_view: int = RAYS_PER_VIEW,
     trigger: SimulatedTrigger | None = None,
+    flaws: Flaws = NO_FLAWS,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
@@ -177,8 +181,8 @@ def simulated_rig(
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
     pixel; few are quick, and grainy beside a good sensor's noise. trigger: the stage's arrival
-    begins the exposures of a USB3 Vision camera. Raises AppError for a size that the camera's RAW
-    files cannot hold.
+    begins the exposures of a USB3 Vision camera. flaws: what is wrong with it. Raises AppError for
+    a size that the camera's RAW files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -207,7 +211,19 @@ def simulated_rig(
     window_um = 2 * aperture_um
     rng = np.random.default_rng(seed)
     bench = Bench(
-        camera, fine_scene, size, positions_um, window_um, rng, rays_per_view=rays_per_view
+        camera,
+        fine_scene,
+        size,
+        positions_um,
+        window_um,
+        rng,
+        flaws.mounting,
+        rays_per_view,
+        flaws.optics,
+        flaws.sensor,
+        flaws.board,
+        flaws.lamp,
+        clock.now_s,
     )
     stage = ZaberStage(
         chain.transport(),

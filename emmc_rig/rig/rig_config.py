@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from drivers.clock import SYSTEM_CLOCK
 from emmc_rig.errors import AppError
@@ -16,9 +16,10 @@ from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
-from emmc_rig.rig.hardware import Rig, open_camera, open_stage, simulated_rig
+from emmc_rig.rig.hardware import NO_FLAWS, Rig, open_camera, open_stage, simulated_rig
 from emmc_rig.rig.trigger import SimulatedTrigger, Trigger, check_trigger
 from simulators.bench import RAYS_PER_VIEW
+from simulators.effects import EFFECTS, TOGETHER, flawed
 
 SIMULATED = "simulated"
 Ask = Callable[[str], None]
@@ -54,7 +55,8 @@ class ImagedRig(Settings):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
     rays: per view and pixel; calibration to a per cent needs 1024 or more. trigger: the line from
-    its stage to its camera, which it has not by default.
+    its stage to its camera, which it has not by default. flaws: what is wrong with it, by the names
+    of `simulators.effects`.
     """
 
     scene: str
@@ -63,6 +65,16 @@ class ImagedRig(Settings):
     real_time: bool = False
     rays: int = Field(default=RAYS_PER_VIEW, ge=16)
     trigger: SimulatedTrigger | None = None
+    flaws: tuple[str, ...] = ()
+
+    @field_validator("flaws")
+    @classmethod
+    def _known(cls, flaws: tuple[str, ...]) -> tuple[str, ...]:
+        known = (*EFFECTS, TOGETHER)
+        for name in flaws:
+            if name not in known:
+                raise ValueError(f"{name!r} is no flaw of the bench: use {', '.join(known)}")
+        return flaws
 
 
 class AskingAttendant:
@@ -77,9 +89,10 @@ class AskingAttendant:
         off = "switch the lamp off"
         self._want("lamp", off if colour == "off" else f"switch the {colour} lamp on")
 
-    def place(self, target: str) -> None:
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
         """Ask for the scene or the board."""
-        self._want("target", f"put the {target} before the camera")
+        turned = f", turned by {turn_deg:g} degrees in its plane" if turn_deg else ""
+        self._want("target", f"put the {target} before the camera{turned}")
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
         """Ask for masks and filter."""
@@ -103,7 +116,7 @@ class NoAttendant:
     def set_lamp(self, colour: str) -> None:
         """Leave the lamp as it is."""
 
-    def place(self, target: str) -> None:
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
         """Leave the board or scene where it is."""
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
@@ -162,19 +175,23 @@ def rig(
     seed: int = 0,
     rays: int | None = None,
     real_time: bool = False,
+    flaws: tuple[str, ...] = (),
 ) -> RigChoice:
     """Return a rig: "simulated", or the YAML file that names real devices.
 
     The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
     of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
-    cent needs 1024. real_time: moves and exposures take their time. Raises AppError.
+    cent needs 1024. real_time: moves and exposures take their time. flaws: what is wrong with it,
+    by the names of `simulators.effects`. Raises AppError.
 
     >>> import emmc_rig as emmc
     >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
     'simulated'
     """
     traced: dict[str, Any] = {} if rays is None else {"rays": rays}
-    imaged = ImagedRig(scene=scene, size=size, seed=seed, real_time=real_time, **traced)
+    imaged = ImagedRig(
+        scene=scene, size=size, seed=seed, real_time=real_time, flaws=flaws, **traced
+    )
     return RigChoice(name, rig_description(name, imaged))
 
 
@@ -206,6 +223,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             clock,
             imaged.rays,
             imaged.trigger,
+            flawed(NO_FLAWS, imaged.flaws),
         )
         if imaged.trigger is not None:
             check_trigger(imaged.trigger, rig.stage, rig.camera)

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Kind = Literal["dark", "metering", "reference", "whiteboard", "open", "held-out", "shot"]
+Kind = Literal[
+    "dark", "metering", "reference", "whiteboard", "open", "held-out", "check", "turned", "shot"
+]
 KINDS: tuple[Kind, ...] = (
     "dark",
     "metering",
@@ -14,6 +16,8 @@ KINDS: tuple[Kind, ...] = (
     "whiteboard",
     "open",
     "held-out",
+    "check",
+    "turned",
     "shot",
 )
 
@@ -24,7 +28,7 @@ class Bench:
 
     target: what is before the camera. fitting: the first shot with the same masks and filter;
     masks_in: whether these masks are in the beam. offsets_um: stage axes by name, from where each
-    is centred; an axis not named stays.
+    is centred; an axis not named stays. board_turn_deg: how the white board is turned in its plane.
     """
 
     target: Literal["scene", "whiteboard"]
@@ -33,11 +37,12 @@ class Bench:
     fitting: int
     masks_in: bool
     offsets_um: Mapping[str, float] = field(default_factory=dict)
+    board_turn_deg: float = 0.0
 
     @property
-    def set_by_hand(self) -> tuple[str, int, bool]:
+    def set_by_hand(self) -> tuple[str, int, bool, float]:
         """What somebody has to do at the bench: the same for frames that need no hand between."""
-        return self.target, self.fitting, self.masks_in
+        return self.target, self.fitting, self.masks_in, self.board_turn_deg
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,8 @@ class PlannedFrame:
 
     exposure_s: None where it is metered: then `light` times less light than in the metering
     frame `metered_by` comes to the sensor. view: (v, u) of a whiteboard's pinhole. Frames of one
-    shot that differ in exposure alone are its bracket; `repeat` counts equal ones.
+    shot that differ in exposure alone are its bracket; `repeat` counts equal ones. part: frames
+    of one come before those of the next, in whatever order else.
     """
 
     id: str
@@ -58,6 +64,7 @@ class PlannedFrame:
     view: tuple[int, int] | None = None
     metered_by: str | None = None
     light: float = 1.0
+    part: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, for JSON."""
@@ -71,12 +78,14 @@ class PlannedFrame:
             "fitting": bench.fitting,
             "masks_in": bench.masks_in,
             "offsets_um": dict(bench.offsets_um),
+            "board_turn_deg": bench.board_turn_deg,
             "exposure_s": self.exposure_s,
             "gain": self.gain,
             "repeat": self.repeat,
             "view": None if self.view is None else list(self.view),
             "metered_by": self.metered_by,
             "light": self.light,
+            "part": self.part,
         }
 
     @classmethod
@@ -89,6 +98,8 @@ class PlannedFrame:
             data["fitting"],
             data["masks_in"],
             data["offsets_um"],
+            # Sessions of version 0.2 do not have it.
+            data.get("board_turn_deg", 0.0),
         )
         view = data["view"]
         return cls(
@@ -101,4 +112,5 @@ class PlannedFrame:
             None if view is None else (view[0], view[1]),
             data["metered_by"],
             data["light"],
+            data.get("part", 0),
         )

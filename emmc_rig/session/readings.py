@@ -6,15 +6,16 @@ Frames are decoded one at a time and averaged or fused as they come.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import BoardFrame, BoardSet
+from calibration.boards import BoardFrame, BoardSet, channels_of
 from calibration.bracket import LinearFrame, fuse
-from calibration.frames import MeanFrame, SensorGain, average
+from calibration.frames import MeanFrame, SensorGain, average, before_and_after
+from calibration.levels import Check, check_of
 from calibration.routes import Outcome, calibrate
 from calibration.whiteboard import Calibration, Whiteboards, measure_psi
 from drivers.raw import RawFrame
@@ -23,6 +24,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -96,35 +98,71 @@ def whiteboards(session: Session) -> Whiteboards:
     )
 
 
-def board_sets(session: Session) -> tuple[BoardSet | None, BoardSet | None, BoardSet | None]:
-    """Return the whiteboards for the parametric fit, for the free route, and those held out.
+@dataclass(frozen=True, eq=False)
+class SessionBoards:
+    """A session's whiteboards by what takes them; None where the plan has no such frames.
 
-    None where the plan has no such frames. For the fit they are those of the open aperture, and
-    those through the pinhole as well.
+    fit: for the parametric routes, those of the open aperture, and those through the pinhole as
+    well. pinholes: for the free route. held_out: seen by no fit. turned: by the degrees that the
+    board was turned.
     """
+
+    fit: BoardSet | None
+    pinholes: BoardSet | None
+    held_out: BoardSet | None
+    turned: Mapping[float, BoardSet]
+
+
+def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
+    """Return a session's whiteboards; channels: (y, x), the colour each pixel sees (3: all)."""
     groups: dict[tuple[str, str], list[PlannedFrame]] = defaultdict(list)
     for frame in session.frames:
-        if frame.kind in ("open", "held-out", "whiteboard"):
+        if frame.kind in ("open", "held-out", "whiteboard", "turned"):
             groups[frame.kind, frame.id.rpartition("-r")[0]].append(frame)
     if not groups:
         raise AppError(f"{session.folder}: its plan has no whiteboards")
     found: dict[str, list[BoardFrame]] = defaultdict(list)
+    turned: dict[float, dict[bool, MeanFrame]] = defaultdict(dict)
     for (kind, _), frames in groups.items():
         bench = frames[0].bench
+        mean = _mean(session, frames)
+        if kind == "turned":
+            turned[bench.board_turn_deg][bench.masks_in] = mean
+            continue
         stage_um = bench.offsets_um.get("mask_x", 0.0), bench.offsets_um.get("mask_y", 0.0)
-        board = BoardFrame(_mean(session, frames), stage_um, bench.shot, frames[0].view, bench.lamp)
-        found[kind].append(board)
+        found[kind].append(BoardFrame(mean, stage_um, bench.shot, frames[0].view, bench.lamp))
     references = {key: _mean(session, frames) for key, frames in _references(session).items()}
-    darks = tuple(
-        _mean(session, [frame for frame in _darks(session) if frame.exposure_s == exposure_s])
-        for exposure_s in sorted({frame.exposure_s or 0.0 for frame in _darks(session)})
-    )
+    # The white lamp's first: the sensor's gain is told by it.
+    references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
+    darks = _board_darks(session)
+    every = BoardSet(darks, references, ())
+    checks = tuple(_checks(session, every, channels))
     few = [*found["open"], *(found["whiteboard"] if found["open"] else ())]
     fit, free, held_out = (
-        BoardSet(darks, references, tuple(frames)) if frames else None
+        replace(every, frames=tuple(frames), checks=checks) if frames else None
         for frames in (few, found["whiteboard"], found["held-out"])
     )
-    return fit, free, held_out
+    own_um = next((one.stage_um for one in found["open"]), (0.0, 0.0))
+    boards = {
+        turn_deg: BoardSet(darks, {(0, "white"): by[False]}, (BoardFrame(by[True], own_um),))
+        for turn_deg, by in turned.items()
+    }
+    return SessionBoards(fit, free, held_out, boards)
+
+
+def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> Iterator[Check]:
+    """Yield every look at a whiteboard that was seen before, single frames each.
+
+    Nothing where none was planned: references alone tell no drift.
+    """
+    checks = [frame for frame in session.frames if frame.kind == "check"]
+    if not checks:
+        return
+    first = [f for f in _references(session).get((0, "white"), ()) if f.id in session.stored]
+    for frame in [*first, *checks]:
+        mean = _mean(session, [frame])
+        board = "masks in" if frame.bench.masks_in else "without masks"
+        yield check_of(board, mean, boards.dark_at(mean.exposure_s).mean_dn, channels)
 
 
 def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
@@ -135,11 +173,22 @@ def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
     return found
 
 
+def _board_darks(session: Session) -> tuple[MeanFrame, ...]:
+    """Return the darks of each exposure; those taken before and after the whiteboards as one."""
+    groups: dict[tuple[float, int], list[PlannedFrame]] = defaultdict(list)
+    for frame in _darks(session):
+        groups[_exposure_s(session, frame), frame.part].append(frame)
+    found: dict[float, MeanFrame] = {}
+    for (exposure_s, _), frames in sorted(groups.items()):
+        mean = _mean(session, frames)
+        earlier = found.get(exposure_s)
+        found[exposure_s] = mean if earlier is None else before_and_after(earlier, mean)
+    return tuple(found.values())
+
+
 def mean_dark(session: Session) -> MeanFrame:
     """Return the average of the dark frames of the shortest exposure; raises AppError."""
-    darks = _darks(session)
-    shortest_s = min(frame.exposure_s or 0.0 for frame in darks)
-    return _mean(session, [frame for frame in darks if frame.exposure_s == shortest_s])
+    return min(_board_darks(session), key=lambda frame: frame.exposure_s)
 
 
 def _darks(session: Session) -> list[PlannedFrame]:
@@ -147,6 +196,31 @@ def _darks(session: Session) -> list[PlannedFrame]:
     if not darks:
         raise AppError(f"{session.folder}: its plan has no darks")
     return darks
+
+
+def _exposure_s(session: Session, frame: PlannedFrame) -> float:
+    """Return how long a frame was exposed; raises AppError where it was not captured yet."""
+    entry = session.stored.get(frame.id)
+    if entry is None:
+        raise AppError(f"{session.folder}: frame {frame.id} was not captured yet; resume it")
+    return float(entry["exposure_s"])
+
+
+def _taken_s(session: Session, entry: Entry) -> float:
+    """Return when a frame was taken, in seconds of the session.
+
+    The clock of a run may begin anew with it: then the run follows the one before.
+    """
+    times: dict[int, list[float]] = defaultdict(list)
+    for one in session.stored.values():
+        times[one.get("run", 0)].append(one.get("host_time_s") or 0.0)
+    offset = latest = 0.0
+    for run in sorted(times):
+        offset = max(0.0, latest - min(times[run])) if run != min(times) else 0.0
+        latest = max(times[run]) + offset
+        if run == entry.get("run", 0):
+            break
+    return (entry.get("host_time_s") or 0.0) + offset
 
 
 def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
@@ -163,7 +237,8 @@ def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
     ]
     lit = frames[0].kind != "dark"
     mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
-    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id, lit=lit)
+    taken_s = float(np.mean([_taken_s(session, entry) for entry in entries]))
+    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id, taken_s, lit)
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
@@ -228,8 +303,10 @@ def session_outcome(
 
     Raises AppError where the session has not what a route needs, or CalibrationError.
     """
-    few, pinholes, held_out = board_sets(session)
     camera = camera_of(session)
+    design = designed_psi(session, mean_dark(session))
+    boards = board_sets(session, channels_of(design.layout))
+    few, pinholes, held_out = boards.fit, boards.pinholes, boards.held_out
     if routes is None:
         routes = ("parametric", "mixed") if few is not None else ("free",)
         if few is not None and _opens_every_view(camera, pinholes):
@@ -249,8 +326,16 @@ def session_outcome(
             "needs; `emmc-rig calibrate --plan` writes a plan that has"
         )
     assert held_out is not None
-    design = designed_psi(session, held_out.dark)
-    return calibrate(camera, design, routes, held_out, few, pinholes, on_stage=on_stage)
+    return calibrate(
+        camera,
+        design,
+        routes,
+        held_out,
+        few,
+        pinholes,
+        on_stage=on_stage,
+        turned=boards.turned,
+    )
 
 
 def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:

@@ -108,7 +108,7 @@ def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> P
     settings = CalibrateSettings(camera_name, several, size)
     mask = shadow_mask(several, size)
     light = plan_light(WhiteboardBench(several, size, settings.truth), mask)
-    plan = capture_plan(settings, parametric_plan(several, mask, light, settings.target), light)
+    plan = capture_plan(settings, parametric_plan(several, mask, light, settings.target))
     exposure_s = (float(camera.exposures_s()[0]),)
     shots = tuple(PlannedShot(exposure_s=exposure_s) for _ in several.shots)
     return plan.model_copy(update={"shots": shots})

@@ -87,7 +87,7 @@ class _Idle:
     def set_lamp(self, colour: str) -> None:
         pass
 
-    def place(self, target: str) -> None:
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
         pass
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:

@@ -24,7 +24,7 @@ from calibration.planning import REFERENCE_FRAMES
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import measure_psi
 from emmc_rig.calibrate.bench import (
-    HARSH_SENSOR,
+    ORDINARY_BENCH,
     Setting,
     WhiteboardBench,
 )
@@ -184,7 +184,9 @@ def check_plan(settings: CalibrateSettings) -> tuple[list[Row], dict]:
             )
         )
     bench = WhiteboardBench(
-        camera, settings.size, replace(settings.truth, sensor=replace(HARSH_SENSOR, bad_share=0.0))
+        camera,
+        settings.size,
+        replace(settings.truth, sensor=replace(ORDINARY_BENCH.sensor, bad_share=0.0)),
     )
     one_shot = build_imaging_matrix(camera, settings.size)
     for repeats in (1, 4):
