@@ -37,7 +37,7 @@ LEAST_DRIFT = 5e-4
 class Check:
     """One look at a board that is seen several times.
 
-    board: which one. above_dn: mean above the dark by the colour pixels see (3: all), NaN where
+    board: which one; masks_in: seen through the masks. above_dn: mean above the dark by the colour pixels see (3: all), NaN where
     there are none. deviation: relative, of that mean.
     """
 
@@ -46,6 +46,7 @@ class Check:
     exposure_s: float
     above_dn: tuple[float, ...]
     deviation: float
+    masks_in: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +101,18 @@ class Levels:
         return replace(frame, mean_dn=mean, extra_variance_dn2=extra)
 
 
-def check_of(board: str, frame: MeanFrame, dark_dn: Array, channels: NDArray[np.uint8]) -> Check:
-    """Return the check that a frame is; dark_dn, channels: (y, x), as `Levels.corrected`'s."""
+def check_of(
+    frame: MeanFrame,
+    masks_in: bool,
+    dark_dn: Array,
+    channels: NDArray[np.uint8],
+    turn_deg: float = 0,
+) -> Check:
+    """Return the check that a frame of the open aperture is.
+
+    dark_dn, channels: (y, x), as `Levels.corrected`'s. turn_deg: of the white board.
+    """
+    board = f"{'masks in' if masks_in else 'without masks'}, turned by {turn_deg:g}"
     above = (frame.mean_dn - dark_dn).astype(np.float64)
     means = tuple(
         # Hot pixels saturate, and would bend the mean.
@@ -111,7 +122,7 @@ def check_of(board: str, frame: MeanFrame, dark_dn: Array, channels: NDArray[np.
     level = max(float(above.mean()), 1e-9)
     # Shot noise at a gain of one is what there is at most.
     deviation = np.sqrt(CHANNELS / above.size / frame.count / level)
-    return Check(board, frame.taken_s, frame.exposure_s, means, float(deviation))
+    return Check(board, frame.taken_s, frame.exposure_s, means, float(deviation), masks_in)
 
 
 def fit_levels(checks: Sequence[Check]) -> Levels | None:

@@ -24,14 +24,14 @@ from calibration.colours import crosstalk, in_three_colours, mixing, other_colou
 from calibration.combine import combined
 from calibration.defects import Defects, find_defects
 from calibration.errors import CalibrationError
-from calibration.findings import angle_findings, level_findings, mask_findings
+from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
 from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
-from calibration.levels import fit_levels
+from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, measured_misfit
 from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
 from calibration.placement import Tolerances
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
-from calibration.whiteboard import Calibration, lamps_needed, measure_psi
+from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -69,7 +69,8 @@ class Outcome:
     """Psi by every route asked for, how each does on held-out whiteboards, and the choice.
 
     frames: exposures that each route used. findings: what is wrong with the bench and was taken
-    into account. advice: what to measure again.
+    into account. advice: what to measure again. unwatched: what no whiteboard was there to tell,
+    and what that may cost.
     """
 
     chosen: str
@@ -82,6 +83,7 @@ class Outcome:
     good: NDArray[np.bool_]
     advice: tuple[str, ...]
     findings: tuple[str, ...] = ()
+    unwatched: tuple[str, ...] = ()
 
     @property
     def calibration(self) -> Calibration:
@@ -217,7 +219,24 @@ def calibrate(
         good,
         tuple(advice),
         tuple(findings),
+        tuple(unwatched(_missing(sets, levels, design, bool(turned)))),
     )
+
+
+def _missing(
+    sets: Sequence[BoardSet], levels: Levels | None, design: ImagingMatrix, turned: bool
+) -> list[str]:
+    """Return what was not watched, by the names of `findings.UNWATCHED`."""
+    lamps = {lamp for one in sets for _, lamp in one.references}
+    coloured = design.colour is None or design.binning > 1 or lamps >= set(LAMP_COLOURS)
+    seen_again = any(check.masks_in for one in sets for check in one.checks)
+    watched = {
+        "lamp": seen_again,
+        "response": levels is not None and levels.bend_known,
+        "colours": coloured,
+        "turned": turned,
+    }
+    return [name for name, known in watched.items() if not known]
 
 
 def refuse_without_mask(board: Board) -> None:

@@ -27,6 +27,7 @@ Array = NDArray[np.floating]
 Frames = NDArray[np.floating] | NDArray[np.integer]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
+LARGEST_DARK_SHARE = 0.01
 IDEAL_DN = 1e6
 Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
@@ -204,14 +205,19 @@ def _signal(
 def _bright(
     boards: Whiteboards, gain: SensorGain, frame: MeanFrame | None, what: str
 ) -> tuple[Array, Array]:
-    """Return `_signal` of a reference whiteboard; refuses one too dark to divide by."""
+    """Return `_signal` of a reference whiteboard; refuses one too dark to divide by.
+
+    A few hot or dead pixels, which no route uses, are taken as just bright enough.
+    """
     signal, variance = _signal(boards, gain, frame, f"{what}, open aperture without masks")
-    if frame is not None and float(signal.min()) * frame.exposure_s < DARKEST_REFERENCE_DN:
+    assert frame is not None
+    darkest = DARKEST_REFERENCE_DN / frame.exposure_s
+    if np.mean(signal < darkest) > LARGEST_DARK_SHARE:
         raise CalibrationError(
             f"the reference whiteboard ({what}) has pixels less than {DARKEST_REFERENCE_DN:g} DN "
             "above the dark: raise the lamp or the exposure"
         )
-    return signal, variance
+    return np.maximum(signal, darkest), variance
 
 
 def _samples(pixels: Array, binning: int) -> Array:

@@ -2,17 +2,22 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 import yaml
 from programs import exit_code
 
+from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
 from emmc_rig.capture.plan import load_plan
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.rig.hardware import NO_FLAWS
 from emmc_rig.session.readings import camera_of, session_readings
 from emmc_rig.session.session import Session
 from simulators.bench import MountingErrors
+from simulators.effects import flawed
 
 SIZE = (32, 48)
 RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "32x48", "--rays", "1024")
@@ -87,3 +92,44 @@ def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path
         path.write_text(yaml.safe_dump(plan))
         assert exit_code("capture", path, *RIG, "--out", tmp_path / "out") == 1
         assert line in capsys.readouterr().err.replace("\n", " ")
+
+
+EFFECTS = "lamp,response,crosstalk,board,dark"
+
+
+def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, capsys):
+    """Error of Psi against the coefficients that the bench's own rays integrate to."""
+    plan, session, out = (tmp_path / name for name in ("plan", "session", "calibration"))
+    assert exit_code("calibrate", "--plan", "--size", "32x48", "--out", plan) == 0
+    taken = ("capture", plan / "plan.yaml", *RIG, "--flaws", EFFECTS, "--out", session)
+    assert exit_code(*taken) == 0
+    assert exit_code("calibrate", session, "--out", out) == 0
+    told = capsys.readouterr().out
+    for named in ("lamp drifted", "response loses", "colour filters", "white board is uneven"):
+        assert f"found: the {named}" in told.replace("the sensor's", "the")
+    assert "not measured" not in told
+    flaws = flawed(NO_FLAWS, EFFECTS.split(","))
+    truth = BenchTruth(flaws.mounting, flaws.optics, flaws.sensor, flaws.board, flaws.lamp, 1024)
+    true = WhiteboardBench(find_camera("rgbw-bayer-1shot"), SIZE, truth).true_psi()
+    psi = ImagingMatrix.load(out / "psi.h5")
+    with h5py.File(out / "calibration.h5") as stored:
+        deviation, good = stored["deviation"][()], stored["good"][()]
+    off = np.where(good[:, None, :], psi.weights - true, 0)
+    stated = np.linalg.norm(deviation) / np.linalg.norm(true)
+    assert np.linalg.norm(off) / np.linalg.norm(true) < min(1.25 * stated, 0.01)
+
+
+def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, capsys):
+    plan, out = tmp_path / "plan", tmp_path / "session"
+    without = ("--leave-out", "lamp,response,colours,turned")
+    assert exit_code("calibrate", "--plan", "--size", "32x48", *without, "--out", plan) == 0
+    whiteboards = load_plan(plan / "plan.yaml").whiteboards
+    assert whiteboards is not None
+    assert not (whiteboards.lamp_checks or whiteboards.response or whiteboards.colours)
+    rig = (*RIG[:-1], "64")
+    assert exit_code("capture", plan / "plan.yaml", *rig, "--out", out) == 0
+    capsys.readouterr()
+    assert exit_code("calibrate", out, "--route", "mixed") == 0
+    assert capsys.readouterr().out.count("not measured") == 4
+    assert exit_code("calibrate", "--plan", "--leave-out", "hue", "--out", tmp_path / "x") == 1
+    assert "colours" in capsys.readouterr().err

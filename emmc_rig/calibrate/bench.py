@@ -202,9 +202,9 @@ class WhiteboardBench:
 
         turn = settings[0].board_turn_deg
 
-        def seen_again(board: str, frame: MeanFrame) -> None:
+        def seen_again(masks_in: bool, frame: MeanFrame) -> None:
             dark = darks[frame.exposure_s].mean_dn
-            checks.append(check_of(f"{board}, {turn:g}", frame, dark, self._channels))
+            checks.append(check_of(frame, masks_in, dark, self._channels, turn))
 
         references = self._references(settings, board_s, on_frame, "colours" not in leave_out)
         watched = "lamp" not in leave_out
@@ -212,12 +212,12 @@ class WhiteboardBench:
         plain = Setting(lamp=lamp, board_turn_deg=turn)
         for exposure_s in series * ("response" not in leave_out) + [board_s] * watched:
             frame = self._frames(plain, exposure_s, False, 2, "response")
-            seen_again("without masks", frame)
+            seen_again(False, frame)
         frames = []
         again = Setting(lamp=lamp, repeats=1, board_turn_deg=turn)
         for place, setting in enumerate(settings):
             if watched and place % CHECK_EVERY == 0:
-                seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
+                seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
             exposure_s = board_s if setting.pinhole is None else board_s * views
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
             frame = self._frames(setting, exposure_s, True, setting.repeats, label)
@@ -225,8 +225,8 @@ class WhiteboardBench:
             sent = self.sent_um(setting)
             frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
         if watched:
-            seen_again("masks in", self._frames(again, board_s, True, 1, "the lamp's level"))
-            seen_again("without masks", self._frames(plain, board_s, False, 2, "reference"))
+            seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
+            seen_again(False, self._frames(plain, board_s, False, 2, "reference"))
         both = tuple(before_and_after(dark, self._dark(t)) for t, dark in darks.items())
         return BoardSet(both, references, tuple(frames), tuple(checks))
 

@@ -26,6 +26,7 @@ def outcome_figures(outcome: Outcome) -> dict:
         "why": outcome.why,
         "findings": list(outcome.findings),
         "advice": list(outcome.advice),
+        "unwatched": list(outcome.unwatched),
         "held_out": {
             name: {
                 "chi2": one.chi2,

@@ -152,11 +152,17 @@ def calibrate(
         f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
         f"(the design is off by {metrics['design_relative_error']:.0%})"
     )
+    _tell_findings(metrics)
+    typer.echo(f"open {out / 'report.html'}")
+
+
+def _tell_findings(metrics: dict) -> None:
     for line in metrics["findings"]:
         typer.echo(f"found: {line}")
+    for line in metrics["unwatched"]:
+        typer.echo(line)
     for line in metrics["advice"]:
         typer.echo(f"measure again: {line}")
-    typer.echo(f"open {out / 'report.html'}")
 
 
 def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
@@ -177,10 +183,7 @@ def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
-    for line in metrics["findings"]:
-        typer.echo(f"found: {line}")
-    for line in metrics["advice"]:
-        typer.echo(f"measure again: {line}")
+    _tell_findings(metrics)
     typer.echo(f"open {out / 'report.html'}")
 
 

@@ -62,7 +62,8 @@ def write_calibration_report(
     """
     sections = [
         Section("choice", "Chosen", _choice(outcome, metrics)),
-        *_found(outcome.findings),
+        *_listed("found", "Found and taken into account", outcome.findings),
+        *_listed("unwatched", "Not measured", outcome.unwatched),
         Section("redo", "What to measure again", fragment("advice.html", lines=outcome.advice)),
     ]
     best = outcome.mixed or outcome.parametric
@@ -118,12 +119,9 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
     return fragment("calibration_choice.html", cards=cards, rows=rows, chosen=chosen)
 
 
-def _found(findings: Sequence[str]) -> list[Section]:
-    """Return the section of what was wrong with the bench and taken into account, if anything."""
-    if not findings:
-        return []
-    body = fragment("advice.html", lines=findings)
-    return [Section("found", "Found and taken into account", body)]
+def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
+    """Return the section of some lines; none without any."""
+    return [Section(name, title, fragment("advice.html", lines=lines))] if lines else []
 
 
 def _kinds(judged: HeldOut) -> str:

@@ -161,8 +161,8 @@ def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> 
     first = [f for f in _references(session).get((0, "white"), ()) if f.id in session.stored]
     for frame in [*first, *checks]:
         mean = _mean(session, [frame])
-        board = "masks in" if frame.bench.masks_in else "without masks"
-        yield check_of(board, mean, boards.dark_at(mean.exposure_s).mean_dn, channels)
+        dark_dn = boards.dark_at(mean.exposure_s).mean_dn
+        yield check_of(mean, frame.bench.masks_in, dark_dn, channels)
 
 
 def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:

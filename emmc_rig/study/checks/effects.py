@@ -42,6 +42,7 @@ KEPT = (
     "why",
     "findings",
     "advice",
+    "unwatched",
     "held_out",
     "psi_relative_error",
     "psi_stated_error",
