@@ -37,8 +37,8 @@ LEAST_DRIFT = 5e-4
 class Check:
     """One look at a board that is seen several times.
 
-    board: which one; masks_in: seen through the masks. above_dn: mean above the dark by the colour pixels see (3: all), NaN where
-    there are none. deviation: relative, of that mean.
+    board: which one; masks_in: seen through the masks. above_dn: mean above the dark by the colour
+    pixels see (3: all), NaN where there are none. deviation: relative, of that mean.
     """
 
     board: str
