@@ -1,43 +1,68 @@
-"""Reconstruct in tiles that overlap, so that any capture fits into memory.
+"""Reconstruct in blocks of one canonical grid, so that any capture fits into memory.
 
-What a method would choose from its frames (mu, rho, the primal step, the number of steps) is
-chosen once from the whole capture. Tiles start at multiples of the patches' stride, so that
-every tile cuts the patches of the whole: sparse patches come out the same in any tiling once
-tiles overlap by a patch. A step of the variational methods carries information by a sample; what
-lies further than the overlap hardly matters, see OVERLAP.
+The grid follows from the size of the light field, the settings and the capture's largest disparity
+alone. Each block is reconstructed by itself, with its halo, from what was settled once for the
+whole capture (`survey`). Neighbouring blocks overlap and are averaged with weights that sum to 1.
+So the result is the same whatever order, process or machine the blocks are reconstructed in.
+
+Up to `BlockSettings.whole` samples a light field is one block: the method itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import hashlib
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from math import lcm
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import ceil, lcm
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.reading import StoredArrays, stored_arrays
-from emmc_rig.model.sensing import FORMAT, ImagingMatrix
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
+from reconstruction.adaptive.edges import SIDES, dark_edges
+from reconstruction.adaptive.method import TINY, AdaptiveSettings
+from reconstruction.adaptive.parsimony import may_be_grey
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.flat import flat_psi
+from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
 from reconstruction.methods.tv_dict import patched_weights
-from reconstruction.result import Reconstruction
+from reconstruction.result import Progress, Reconstruction, Status
+from reconstruction.screening import screened
+from reconstruction.verdict.blocks import JudgedBlock, judged_together
+from reconstruction.verdict.rules import Verdict
+from reconstruction.verdict.run import reconstruct_judged
 
-OVERLAP = 48
-"""Samples beside a tile that are reconstructed and thrown away."""
+REACH = 48
+"""Samples of halo for methods that carry information from sample to sample: steps of the
+variational methods move it by one, and what lies further hardly matters."""
+TEXTURE_REACH = 16
+"""Samples of halo for `adaptive` beyond the parallax: patches, stacks of blocks, windows."""
 STEPS = 100
-"""Of the variational methods, in every tile alike; the rule by change would differ from tile to
-tile."""
-SAMPLED = 256
-"""Rows and columns of the window from which contrast and brightness are judged."""
+"""Of the variational methods, in every block alike; the rule by change would differ between
+blocks."""
+SAMPLE, SAMPLES = 96, 3
+"""Rows and columns of a sample window of the survey, and windows along each axis."""
+SURE_PX, COVERED = 0.25, 99.0
+"""Deviation of disparities below which they count for the halo, and percent of them that it covers:
+what lies further is seen by fewer readings of a block beside it, and averaged with that block's."""
+PLANAR_PX, ALIKE_PX = 1e-3, 0.06
+"""By how much a window's disparities may leave a plane that was taken for all of them; and windows
+the plane of all, half a step of the search."""
+EDGE_PX = 48
+"""Pixels beside a side of the light field in which a dark edge is looked for."""
 
 Array = NDArray[np.floating]
+Place = tuple[slice, slice]
 
 
 class PsiSource(Protocol):
@@ -69,9 +94,29 @@ class SavedPsi:
         self._path = path
         with self._opened() as stored:
             weights = stored.dataset("weights")
+            self.shape = weights.shape
+            self.views = weights.shape[1], weights.shape[2]
             self.size = weights.shape[3], weights.shape[5]
             self.binning = int(np.asarray(stored.attributes["binning"]))
             self.checksum = str(stored.attributes["sha256"])
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]:
+        """(shot, pixel_y, pixel_x)."""
+        rows, columns = (length // self.binning for length in self.size)
+        return self.shape[0], rows, columns
+
+    def verify(self) -> None:
+        """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
+        with self._opened() as stored:
+            camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
+            digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{camera}".encode())
+            for place in np.ndindex(self.shape[:3]):
+                digest.update(np.ascontiguousarray(weights[place]).view(np.uint8).data)
+            colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
+            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
+        if digest.hexdigest() != self.checksum:
+            raise SensingError(f"{self._path}: damaged (its checksum differs); measure Psi again")
 
     @contextmanager
     def _opened(self) -> Iterator[StoredArrays]:
@@ -88,70 +133,362 @@ class SavedPsi:
                 stored.dataset("weights")[:, :, :, rows, :, columns],
                 None if colour is None else colour[:, rows, columns],
                 self.binning,
+                str(stored.attributes["camera"]),
             )
 
 
 @dataclass(frozen=True)
-class Tile:
-    """outer: rows and columns reconstructed; inner: those kept, in the light field's samples."""
+class Block:
+    """outer: rows and columns reconstructed; part: those that count, with what overlaps the
+    neighbours; inner: those nearer to it than to any other; all in the light field's samples.
 
-    outer: tuple[slice, slice]
-    inner: tuple[slice, slice]
-
-    def kept(self) -> tuple[slice, slice]:
-        """Return the inner part within the outer."""
-        return tuple(
-            slice(i.start - o.start, i.stop - o.start)
-            for i, o in zip(self.inner, self.outer, strict=True)
-        )  # type: ignore[return-value]
-
-
-def tiles(size: tuple[int, int], tile: int, overlap: int, multiple: int) -> Iterator[Tile]:
-    """Yield tiles that cover `size` with inner parts of about `tile` samples a side.
-
-    multiple: of which all inner starts and the overlap are; the last tiles end at the border.
+    sides: those of SIDES at which the light field ends.
     """
-    step = max(tile // multiple, 1) * multiple
-    margin = -(-overlap // multiple) * multiple
-    sides = [
-        [
-            (
-                slice(max(start - margin, 0), min(start + step + margin, whole)),
-                slice(start, min(start + step, whole)),
-            )
-            for start in range(0, whole, step)
+
+    row: int
+    column: int
+    outer: Place
+    part: Place
+    inner: Place
+    sides: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Row and column in the grid, as files are called."""
+        return f"block-{self.row:03d}-{self.column:03d}"
+
+
+def within(one: Place, other: Place) -> Place:
+    """Return rows and columns counted from the first of another place."""
+    rows, columns = (
+        slice(a.start - b.start, a.stop - b.start) for a, b in zip(one, other, strict=True)
+    )
+    return rows, columns
+
+
+def pixels_of(place: Place, binning: int) -> tuple[slice, slice, slice]:
+    """Return the readings of all shots in pixels of k x k samples."""
+    rows, columns = (slice(part.start // binning, part.stop // binning) for part in place)
+    return slice(None), rows, columns
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The canonical grid of blocks of a light field.
+
+    size: its rows and columns. multiple: of which all edges are, in samples. halo: samples beyond a
+    block's part that are reconstructed and thrown away.
+    """
+
+    size: tuple[int, int]
+    multiple: int
+    halo: int
+    settings: BlockSettings
+
+    @property
+    def _blend(self) -> int:
+        return ceil(self.settings.blend / self.multiple) * self.multiple
+
+    @cached_property
+    def edges(self) -> tuple[list[int], list[int]]:
+        """Where inner parts begin along rows and columns, and the end."""
+        if self.size[0] * self.size[1] <= self.settings.whole:
+            return [0, self.size[0]], [0, self.size[1]]
+        along = []
+        for length in self.size:
+            most = max(1, length // (2 * self._blend + 2 * self.multiple))
+            count = min(ceil(length / self.settings.side), most)
+            inner = np.linspace(0, length, count + 1)[1:-1] / self.multiple
+            along.append([0, *(np.rint(inner).astype(int) * self.multiple).tolist(), length])
+        return along[0], along[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of blocks."""
+        return len(self.edges[0]) - 1, len(self.edges[1]) - 1
+
+    def __len__(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+    def __iter__(self) -> Iterator[Block]:
+        for row, column in np.ndindex(self.shape):
+            yield self.block(row, column)
+
+    def block(self, row: int, column: int) -> Block:
+        """Return a block by its row and column in the grid."""
+        halo = ceil(self.halo / self.multiple) * self.multiple
+        sides: list[str] = []
+        places: list[list[slice]] = [[], [], []]
+        for axis, at in enumerate((row, column)):
+            edges, length = self.edges[axis], self.size[axis]
+            first, last = edges[at], edges[at + 1]
+            sides += [SIDES[2 * axis]] if at == 0 else []
+            sides += [SIDES[2 * axis + 1]] if at == len(edges) - 2 else []
+            for place, more in zip(places, (self._blend + halo, self._blend, 0), strict=True):
+                place.append(slice(max(first - more, 0), min(last + more, length)))
+        outer, part, inner = ((rows, columns) for rows, columns in places)
+        return Block(row, column, outer, part, inner, tuple(sides))
+
+    def _weight(self, axis: int, at: int, place: slice) -> NDArray[np.float32]:
+        """Return the weights along an axis of the at-th blocks, in a place."""
+        edges, blend = self.edges[axis], self._blend
+        centre = np.arange(place.start, place.stop, dtype=np.float32) + np.float32(0.5)
+        weight = np.ones_like(centre)
+        if at > 0:
+            weight *= np.clip((centre - (edges[at] - blend)) / (2 * blend), 0, 1)
+        if at < len(edges) - 2:
+            weight *= 1 - np.clip((centre - (edges[at + 1] - blend)) / (2 * blend), 0, 1)
+        return weight.astype(np.float32)
+
+    def overlapping(self, block: Block) -> Iterator[tuple[Block, Place, NDArray[np.float32]]]:
+        """Yield the blocks whose parts reach into a block's inner one, in a fixed order.
+
+        Each with the place they share, in the light field, and its weights there (y, x).
+        """
+        around = [
+            [at + more for more in (-1, 0, 1) if 0 <= at + more < count]
+            for at, count in zip((block.row, block.column), self.shape, strict=True)
         ]
-        for whole in size
-    ]
-    for row_outer, row_inner in sides[0]:
-        for column_outer, column_inner in sides[1]:
-            yield Tile((row_outer, column_outer), (row_inner, column_inner))
+        for row, column in product(*around):
+            other = self.block(row, column)
+            rows, columns = (
+                slice(max(a.start, b.start), min(a.stop, b.stop))
+                for a, b in zip(block.inner, other.part, strict=True)
+            )
+            weight = np.outer(self._weight(0, row, rows), self._weight(1, column, columns))
+            yield other, (rows, columns), weight
+
+
+Parts = Callable[[Block, str, tuple], Array]
+"""Returns what a block's part has of an array by name, at an index into it."""
+
+
+def assembled(grid: Grid, block: Block, name: str, axes: int, parts: Parts) -> Array:
+    """Return an array's inner part of a block, the weighted mean of the parts that overlap there.
+
+    axes: of the array before (y, x). Arrays of whole numbers are those of the block itself.
+    """
+    lead = (slice(None),) * axes
+    own = parts(block, name, (*lead, *within(block.inner, block.part)))
+    if len(grid) == 1 or own.dtype.kind != "f":
+        return own
+    total = np.zeros_like(own)
+    for other, place, weight in grid.overlapping(block):
+        values = parts(other, name, (*lead, *within(place, other.part)))
+        spread = weight.reshape(*weight.shape, *(1,) * (own.ndim - axes - 2))
+        total[(*lead, *within(place, block.inner))] += spread * values
+    return total
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is settled once for the whole capture, so that blocks are functions of it.
+
+    settings: of the methods, with mu, primal step and steps settled. halo: see `Grid`. left_out:
+    shots, gains: of the shots, words: about both. largest_px: disparity, 0 where not searched.
+    """
+
+    settings: MethodSettings
+    halo: int
+    left_out: tuple[int, ...]
+    gains: tuple[float, ...]
+    words: tuple[str, ...]
+    largest_px: float
+
+    @classmethod
+    def of_one_block(cls, settings: MethodSettings, shots: int) -> Survey:
+        """Return what settles nothing: a single block is the whole."""
+        return cls(settings, 0, (), (1.0,) * shots, (), 0.0)
+
+    def applied(self, frames: Array, usable: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+        """Return frames (shot, y, x) of even brightness, and usable without shots left out."""
+        kept = usable.copy()
+        kept[list(self.left_out)] = False
+        gains = np.asarray(self.gains, dtype=frames.dtype)
+        return (frames if (gains == 1).all() else frames / gains[:, None, None]), kept
+
+
+def samples(size: tuple[int, int], multiple: int) -> list[Place]:
+    """Return the places of the sample windows, spread evenly over the light field."""
+    along = []
+    for length in size:
+        side = min(ceil(SAMPLE / multiple) * multiple, length)
+        last = (length - side) // multiple
+        firsts = sorted({round(share * last) for share in np.linspace(0, 1, SAMPLES)})
+        along.append([slice(first * multiple, first * multiple + side) for first in firsts])
+    return [(rows, columns) for rows, columns in product(*along)]
+
+
+def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSettings) -> int:
+    """Return of what blocks' edges are multiples: pixels, and the strides of patches.
+
+    So every block cuts the patches of the whole, and sees colour filters as a whole does.
+    """
+    return lcm(2 * binning, settings.sparse.stride if dictionary is not None else 1)
+
+
+@dataclass(frozen=True)
+class SampleDisparity:
+    """What `adaptive-fast` estimates in a sample window.
+
+    largest_px: the largest disparity it is sure of. corners: (y, x, px) of the one plane that it
+    is, else none. silent: no patch preferred any disparity.
+    """
+
+    largest_px: float
+    corners: tuple[tuple[float, float, float], ...]
+    silent: bool
+
+
+def _sample_disparity(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    settings: MethodSettings,
+    place: Place,
+) -> SampleDisparity:
+    """Return what a window at a place says; its corners are (y, x, px), in pixels of the whole."""
+    found = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable)
+    maps, silent = found.maps, not found.parameters.get("decided")
+    disparity, k = maps["disparity"].astype(np.float64), psi.binning
+    sure = maps["disparity_sigma"] < SURE_PX
+    largest = float(np.percentile(np.abs(disparity[sure]), COVERED)) if sure.any() else 0.0
+    y, x = (part.ravel() / k for part in np.indices(disparity.shape))
+    system = np.stack([np.ones_like(y), y, x], axis=-1)
+    plane, *_ = np.linalg.lstsq(system, disparity.ravel(), rcond=None)
+    if np.abs(system @ plane - disparity.ravel()).max() > PLANAR_PX:
+        return SampleDisparity(largest, (), silent)
+    ends = product((0, psi.size[0] / k), (0, psi.size[1] / k))
+    top, left = (part.start / k for part in place)
+    corners = tuple((top + y, left + x, float(plane @ (1, y, x))) for y, x in ends)
+    return SampleDisparity(largest, corners, silent)
+
+
+def _joint_plane(
+    found: Iterable[SampleDisparity], size: tuple[int, int], binning: int
+) -> tuple[float, float, float] | None:
+    """Return middle, down and right of the plane that all windows lie on, if there is one."""
+    every = [one for one in found if not one.silent]
+    if not every or not all(one.corners for one in every):
+        return None
+    y, x, disparity = np.array([corner for one in every for corner in one.corners]).T
+    middle = [(length / binning - 1) / 2 for length in size]
+    system = np.stack([np.ones_like(y), y - 0.5 - middle[0], x - 0.5 - middle[1]], axis=-1)
+    plane, *_ = np.linalg.lstsq(system, disparity, rcond=None)
+    if np.abs(system @ plane - disparity).max() > ALIKE_PX:
+        return None
+    return tuple(0.0 if not disparity.any() else float(value) for value in plane)  # type: ignore[return-value]
+
+
+def _dark_sides(psi: PsiSource, frames: Array, usable: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return the sides of the whole light field that views do not reach."""
+    k, found = psi.binning, []
+    for number, side in enumerate(SIDES):
+        axis, far = divmod(number, 2)
+        spans = [slice(0, length) for length in psi.size]
+        wide = min(EDGE_PX * k, psi.size[axis])
+        spans[axis] = slice(psi.size[axis] - wide, psi.size[axis]) if far else slice(0, wide)
+        part = psi.window(*spans)
+        seen = pixels_of((spans[0], spans[1]), k)
+        read = np.where(usable[seen], frames[seen], 0).astype(np.float32)
+        if dark_edges(flat_psi(part), read, usable[seen], (side,)) is not None:
+            found.append(side)
+    return tuple(found)
+
+
+def surveyed(
+    name: str,
+    psi: PsiSource,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    dictionary: Dictionary | None = None,
+    settings: MethodSettings | None = None,
+) -> Survey:
+    """Return what is settled from sample windows of a capture, read one at a time.
+
+    frames, usable: (shot, pixel_y, pixel_x).
+    """
+    settings, method, k = settings or MethodSettings(), find_method(name), psi.binning
+    places = samples(psi.size, multiple_of(k, dictionary, settings))
+    windows = [psi.window(*place) for place in places]
+    mosaic = replace(
+        windows[0],
+        weights=np.concatenate([one.weights for one in windows], axis=5),
+        colour=None
+        if windows[0].colour is None
+        else np.concatenate([one.colour for one in windows if one.colour is not None], axis=2),
+    )
+    seen = [pixels_of(place, k) for place in places]
+    use = np.concatenate([usable[one] for one in seen], axis=2)
+    read = np.concatenate([frames[one] for one in seen], axis=2).astype(np.float32)
+    read = np.where(use, read, 0)
+    left_out, gains, words = (), (1.0,) * len(frames), ()
+    if settings.screening and use.any():
+        found = screened(mosaic, read, use)
+        left_out = tuple(sorted((*found.dark, *found.double)))
+        gains = tuple(float(gain) for gain in found.gains)
+        # Single bad pixels are left to the blocks.
+        words = found.told[: len(found.told) - bool(found.bad.any())]
+        read, use = found.frames, found.usable
+    halo, largest = REACH, 0.0
+    if method.settings is AdaptiveSettings:
+        firsts = np.cumsum([0, *(one.frames_shape[2] for one in windows)])
+        disparities = []
+        for place, window, first in zip(places, windows, firsts, strict=False):
+            part = np.s_[:, :, first : first + window.frames_shape[2]]
+            if use[part].any():
+                disparities.append(
+                    _sample_disparity(window, read[part], noise_sigma, use[part], settings, place)
+                )
+        largest = max((one.largest_px for one in disparities), default=0.0)
+        halo = TEXTURE_REACH + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
+        picture = smooth_guess(mosaic, read, use)
+        plane = _joint_plane(disparities, psi.size, k) if settings.adaptive.parsimony else None
+        grey = settings.adaptive.parsimony and may_be_grey(picture)
+        adaptive = settings.adaptive.model_copy(
+            update={
+                "brightness": settings.adaptive.brightness or max(float(picture.mean()), TINY),
+                "parsimony": plane is not None or grey,
+                "plane": plane,
+                "edges": _dark_sides(psi, frames, usable),
+            }
+        )
+        settings = settings.model_copy(update={"adaptive": adaptive})
+    if dictionary is not None:
+        halo = max(halo, *dictionary.patch_shape[2:4])
+    settled = _settled(mosaic, read, noise_sigma, use, settings, name == "tv-dict")
+    return Survey(settled, halo, left_out, gains, words, largest)
+
+
+def _of_block(settings: AdaptiveSettings, block: Block, size: tuple[int, int], k: int) -> dict:
+    """Return what of the settings is a block's own: its dark sides, and its part of the plane."""
+    own: dict[str, object] = {"edges": tuple(s for s in settings.edges if s in block.sides)}
+    if settings.plane is not None:
+        middle, down, right = settings.plane
+        off = [(part.start + part.stop - length) / 2 / k
+               for part, length in zip(block.outer, size, strict=True)]  # fmt: skip
+        own["plane"] = middle + down * off[0] + right * off[1], down, right
+    return own
 
 
 def _settled(
-    psi: PsiSource,
+    psi: ImagingMatrix,
     frames: Array,
     noise_sigma: float,
     usable: NDArray[np.bool_],
     settings: MethodSettings,
     patched: bool,
 ) -> MethodSettings:
-    """Return the settings with all that a tile would choose for itself chosen for all of them."""
-    k = psi.binning
-    middle = [max(0, (whole - SAMPLED) // 2 // k * k) for whole in psi.size]
-    rows, columns = (
-        slice(first, first + min(SAMPLED, whole))
-        for first, whole in zip(middle, psi.size, strict=True)
-    )
-    part = psi.window(rows, columns)
-    seen = np.s_[:, rows.start // k : rows.stop // k, columns.start // k : columns.stop // k]
-    readings = frames[usable]
-    tv = settings.tv
+    """Return the settings with what a block would choose for itself chosen for all of them."""
+    readings, tv = frames[usable], settings.tv
+    if not readings.size:
+        return settings
     if patched:
-        tv = patched_weights(tv, settings.sparse, part, readings, noise_sigma)
-    mu = tv.mu or choose_mu(part, readings, noise_sigma, tv.order)
-    kept = np.where(usable[seen], frames[seen], 0).astype(np.float32)
-    guess = smooth_guess(part, kept, usable[seen])
+        tv = patched_weights(tv, settings.sparse, psi, readings, noise_sigma)
+    mu = tv.mu or choose_mu(psi, readings, noise_sigma, tv.order)
+    guess = smooth_guess(psi, frames, usable)
     step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight, tv.order)
     tv = tv.model_copy(
         update={"mu": mu, "primal_step": step, "rtol": 1e-12, "max_steps": min(STEPS, tv.max_steps)}
@@ -159,60 +496,165 @@ def _settled(
     return settings.model_copy(update={"tv": tv})
 
 
-def reconstruct_in_tiles(
+@dataclass(frozen=True, eq=False)
+class SolvedBlock:
+    """What a block adds: its part's arrays by name, `light_field` among them, and the verdict.
+
+    result: without its arrays. verdict: None where no pixel is usable.
+    """
+
+    arrays: Mapping[str, Array]
+    result: Reconstruction
+    verdict: Verdict | None
+
+
+def solve_block(
+    name: str,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    block: Block,
+    size: tuple[int, int],
+    settings: MethodSettings,
+    dictionary: Dictionary | None = None,
+) -> SolvedBlock:
+    """Return a block's part. psi, frames, usable: of its outer place, after the survey's steps.
+
+    size: of the whole light field. settings: as the survey settled them. A block without usable
+    pixels is black.
+    """
+    if not usable.any():
+        views = psi.light_field_shape[:2]
+        dark = np.zeros((*views, *(part.stop - part.start for part in block.part), 3), np.float32)
+        result = Reconstruction(name, dark, Status.INCOMPLETE, "", 0, (), 0.0, {})
+        return SolvedBlock({"light_field": dark}, result.without_light_field(), None)
+    own = _of_block(settings.adaptive, block, size, psi.binning)
+    adaptive = settings.adaptive.model_copy(update=own)
+    result, verdict = reconstruct_judged(
+        name,
+        psi,
+        frames,
+        noise_sigma,
+        dictionary,
+        settings.model_copy(update={"adaptive": adaptive}),
+        usable,
+    )
+    place = within(block.part, block.outer)
+    arrays = {"light_field": result.light_field[:, :, *place]}
+    for key, values in result.maps.items():
+        arrays[key] = values[(slice(None),) * (values.ndim - 2) + place]
+    arrays = {key: np.ascontiguousarray(values) for key, values in arrays.items()}
+    return SolvedBlock(arrays, result.without_light_field(), verdict)
+
+
+AXES = {"light_field": 2, "sigma": 2}
+"""Axes before (y, x) of the arrays of a result; maps that are not listed have none."""
+
+
+def summed_up(
+    name: str, results: Iterable[Reconstruction], survey: Survey, seconds: float
+) -> Reconstruction:
+    """Return what blocks say together, without arrays: the mean of their figures.
+
+    The halo's largest disparity is the survey's; steps are those of all blocks.
+    """
+    solved = [one for one in results if one.status != Status.INCOMPLETE]
+    keys = dict.fromkeys(key for one in solved for key in one.parameters)
+    each = {key: [one.parameters[key] for one in solved if key in one.parameters] for key in keys}
+    parameters = {key: float(np.mean(values)) for key, values in each.items()}
+    for key, extreme in (("lowest_px", min), ("highest_px", max)):
+        if key in each:
+            parameters[key] = extreme(each[key])
+    # Of what no place can be told for the whole, the verdict tells the block.
+    for key in ("misfit_row", "misfit_column"):
+        parameters.pop(key, None)
+    left_out = [line for one in solved for line in one.left_out]
+    words = dict.fromkeys(left_out)
+    return Reconstruction(
+        method=name,
+        light_field=np.empty((0, 0, 0, 0, 3), np.float32),
+        status=Status.IN_TILES,
+        advice="; ".join(dict.fromkeys(one.advice for one in solved if one.advice)),
+        steps=sum(one.steps for one in solved),
+        objective=(),
+        seconds=seconds,
+        parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},
+        left_out=tuple(
+            f"{line}, in {left_out.count(line)} of {len(solved)} blocks" for line in words
+        ),
+        screening=survey.words,
+    )
+
+
+def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
+    """Return a block's verdict with its place, in pixels of k x k samples."""
+    rows, columns = block.inner
+    samples = (rows.stop - rows.start) * (columns.stop - columns.start)
+    row, column = (part.start // binning for part in block.outer)
+    return JudgedBlock(verdict, row, column, samples // binning**2)
+
+
+def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
+    """Raise ReconstructionError for frames of another shape than Psi's (shot, row, column)."""
+    if frames.shape != shape:
+        raise ReconstructionError(
+            f"frames of shape {frames.shape} given, Psi needs {shape} "
+            "(shot, row, column): use the Psi measured with these shots"
+        )
+
+
+def reconstruct_in_blocks(
     name: str,
     psi: PsiSource,
     frames: Array,
     noise_sigma: float,
-    out: Any,
-    dictionary: Dictionary | None = None,
-    settings: MethodSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
-    tile: int = 512,
-    overlap: int = OVERLAP,
-    on_tile: Callable[[int, int], None] | None = None,
-) -> list[Reconstruction]:
-    """Reconstruct by the method called `name` into out (v, u, y, x, c), tile by tile.
+    dictionary: Dictionary | None,
+    settings: MethodSettings,
+    usable: NDArray[np.bool_],
+    on_step: Callable[[Progress], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[Reconstruction, Verdict]:
+    """Return a light field and the verdict on it, block by block in this process.
 
-    psi: an ImagingMatrix, or one read window by window (`SavedPsi`). out: an array, a memory map
-    or an HDF5 dataset. on_tile: called with the tiles done and their number. The variational
-    methods take a fixed number of steps. Returns the tiles' results without their light fields.
-    Raises ReconstructionError as `reconstruct`, and for a tile of no samples.
+    frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError as `reconstruct`.
     """
-    if tile < 1 or overlap < 0:
-        raise ReconstructionError(
-            f"tiles of {tile} samples, overlap {overlap}: use 1 and 0 or more"
-        )
-    if usable is None:
-        usable = np.ones(frames.shape, dtype=bool)
+    started = clock()
     if not usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
-    settings = settings or MethodSettings()
-    settled = _settled(psi, frames, noise_sigma, usable, settings, name == "tv-dict")
-    k = psi.binning
-    multiple = lcm(k, settings.sparse.stride) if dictionary is not None else k
-    if dictionary is not None:
-        overlap = max(overlap, *dictionary.patch_shape[2:4])
-    places = list(tiles(psi.size, tile, overlap, multiple))
-    results = []
-    for done, place in enumerate(places):
-        rows, columns = place.outer
-        seen = np.s_[:, rows.start // k : rows.stop // k, columns.start // k : columns.stop // k]
-        if not usable[seen].any():
-            out[:, :, place.inner[0], place.inner[1]] = 0
-            continue
-        result = reconstruct(
-            name,
-            psi.window(rows, columns),
-            frames[seen],
-            noise_sigma,
-            dictionary,
-            settled,
-            usable[seen],
-        )
-        kept = place.kept()
-        out[:, :, place.inner[0], place.inner[1]] = result.light_field[:, :, kept[0], kept[1]]
-        results.append(result.without_light_field())
-        if on_tile is not None:
-            on_tile(done + 1, len(places))
-    return results
+    survey = surveyed(name, psi, frames, noise_sigma, usable, dictionary, settings)
+    multiple = multiple_of(psi.binning, dictionary, settings)
+    grid = Grid(psi.size, multiple, survey.halo, settings.blocks)
+    parts, results, verdicts = {}, [], []
+    frames, usable = survey.applied(frames, usable)
+    for done, block in enumerate(grid, 1):
+        seen = pixels_of(block.outer, psi.binning)
+        solved = solve_block(
+            name, psi.window(*block.outer), frames[seen], noise_sigma, usable[seen], block,
+            psi.size, survey.settings, dictionary,
+        )  # fmt: skip
+        parts[block.name] = solved.arrays
+        results.append(solved.result)
+        if solved.verdict is not None:
+            verdicts.append(judged_block(solved.verdict, block, psi.binning))
+        if on_step is not None:
+            on_step(Progress(done, None, None, len(grid)))
+    arrays = _whole(grid, parts)
+    whole = summed_up(name, results, survey, clock() - started)
+    light_field = arrays.pop("light_field")
+    return replace(whole, light_field=light_field, maps=arrays), judged_together(verdicts)
+
+
+def _whole(grid: Grid, parts: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
+    """Return the arrays that all blocks have, by name. parts: by block and name."""
+    first = next(iter(parts.values()))
+    out: dict[str, Array] = {}
+    for name in (key for key in first if all(key in one for one in parts.values())):
+        axes, like = AXES.get(name, 0), first[name]
+        shape = (*like.shape[:axes], *grid.size, *like.shape[axes + 2 :])
+        out[name] = np.empty(shape, dtype=like.dtype)
+        for block in grid:
+            out[name][(slice(None),) * axes + block.inner] = assembled(
+                grid, block, name, axes, lambda one, key, at: parts[one.name][key][at]
+            )
+    return out

@@ -14,7 +14,6 @@ from emmc_rig.files.frames import read_frames
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.solve import reconstruct_folder
-from emmc_rig.reconstruct.tiles import reconstruct_folder_in_tiles
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.method import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
@@ -94,14 +93,6 @@ def test_dictionaries_come_by_name_or_file(tmp_path):
     assert open_dictionary("dct", (5, 5), 2).patch_shape[2:4] == (8, 8)
     with pytest.raises(DictionaryError, match="no such file"):
         open_dictionary("nowhere.h5", (5, 5), 1)
-
-
-def test_tiles_give_the_light_field_of_the_whole(frames, tmp_path):
-    metrics = reconstruct_folder_in_tiles(frames, tmp_path, "tv", 1000)
-    whole = load_hdf5(tmp_path / "light_field.h5")
-    assert metrics["tiles"] == 1
-    assert reconstruct_folder_in_tiles(frames, tmp_path, "tv", 20)["tiles"] == 6
-    np.testing.assert_allclose(load_hdf5(tmp_path / "light_field.h5"), whole, atol=1e-4)
 
 
 def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):

@@ -1,116 +1,231 @@
-"""Tiles: they cover the light field once, and the result does not depend on how it is tiled."""
+"""Blocks: they cover the light field once, and the result does not depend on who computes them."""
 
-import h5py
+import json
+
 import numpy as np
 import pytest
 
 from emmc_rig.model.errors import SensingError
+from emmc_rig.model.lightfield import psnr_db
+from reconstruction.adaptive.edges import SIDES
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings
+from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
 from reconstruction.sparse import SparseSettings
-from reconstruction.tiles import SavedPsi, reconstruct_in_tiles, tiles
+from reconstruction.tiles import (
+    Grid,
+    SavedPsi,
+    reconstruct_in_blocks,
+    samples,
+    surveyed,
+    within,
+)
 from reconstruction.tv import TVSettings
+from reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
+from reconstruction.verdict.run import reconstruct_judged
 
 VIEWS = (2, 2)
+SMALL = BlockSettings(whole=1, side=48, blend=4)
 
 
 @pytest.mark.parametrize(
-    ("tile", "overlap", "multiple"), [(7, 3, 1), (10, 4, 5), (16, 5, 4), (99, 8, 2)]
+    ("size", "multiple", "halo", "side", "blend"),
+    [((40, 60), 2, 3, 16, 2), ((41, 97), 2, 9, 20, 3), ((100, 36), 10, 5, 30, 4)],
 )
-def test_inner_parts_cover_every_sample_once_and_lie_in_their_tiles(tile, overlap, multiple):
-    size = (40, 60)
-    seen = np.zeros(size, dtype=int)
-    for place in tiles(size, tile, overlap, multiple):
-        seen[place.inner] += 1
-        for inner, outer, whole in zip(place.inner, place.outer, size, strict=True):
+def test_inner_parts_cover_every_sample_once_and_weights_of_parts_add_up_to_one(
+    size, multiple, halo, side, blend
+):
+    grid = Grid(size, multiple, halo, BlockSettings(whole=1, side=side, blend=blend))
+    seen, weights = np.zeros(size, dtype=int), np.zeros(size)
+    assert len(grid) == len(list(grid)) > 1
+    for block in grid:
+        seen[block.inner] += 1
+        for inner, part, outer, whole in zip(
+            block.inner, block.part, block.outer, size, strict=True
+        ):
             assert outer.start % multiple == 0
-            assert outer.start == 0 or inner.start - outer.start >= overlap
-            assert outer.stop == whole or outer.stop - inner.stop >= overlap
+            assert outer.start == 0 or part.start - outer.start >= halo
+            assert outer.stop == whole or outer.stop - part.stop >= halo
+            assert part.start == 0 or inner.start - part.start >= blend
+        for other, place, weight in grid.overlapping(block):
+            weights[place] += weight
+            assert all(part.start >= 0 for part in within(place, other.part))
     np.testing.assert_array_equal(seen, 1)
+    np.testing.assert_allclose(weights, 1, atol=1e-6)
 
 
-def scene(random_psi, binning=1):
+def test_only_blocks_at_the_border_may_have_dark_edges():
+    grid = Grid((90, 90), 2, 4, BlockSettings(whole=1, side=30, blend=2))
+    assert grid.block(1, 1).sides == ()
+    assert grid.block(0, 2).sides == ("top", "right")
+    assert {side for block in grid for side in block.sides} == set(SIDES)
+
+
+def test_sample_windows_lie_within_and_reach_all_corners():
+    places = samples((500, 131), 6)
+    assert {place[0].start for place in places} == {0, 204, 402}
+    assert all(place[1].stop <= 131 and place[1].start % 6 == 0 for place in places)
+
+
+def scene(random_psi, binning=1, shots=2):
     size = (36, 160)
-    psi = random_psi(2, VIEWS, size, binning=binning)
+    psi = random_psi(shots, VIEWS, size, binning=binning)
     y, x = np.mgrid[: size[0], : size[1]] / 12
     picture = 0.5 + 0.3 * np.sin(x + np.sin(y))[..., None] * np.array([1, 0.5, -0.5])
     truth = np.broadcast_to(picture.astype(np.float32), psi.light_field_shape)
     noise = np.random.default_rng(0).normal(0, 0.01, psi.frames_shape)
-    return psi, (psi.forward(truth) + noise).astype(np.float32)
+    return psi, (psi.forward(truth) + noise).astype(np.float32), truth
 
 
-@pytest.mark.parametrize("binning", [1, 2])
-@pytest.mark.parametrize("method", ["tv", "dict-omp", "tv-dict"])
-def test_the_tiling_changes_the_result_by_less_than_a_ten_thousandth(random_psi, method, binning):
-    psi, frames = scene(random_psi, binning)
-    dictionary = dct_dictionary(VIEWS, (4, 4))
+def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step=None):
+    settings = MethodSettings(
+        tv=TVSettings(max_steps=60), sparse=SparseSettings(stride=2), blocks=blocks
+    )
+    usable = np.ones(frames.shape, dtype=bool) if usable is None else usable
+    return reconstruct_in_blocks(
+        method, psi, frames, 0.01, dictionary, settings, usable, on_step, lambda: 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "binning"),
+    [("tv", 1), ("tv", 2), ("dict-omp", 1), ("tv-dict", 2), ("adaptive-fast", 1)],
+)
+def test_every_method_works_in_blocks_and_loses_little(random_psi, method, binning):
+    psi, frames, truth = scene(random_psi, binning)
+    dictionary = dct_dictionary(VIEWS, (4, 4)) if "dict" in method else None
     settings = MethodSettings(tv=TVSettings(max_steps=60), sparse=SparseSettings(stride=2))
-    found = []
-    for tile in (1000, 40):
-        out = np.full(psi.light_field_shape, np.nan, dtype=np.float32)
-        reconstruct_in_tiles(method, psi, frames, 0.01, out, dictionary, settings, tile=tile)
-        found.append(out)
-    assert np.isfinite(found[1]).all()
-    assert np.abs(found[0] - found[1]).max() < 1e-4
+    whole = reconstruct(method, psi, frames, 0.01, dictionary, settings)
+    result, verdict = in_blocks(method, psi, frames, SMALL, dictionary=dictionary)
+    assert result.light_field.shape == psi.light_field_shape
+    assert psnr_db(result.light_field, truth) > psnr_db(whole.light_field, truth) - 0.7
+    assert set(result.maps) == set(whole.maps)
+    assert verdict.evidence.kept > 0
 
 
-def test_seams_show_without_overlap(random_psi):
-    psi, frames = scene(random_psi)
-    settings = MethodSettings(tv=TVSettings(max_steps=60))
-    whole, cut = np.empty((2, *psi.light_field_shape), dtype=np.float32)
-    reconstruct_in_tiles("tv", psi, frames, 0.01, whole, None, settings, tile=1000)
-    reconstruct_in_tiles("tv", psi, frames, 0.01, cut, None, settings, tile=40, overlap=0)
-    assert np.abs(whole - cut).max() > 1e-3
+def test_a_step_of_the_result_between_blocks_is_no_larger_than_within_them(random_psi):
+    psi, frames, _ = scene(random_psi)
+    result, _ = in_blocks("tv", psi, frames, SMALL)
+    steps = np.abs(np.diff(result.light_field, axis=3)).mean(axis=(0, 1, 2, 4))
+    grid = Grid(psi.size, 2, 48, SMALL)
+    seams = np.array(grid.edges[1][1:-1]) - 1
+    assert steps[seams].max() < 1.5 * np.median(steps)
+
+
+def test_a_light_field_of_one_block_is_that_of_the_method_itself(random_psi):
+    psi, _, _ = scene(random_psi)
+    settings = MethodSettings()
+    grid = Grid(psi.size, 2, 48, settings.blocks)
+    assert len(grid) == 1
+    block = grid.block(0, 0)
+    whole = (slice(0, 36), slice(0, 160))
+    assert block.outer == block.part == block.inner == whole
+    assert block.sides == SIDES
 
 
 def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
-    psi, frames = scene(random_psi, binning=2)
+    psi, frames, _ = scene(random_psi, binning=2)
     psi.save(tmp_path / "psi.h5")
     saved = SavedPsi(tmp_path / "psi.h5")
+    saved.verify()
     assert (saved.size, saved.binning) == (psi.size, 2)
     part, expected = (source.window(slice(4, 20), slice(10, 30)) for source in (saved, psi))
     np.testing.assert_array_equal(part.weights, expected.weights)
     np.testing.assert_array_equal(part.colour, expected.colour)
-    outs = np.empty((2, *psi.light_field_shape), dtype=np.float32)
-    for out, source in zip(outs, (psi, saved), strict=True):
-        reconstruct_in_tiles("tv", source, frames, 0.01, out, tile=40)
-    np.testing.assert_array_equal(outs[0], outs[1])
+    found = [in_blocks("tv", source, frames, SMALL)[0].light_field for source in (psi, saved)]
+    np.testing.assert_array_equal(*found)
 
 
-def test_results_go_straight_into_a_file_and_progress_is_told(random_psi, tmp_path):
-    psi, frames = scene(random_psi)
-    told = []
-    with h5py.File(tmp_path / "out.h5", "w") as file:
-        out = file.create_dataset("light_field", psi.light_field_shape, "f4")
-        results = reconstruct_in_tiles(
-            "tv", psi, frames, 0.01, out, tile=60, on_tile=lambda done, of: told.append((done, of))
-        )
-        assert np.isfinite(out[()]).all()
-        assert out[()].std() > 0.01
-    assert told == [(1, 3), (2, 3), (3, 3)]
-    assert [r.light_field.size for r in results] == [0, 0, 0]
-
-
-def test_a_tile_without_usable_pixels_is_left_dark(random_psi):
-    psi, frames = scene(random_psi)
-    usable = np.ones(psi.frames_shape, dtype=bool)
-    usable[:, :, :100] = False
-    out = np.empty(psi.light_field_shape, dtype=np.float32)
-    reconstruct_in_tiles("tv", psi, frames, 0.01, out, usable=usable, tile=40, overlap=10)
-    assert not out[:, :, :, :40].any()
-    assert out[:, :, :, 120:].any()
-
-
-def test_tiles_and_windows_that_cannot_be_are_refused(random_psi, tmp_path):
-    psi, frames = scene(random_psi, binning=2)
-    out = np.empty(psi.light_field_shape, dtype=np.float32)
-    with pytest.raises(ReconstructionError, match="tiles of 0"):
-        reconstruct_in_tiles("tv", psi, frames, 0.01, out, tile=0)
-    with pytest.raises(ReconstructionError, match="no usable pixel"):
-        reconstruct_in_tiles("tv", psi, frames, 0.01, out, usable=np.zeros(frames.shape, bool))
-    with pytest.raises(SensingError, match="cuts pixels"):
-        psi.window(slice(1, 5), slice(0, 4))
+def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
+    psi, _, _ = scene(random_psi)
+    psi.save(tmp_path / "psi.h5")
+    content = bytearray((tmp_path / "psi.h5").read_bytes())
+    content[-100] ^= 1
+    (tmp_path / "psi.h5").write_bytes(content)
+    with pytest.raises(SensingError, match="damaged"):
+        SavedPsi(tmp_path / "psi.h5").verify()
     (tmp_path / "psi.h5").write_bytes(b"no")
     with pytest.raises(SensingError, match="cannot be read"):
         SavedPsi(tmp_path / "psi.h5")
+
+
+def test_progress_is_told_block_by_block(random_psi):
+    psi, frames, _ = scene(random_psi)
+    told = []
+    in_blocks("tv", psi, frames, SMALL, on_step=lambda step: told.append((step.step, step.total)))
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_a_block_without_usable_pixels_is_dark_and_the_others_are_judged(random_psi):
+    psi, frames, _ = scene(random_psi)
+    usable = np.ones(psi.frames_shape, dtype=bool)
+    usable[:, :, :100] = False
+    blocks = BlockSettings(whole=1, side=16, blend=2)
+    result, verdict = in_blocks("tv", psi, frames, blocks, usable)
+    assert not result.light_field[:, :, :, :38].any()
+    assert result.light_field[:, :, :, 120:].any()
+    assert verdict.evidence.kept > 0
+    with pytest.raises(ReconstructionError, match="no usable pixel"):
+        in_blocks("tv", psi, frames, blocks, np.zeros(frames.shape, bool))
+
+
+def test_shots_that_do_not_fit_are_left_out_and_evened_for_all_blocks_alike(random_psi):
+    psi, frames, _ = scene(random_psi, shots=4)
+    frames[1] = 0.0
+    frames[2] *= 1.2
+    usable = np.ones(frames.shape, dtype=bool)
+    survey = surveyed("tv", psi, frames, 0.01, usable)
+    assert survey.left_out == (1,)
+    assert survey.gains[2] / survey.gains[0] == pytest.approx(1.2, rel=0.05)
+    readings, kept = survey.applied(frames, usable)
+    assert not kept[1].any()
+    assert readings[2].mean() / readings[0].mean() == pytest.approx(
+        frames[2].mean() / frames[0].mean() / 1.2, rel=0.05
+    )
+
+
+def test_the_halo_follows_from_the_largest_disparity(random_psi):
+    psi, frames, _ = scene(random_psi)
+    usable = np.ones(frames.shape, dtype=bool)
+    near = surveyed("adaptive-fast", psi, frames, 0.01, usable)
+    assert near.halo == 16 + int(np.ceil(near.largest_px))
+    assert surveyed("tv", psi, frames, 0.01, usable).halo == 48
+
+
+@pytest.fixture(scope="module")
+def blocks(random_psi):
+    psi, frames, _ = scene(random_psi)
+    _, verdict = reconstruct_judged("tv", psi, frames, 0.01)
+    wrong, _, _ = scene(random_psi, shots=2)
+    _, bad = reconstruct_judged("tv", wrong, frames[:, ::-1, ::-1].copy(), 0.01)
+    assert (verdict.level, bad.level) == ("trust", "do not use")
+    return verdict, bad
+
+
+def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
+    verdict, _ = blocks
+    together = judged_together([JudgedBlock(verdict, 0, at, 100) for at in (0, 80)])
+    assert together.level == "trust"
+    one, two = verdict.evidence, together.evidence
+    assert two.kept == 2 * one.kept
+    assert two.missed == pytest.approx(one.missed)
+    assert two.strengths == pytest.approx(one.strengths)
+    assert two.strength_errors == pytest.approx(np.array(one.strength_errors) / 2**0.5)
+    json.dumps(together.as_dict(), allow_nan=False)
+
+
+def test_one_bad_block_of_many_raises_doubt_and_is_named(blocks):
+    good, bad = blocks
+    found = [JudgedBlock(good, 0, 100 * at, 100) for at in range(15)]
+    assert judged_together(found).level == "trust"
+    together = judged_together([*found, JudgedBlock(bad, 7, 1500, 100)])
+    assert together.level == "doubt"
+    assert "1 of 16 blocks" in together.words
+    assert "row 7, column 1500" in together.words
+
+
+def test_places_are_those_of_the_whole(blocks):
+    verdict, _ = blocks
+    evidence = combined([JudgedBlock(verdict, 0, 0, 1), JudgedBlock(verdict, 50, 60, 1)])
+    hole = verdict.evidence.hole_at
+    assert evidence.hole_at in (hole, (hole[0] + 50, hole[1] + 60))

@@ -18,7 +18,7 @@ from emmc_rig.commands.options import (
     ShotsOption,
     SizeOption,
 )
-from emmc_rig.commands.verdict import end_with_verdict
+from emmc_rig.commands.verdict import show_verdict
 from emmc_rig.errors import AppError
 
 
@@ -85,4 +85,4 @@ def demo(
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     typer.echo(f"open {out / 'report.html'}")
-    end_with_verdict(metrics["verdict"], strict=False)
+    show_verdict(metrics["verdict"])

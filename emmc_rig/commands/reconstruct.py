@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from emmc_rig.commands.options import DictionaryOption
-from emmc_rig.commands.verdict import end_with_verdict
+from emmc_rig.commands.verdict import show_verdict
+
+if TYPE_CHECKING:
+    from emmc_rig.reconstruct.captures import Request
 
 
 def reconstruct(
     frames: Annotated[
-        Path | None,
-        typer.Argument(help="a session of `capture`, or a folder that `demo` or `simulate` wrote"),
+        list[Path] | None,
+        typer.Argument(
+            help="a session of `capture`, or a folder that `demo` or `simulate` wrote; or several"
+        ),
     ] = None,
     method: Annotated[
         str | None, typer.Option("--method", help="see --list (default: adaptive)")
@@ -34,7 +39,22 @@ def reconstruct(
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
     tile: Annotated[
-        int | None, typer.Option("--tile", min=1, help="in tiles of so many samples: less memory")
+        int | None,
+        typer.Option(
+            "--tile", min=1, help="large light fields: which blocks come first; changes no result"
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="processes that share blocks and captures"),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of them"),
+    ] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option("--memory", help="of all processes together, as 2GiB: fewer at a time"),
     ] = None,
     budget: Annotated[
         str | None, typer.Option("--budget", help="choose the best method for a time, as 30s")
@@ -53,24 +73,26 @@ def reconstruct(
         Path | None,
         typer.Option(
             "--out",
-            help="folder to write (default: emmc-reconstruction; of a session, in the session)",
+            help="folder to write (default: emmc-reconstruction; of a session, in the session); "
+            "of several captures, a folder in it each",
         ),
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.commands.bars import console, say, shown_bars
-    from emmc_rig.files.folders import is_session, result_folder
+    from emmc_rig.commands.bars import console, shown_bars
+    from emmc_rig.reconstruct.captures import Request, parse_memory, reconstruct_captures
     from emmc_rig.reconstruct.inputs import load_settings
-    from emmc_rig.reconstruct.solve import reconstruct_folder
-    from emmc_rig.reconstruct.tiles import reconstruct_folder_in_tiles
-    from emmc_rig.session.session import RECONSTRUCTION
     from reconstruction.methods import DEFAULT_METHOD
 
     if list_methods:
         _list_methods()
         return
-    if frames is None:
+    if not frames:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
+    if workers is not None and cluster is not None:
+        raise typer.BadParameter("--workers are of this machine, --cluster has its own: give one")
+    if memory is not None and cluster is not None:
+        raise typer.BadParameter("--memory is of this machine; a cluster's workers have their own")
     chosen, why = load_settings(settings), None
     if budget is not None or want is not None:
         if method is not None or settings is not None:
@@ -79,35 +101,68 @@ def reconstruct(
         from emmc_rig.files.frames import PSI
         from emmc_rig.model.sensing import ImagingMatrix
 
-        advice = advice_for(ImagingMatrix.load(psi or frames / PSI), budget, want, chart_folder)
+        measured = ImagingMatrix.load(psi or frames[0] / PSI)
+        advice = advice_for(measured, budget, want, chart_folder)
         method, chosen, why = advice.method, advice.settings, advice.why
         console.print(why, highlight=False, soft_wrap=True)
     elif chart_folder is not None:
         raise typer.BadParameter("--chart serves --budget and --want")
     method = method or DEFAULT_METHOD
-    place = frames / RECONSTRUCTION if is_session(frames) else None
-    out = out or place or Path("emmc-reconstruction")
-    results = result_folder(out, "reconstruct", belongs_to=place)
-    if tile is not None:
-        if truth is not None:
-            raise typer.BadParameter(
-                "--truth needs the whole light field in memory, without --tile"
-            )
-        with results as folder, shown_bars() as bars:
-            bars.begin(f"{method} in tiles", None)
-            metrics = reconstruct_folder_in_tiles(
-                frames, folder, method, tile, psi, dictionary, chosen, lambda *_: bars.step("")
-            )
-        typer.echo(f"{method}: {metrics['tiles']} tiles in {metrics['seconds']:.1f} s")
-        typer.echo(f"read {out / 'light_field.h5'}")
-        end_with_verdict(metrics["verdict"], strict)
-        return
-    with results as folder, shown_bars() as bars:
-        bars.begin(method, None)
-        metrics = reconstruct_folder(
-            frames, folder, method, psi, dictionary, chosen, truth,
-            lambda step: bars.advance(step), why,
-        )  # fmt: skip
+    requests = [
+        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile)
+        for folder, place in _places(frames, out)
+    ]
+    limit = None if memory is None else parse_memory(memory)
+    failed, refused = False, False
+    with shown_bars() as bars:
+        bars.begin(method if len(requests) == 1 else f"{method}, {len(requests)} captures", None)
+        done = []
+        for request, outcome in reconstruct_captures(
+            requests, workers, cluster, limit, lambda step: bars.advance(step)
+        ):
+            if isinstance(outcome, Exception) and len(requests) == 1:
+                raise outcome
+            done.append((request, outcome))
+    for request, outcome in done:
+        if len(requests) > 1:
+            typer.secho(f"{request.folder}:", bold=True)
+        if isinstance(outcome, Exception):
+            typer.secho(f"failed: {outcome}", fg="red")
+            failed = True
+            continue
+        _say_result(outcome, request)
+        show_verdict(outcome["verdict"])
+        refused = refused or outcome["verdict"]["level"] == "do not use"
+    if failed or (strict and refused):
+        raise typer.Exit(1)
+
+
+def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
+    """Return each folder of frames with the folder to write."""
+    from emmc_rig.files.folders import is_session
+    from emmc_rig.session.session import RECONSTRUCTION
+
+    default = Path("emmc-reconstruction")
+    if len(frames) == 1:
+        place = frames[0] / RECONSTRUCTION if is_session(frames[0]) else default
+        return [(frames[0], out or place)]
+    names = [folder.resolve().name for folder in frames]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice and not (out is None and all(map(is_session, frames))):
+        raise typer.BadParameter(
+            f"several captures are called {twice[0]}, and each needs a folder of its name in --out"
+        )
+    return [
+        (folder, folder / RECONSTRUCTION)
+        if out is None and is_session(folder)
+        else (folder, (out or default) / name)
+        for folder, name in zip(frames, names, strict=True)
+    ]
+
+
+def _say_result(metrics: dict, request: Request) -> None:
+    from emmc_rig.commands.bars import say
+
     for line in metrics["screening"]:
         say("screening", line)
     for line in metrics.get("left_out", ()):
@@ -119,12 +174,15 @@ def reconstruct(
             f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied centre view, "
             f"SSIM {metrics['ssim']:.3f}"
         )
+    if "blocks" in metrics:
+        rows, columns = metrics["blocks"]
+        compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"
     typer.echo(
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    typer.echo(f"open {out / 'pictures'}")
-    end_with_verdict(metrics["verdict"], strict)
+    pictures = request.out / "pictures"
+    typer.echo(f"open {pictures if pictures.is_dir() else request.out / 'light_field.h5'}")
 
 
 def _list_methods() -> None:

@@ -1,4 +1,4 @@
-"""How a command ends that reconstructs: the verdict, a line for each reason."""
+"""How a command ends that reconstructs: with the verdict."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import typer
 VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
 
 
-def end_with_verdict(verdict: dict, strict: bool) -> None:
-    """Print a verdict, a line for each reason; strict: exit with 1 if it is not to be used."""
+def show_verdict(verdict: dict) -> None:
+    """Print a verdict, a line for each reason."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
         typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
     for reason in verdict["reasons"]:
         what, remedy = reason["what"], reason["remedy"]
         typer.secho(f"{reason['level']}: {what}; {remedy}", fg=VERDICT_COLOURS[reason["level"]])
-    if strict and verdict["level"] == "do not use":
-        raise typer.Exit(1)

@@ -3,7 +3,7 @@
     OUT/
         metrics.json, ...    what a command wrote
         files.json           the command, and the SHA-256 of every file it wrote
-        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json
+        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json, kept/
 
 A command writes into `new`. When it is done, the files of the earlier result move to `earlier`,
 the new ones take their places, and the hidden folder goes. `moves.json` is there from before the
@@ -28,6 +28,7 @@ from emmc_rig.errors import AppError
 FILES = "files.json"
 PARTIAL = ".emmc-rig.partial"
 NEW, EARLIER, MOVES = "new", "earlier", "moves.json"
+KEPT = "kept"
 SESSION_HEADER, SESSION_JOURNAL = "session.json", "journal.jsonl"
 
 
@@ -78,7 +79,12 @@ def _stays_inside(name: str) -> bool:
 
 @contextmanager
 def result_folder(
-    out: Path, command: str, *, belongs_to: Path | None = None, adds: bool = False
+    out: Path,
+    command: str,
+    *,
+    belongs_to: Path | None = None,
+    adds: bool = False,
+    resumes: bool = False,
 ) -> Iterator[Path]:
     """Yield a folder to write into; its files appear in `out` together when the block succeeds.
 
@@ -91,6 +97,8 @@ def result_folder(
         belongs_to: the one folder in a session, or the session itself, where this may be written.
         adds: the folder may hold other things too, and files of the earlier result that are not
             written again stay.
+        resumes: what the block put into `kept_folder` stays when it fails or is killed, for the
+            next command that resumes there.
 
     Raises:
         AppError: `out` is, holds or lies inside a session; the folder holds what no earlier
@@ -102,7 +110,7 @@ def result_folder(
     try:
         refuse_inside_session(out, belongs_to)
         made = _make_folders(folder, out)
-        with _workplace(folder / PARTIAL):
+        with _workplace(folder / PARTIAL, resumes):
             _undo(folder)
             earlier = _replaceable(folder, out, command, adds)
             if not adds:
@@ -111,12 +119,24 @@ def result_folder(
             new.mkdir()
             yield new
             _take_place(folder, out, earlier, command, adds)
+            if resumes:
+                _clear(folder / PARTIAL)
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
     finally:
         for one in made:
             with suppress(OSError):
                 one.rmdir()
+
+
+def kept_folder(new: Path) -> Path:
+    """Return the folder that outlives a command that fails, see `result_folder`, made if missing.
+
+    new: what `result_folder` yielded.
+    """
+    kept = new.parent / KEPT
+    kept.mkdir(exist_ok=True)
+    return kept
 
 
 @contextmanager
@@ -214,22 +234,23 @@ def _make_folders(folder: Path, out: Path) -> list[Path]:
 
 
 @contextmanager
-def _workplace(place: Path) -> Iterator[None]:
+def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
     """Make a hidden folder that is this program's alone; it goes at the end with all in it.
 
-    What a killed program left in it goes too, but for interrupted moves. Raises AppError where
-    another program works in it, and OSError.
+    What a killed program left in it goes too, but for interrupted moves, and what is kept where
+    `resumes`. Raises AppError where another program works in it, and OSError.
     """
     descriptor = _held(place)
+    spared = KEPT if resumes else None
     try:
         if not (place / MOVES).exists():
-            _clear(place)
+            _clear(place, spared)
         yield
     finally:
         try:
             with suppress(OSError):
                 if not (place / MOVES).exists():
-                    _clear(place)
+                    _clear(place, spared)
                     place.rmdir()
         finally:
             if descriptor is not None:
@@ -266,9 +287,21 @@ def _held(place: Path) -> int | None:
         os.close(descriptor)  # whoever held it has removed it meanwhile
 
 
-def _clear(place: Path) -> None:
-    """Empty a hidden folder of this program; nothing behind a link is touched."""
+def _holds_work(kept: Path) -> bool:
+    return not kept.is_symlink() and any(kept.iterdir())
+
+
+def _clear(place: Path, spared: str | None = None) -> None:
+    """Empty a hidden folder of this program; nothing behind a link is touched.
+
+    spared: the one folder in it that stays, unless it is empty.
+    """
     for folder, inner, names in os.walk(place, topdown=False):
+        at = Path(folder).relative_to(place).parts
+        if spared is not None and at[:1] == (spared,):
+            continue
+        if not at and spared in inner and _holds_work(place / spared):
+            inner.remove(spared)
         for name in names:
             os.unlink(os.path.join(folder, name))
         for name in inner:

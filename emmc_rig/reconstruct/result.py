@@ -36,6 +36,34 @@ if TYPE_CHECKING:
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 
 
+def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
+    """Return how near a light field, an array or a dataset, is to the truth (v, u, y, x, c)."""
+    return {
+        "psnr_db": psnr_db(light_field, truth),
+        "ssim": ssim(light_field, truth),
+        "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
+    }
+
+
+def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[str, Any]:
+    """Return what metrics.json has of a reconstruction, its verdict and its frames."""
+    return {
+        "method": solved.method,
+        "status": solved.status,
+        "advice": solved.advice,
+        "left_out": list(solved.left_out),
+        "screening": list(solved.screening),
+        "verdict": verdict.as_dict(),
+        "steps": solved.steps,
+        "seconds": solved.seconds,
+        "parameters": solved.parameters,
+        "noise_sigma": frames.noise_sigma,
+        "usable_share": float(frames.usable.mean()),
+        "command": command_line(),
+        "versions": versions(),
+    }
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """What `emmc_rig.reconstruct` returns.
@@ -96,33 +124,16 @@ class Result:
         psnr_db, ssim: of all views and colours, peak 1. replicate_psnr_db: that of the true centre
         view copied to all views, which a light field has to beat.
         """
-        true = np.asarray(truth)
-        return {
-            "psnr_db": psnr_db(self.light_field, true),
-            "ssim": ssim(self.light_field, true),
-            "replicate_psnr_db": psnr_db(replicate_centre(true), true),
-        }
+        return compared(self.light_field, np.asarray(truth))
 
     def metrics(self) -> dict[str, Any]:
         """Return the figures of the reconstruction, as metrics.json has them."""
         return {
-            "method": self.method,
-            "status": self.status,
-            "advice": self.advice,
-            "left_out": list(self.solved.left_out),
-            "screening": list(self.solved.screening),
-            "verdict": self.verdict.as_dict(),
-            "steps": self.solved.steps,
-            "seconds": self.seconds,
-            "parameters": self.solved.parameters,
-            "noise_sigma": self.frames.noise_sigma,
-            "usable_share": float(self.frames.usable.mean()),
+            **figures(self.solved, self.verdict, self.frames),
             "shots": self.psi.shots,
             "size": list(self.psi.size),
             "psi_sha256": self.psi.checksum(),
             "dictionary": self.dictionary,
-            "command": command_line(),
-            "versions": versions(),
         }
 
     def save(self, out: str | Path) -> None:

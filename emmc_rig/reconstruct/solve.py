@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.folders import kept_folder
+from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruct.inputs import stored_frames
-from emmc_rig.reconstruct.result import Result
+from emmc_rig.reconstruct.pool import Pool, opened_pool
+from emmc_rig.reconstruct.result import LIGHT_FIELD, MAPS, Result, compared, figures
+from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
+from reconstruction.tiles import SavedPsi, check_frames, reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
@@ -67,17 +76,18 @@ def reconstruct(
         made = isinstance(dictionary, Dictionary)
         views = psi.layout.views
         atoms = dictionary if made else open_dictionary(dictionary, views, psi.binning)
-    solved, verdict = reconstruct_judged(
-        method,
-        psi,
-        given.readings,
-        # Not of each: estimated from the reading itself, it is least where noise made that small.
-        given.noise_sigma,
-        atoms,
-        settings,
-        given.usable,
-        on_step,
-    )
+    settings = settings or MethodSettings()
+    # Not of each: estimated from the reading itself, it is least where noise made that small.
+    noise = given.noise_sigma
+    if is_one_block(psi.size, settings):
+        solved, verdict = reconstruct_judged(
+            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
+        )
+    else:
+        check_frames(psi.frames_shape, given.readings)
+        solved, verdict = reconstruct_in_blocks(
+            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
+        )
     return Result(solved, verdict, psi, given, None if atoms is None else atoms.kind)
 
 
@@ -119,6 +129,11 @@ def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDAr
     return np.sqrt(variance)
 
 
+def is_one_block(size: tuple[int, int], settings: MethodSettings | None) -> bool:
+    """Return whether a light field of this size is reconstructed as a whole."""
+    return size[0] * size[1] <= (settings or MethodSettings()).blocks.whole
+
+
 def reconstruct_folder(
     folder: Path,
     out: Path,
@@ -129,21 +144,85 @@ def reconstruct_folder(
     truth: str | None = None,
     on_step: OnStep | None = None,
     chosen: str | None = None,
+    pool: Pool | None = None,
+    tile: int | None = None,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
-    dictionary_spec: see `open_dictionary`. truth: the scene that was captured, when known, to
-    compare with. chosen: why this method, for the metrics.
+    A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
+    what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
+    was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
+    default as many processes as threads; if one is given, it computes small light fields, too.
+    tile: see `run_capture`.
     """
     find_method(method)
+    settings = settings or MethodSettings()
     frames, psi_path = stored_frames(folder, out, psi_path)
-    psi = ImagingMatrix.load(psi_path)
-    result = reconstruct(
-        psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
-    )
-    metrics = {**result.metrics(), "chosen": chosen}
-    if truth is not None:
-        scene = open_scene(truth, size=psi.size, views=psi.layout.views)
-        metrics = {**metrics, "truth": truth, **result.compare(scene)}
-    result.write(out, metrics)
+    saved = SavedPsi(psi_path)
+    one_block = is_one_block(saved.size, settings)
+    if one_block and pool is None:
+        psi = ImagingMatrix.load(psi_path)
+        result = reconstruct(
+            psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
+        )
+        metrics = {
+            **result.metrics(),
+            "chosen": chosen,
+        }
+        metrics |= _compared(result.light_field, truth, psi.layout)
+        result.write(out, metrics)
+        return metrics
+    saved.verify()
+    check_frames(saved.frames_shape, frames.readings)
+    capture = Capture(
+        kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
+        frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
+    )  # fmt: skip
+
+    def on_block(done: int, of: int) -> None:
+        if on_step is not None:
+            on_step(Progress(done, None, None, of))
+
+    with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
+        blocks = run_capture(capture, frames, workers, tile, on_block)
+    result, verdict = blocks.result(), blocks.verdict(saved.binning)
+    if one_block:
+        arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
+        for name, array in arrays.items():
+            blocks.write(name, array)
+        light_field = arrays.pop("light_field")
+        small = Result(
+            replace(result, light_field=light_field, maps=arrays),
+            verdict,
+            ImagingMatrix.load(psi_path),
+            frames,
+        )
+        metrics = {**small.metrics(), "chosen": chosen, **blocks.metrics()}
+        metrics |= _compared(light_field, truth, saved)
+        small.write(out, metrics)
+        return metrics
+    with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
+        file.attrs["method"] = method
+        for name, (shape, dtype) in blocks.shapes().items():
+            home = file if name == "light_field" else maps
+            blocks.write(name, home.create_dataset(name, shape, dtype))
+        metrics = {
+            **figures(result, verdict, frames),
+            "shots": saved.shape[0],
+            "size": list(saved.size),
+            "psi_sha256": saved.checksum,
+            "dictionary": dictionary_spec,
+            "chosen": chosen,
+            **blocks.metrics(),
+            **_compared(file["light_field"], truth, saved),
+        }
+    write_metrics(out, metrics)
     return metrics
+
+
+def _compared(light_field: Any, truth: str | None, psi: PsiLayout | SavedPsi) -> dict[str, Any]:
+    """Return how near a light field, an array or dataset, is to the scene captured, if known."""
+    if truth is None:
+        return {}
+    scene = open_scene(truth, size=psi.size, views=psi.views)
+    return {"truth": truth, **compared(light_field, np.asarray(scene))}

@@ -1,114 +1,365 @@
-"""Reconstruction tile by tile into a file, for captures that do not fit into memory."""
+"""Blocks of a capture as tasks for workers, each on the disk once it is done.
+
+    KEPT/                       see `emmc_rig.files.folders.kept_folder`
+        job.json                what the blocks are of, and what was settled for all of them
+        frames.h5               the frames as the blocks get them
+        block-000-001.h5        the arrays of a block's part
+        block-000-001.json      their SHA-256, the block's figures and evidence: the block is done
+
+A block whose two files agree, and with the job, is not computed again.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
-from emmc_rig.reconstruct.inputs import stored_frames
-from emmc_rig.reconstruct.result import LIGHT_FIELD
+from emmc_rig.model.reading import stored_arrays
+from emmc_rig.reconstruct.pool import Pool
+from emmc_rig.version import __version__
+from reconstruction.dictionary import Dictionary
 from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Reconstruction, Status
-from reconstruction.tiles import SavedPsi, reconstruct_in_tiles
-from reconstruction.verdict.kept import kept_readings
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import verdict_of
+from reconstruction.tiles import (
+    AXES,
+    Block,
+    Grid,
+    SavedPsi,
+    Survey,
+    assembled,
+    judged_block,
+    multiple_of,
+    pixels_of,
+    solve_block,
+    summed_up,
+    surveyed,
+)
+from reconstruction.verdict.blocks import judged_together
+from reconstruction.verdict.evidence import Evidence
+from reconstruction.verdict.rules import Verdict, judged
 
-VERDICT_WINDOW = 512
-"""Rows and columns of the middle of the light field that the verdict is by: what fits into memory
-anywhere."""
-
-
-def _verdict_of_middle(
-    method: str,
-    psi: SavedPsi,
-    frames: Frames,
-    kept: NDArray[np.bool_],
-    dataset: h5py.Dataset,
-    settings: MethodSettings | None,
-) -> Verdict:
-    """Return the verdict on the middle of a light field in a file, as much as fits into memory."""
-    k = psi.binning
-    rows, columns = (
-        slice(first, first + min(VERDICT_WINDOW, whole))
-        for whole in psi.size
-        for first in [max(0, (whole - VERDICT_WINDOW) // 2 // k * k)]
-    )
-    seen = np.s_[:, rows.start // k : rows.stop // k, columns.start // k : columns.stop // k]
-    found = np.asarray(dataset[:, :, rows, columns])
-    result = Reconstruction(method, found, Status.IN_TILES, "", 0, (), 0.0, {})
-    screening = (settings or MethodSettings()).screening
-    return verdict_of(
-        psi.window(rows, columns),
-        frames.readings[seen],
-        frames.noise_sigma,
-        frames.usable[seen],
-        kept[seen],
-        result,
-        screening,
-    )
+FRAMES, JOB = "frames.h5", "job.json"
+AGAIN = "the same command computes it again"
 
 
-def reconstruct_folder_in_tiles(
-    folder: Path,
-    out: Path,
-    method: str,
-    tile: int,
-    psi_path: Path | None = None,
-    dictionary_spec: str | None = None,
-    settings: MethodSettings | None = None,
-    on_tile: Callable[[int, int], None] | None = None,
-) -> dict:
-    """Reconstruct a folder's frames tile by tile into light_field.h5; return the metrics.
+@dataclass(frozen=True)
+class Capture:
+    """What the blocks of a capture are computed from; picklable, so that workers get it.
 
-    For captures that do not fit into memory: writes no pictures. The arguments are those of
-    `reconstruct_folder`; tile: samples a side.
+    psi_path, kept: absolute, on a disk that all workers share. dictionary: see `open_dictionary`.
     """
-    needs_dictionary = find_method(method).needs_dictionary
-    frames, psi_path = stored_frames(folder, out, psi_path)
-    psi = SavedPsi(psi_path)
-    views = psi.window(slice(0, psi.binning), slice(0, psi.binning)).light_field_shape[:2]
-    dictionary = open_dictionary(dictionary_spec, views, psi.binning) if needs_dictionary else None
-    kept = kept_readings(frames.usable)
+
+    kept: Path
+    psi_path: Path
+    method: str
+    dictionary: str | None
+    settings: MethodSettings
+    noise_sigma: float
+    fingerprint: str
+
+    @cached_property
+    def psi(self) -> SavedPsi:
+        """Psi, read window by window."""
+        return SavedPsi(self.psi_path)
+
+    def opened_dictionary(self) -> Dictionary | None:
+        """Return the dictionary where the method needs one."""
+        if not find_method(self.method).needs_dictionary:
+            return None
+        return open_dictionary(self.dictionary, self.psi.views, self.psi.binning)
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """A block of a capture, with the settings that the survey settled."""
+
+    capture: Capture
+    settings: MethodSettings
+    block: Block
+
+    def path(self, suffix: str) -> Path:
+        """Return the file of the block with this suffix."""
+        return self.capture.kept / f"{self.block.name}.{suffix}"
+
+
+def fingerprint_of(
+    psi: SavedPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
+) -> str:
+    """Return a SHA-256 of all that the light field follows from."""
+    digest = hashlib.sha256()
+    for array in (frames.readings, frames.usable):
+        digest.update(np.ascontiguousarray(array).view(np.uint8).data)
+    atoms = Path(dictionary) if dictionary is not None else None
+    content = atoms.read_bytes() if atoms is not None and atoms.is_file() else b""
+    what = (
+        psi.checksum, frames.shape, frames.noise_sigma, method, dictionary,
+        hashlib.sha256(content).hexdigest(), settings.model_dump(mode="json"), __version__,
+    )  # fmt: skip
+    digest.update(json.dumps(what).encode())
+    return digest.hexdigest()
+
+
+def _write_json(path: Path, content: object) -> None:
+    with whole_file(path) as partial, open(partial, "w", encoding="utf-8") as file:
+        json.dump(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    """Return what a file of a job says; None where it is missing or damaged."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
+    """Write arrays as HDF5, whole and on the disk; return the file's SHA-256."""
+    with whole_file(path) as partial:
+        with h5py.File(partial, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+        with open(partial, "rb+") as file:
+            os.fsync(file.fileno())
+        return _sha256(partial)
+
+
+def survey_task(capture: Capture) -> dict[str, Any]:
+    """Settle in a worker what holds for the whole capture; return it as plain data."""
+    readings, usable = _frames(capture.kept / FRAMES, np.s_[:, :, :])
+    survey = surveyed(
+        capture.method, capture.psi, readings, capture.noise_sigma, usable,
+        capture.opened_dictionary(), capture.settings,
+    )  # fmt: skip
+    return _plain(survey)
+
+
+def _plain(survey: Survey) -> dict[str, Any]:
+    return {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
+
+
+def _survey(found: Mapping[str, Any]) -> Survey:
+    plain = {key: tuple(one) if isinstance(one, list) else one for key, one in found.items()}
+    return Survey(**{**plain, "settings": MethodSettings.model_validate(found["settings"])})
+
+
+def _frames(path: Path, seen: Any) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    with stored_arrays(path, AppError, AGAIN) as stored:
+        return stored.dataset("readings")[seen], stored.dataset("usable")[seen].astype(bool)
+
+
+def block_task(task: BlockTask) -> None:
+    """Compute a block in a worker, and write its two files."""
     started = time.perf_counter()
-    with h5py.File(out / LIGHT_FIELD, "w") as file:
-        dataset = file.create_dataset("light_field", (*views, *psi.size, 3), "f4")
-        dataset.attrs["method"] = method
-        results = reconstruct_in_tiles(
-            method,
-            psi,
-            frames.readings,
-            frames.noise_sigma,
-            dataset,
-            dictionary,
-            settings,
-            frames.usable & ~kept,
-            tile,
-            on_tile=on_tile,
-        )
-        verdict = _verdict_of_middle(method, psi, frames, kept, dataset, settings)
-    metrics = {
-        "method": method,
-        "status": Status.IN_TILES,
-        "advice": "",
-        "verdict": verdict.as_dict(),
-        "tiles": len(results),
-        "tile": tile,
-        "seconds": time.perf_counter() - started,
-        "parameters": results[0].parameters if results else {},
-        "noise_sigma": frames.noise_sigma,
-        "size": list(psi.size),
-        "psi_sha256": psi.checksum,
-        "command": command_line(),
-        "versions": versions(),
-    }
-    write_metrics(out, metrics)
-    return metrics
+    capture, block = task.capture, task.block
+    readings, usable = _frames(capture.kept / FRAMES, pixels_of(block.outer, capture.psi.binning))
+    solved = solve_block(
+        capture.method,
+        capture.psi.window(*block.outer),
+        readings,
+        capture.noise_sigma,
+        usable,
+        block,
+        capture.psi.size,
+        task.settings,
+        capture.opened_dictionary(),
+    )
+    result = solved.result
+    _write_json(
+        task.path("json"),
+        {
+            "fingerprint": capture.fingerprint,
+            "sha256": _write_arrays(task.path("h5"), solved.arrays),
+            "result": {
+                key: getattr(result, key)
+                for key in ("status", "advice", "steps", "parameters", "left_out")
+            },
+            "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
+            "seconds": time.perf_counter() - started,
+            "peak_mib": peak_memory_mib(),
+        },
+    )
+
+
+@dataclass(frozen=True)
+class DoneBlock:
+    """What a block says of itself, without its arrays."""
+
+    result: Reconstruction
+    verdict: Verdict | None
+    seconds: float
+    peak_mib: float
+
+
+def done_block(task: BlockTask) -> DoneBlock | None:
+    """Return a block that is done and whole on the disk, else None."""
+    told = _read_json(task.path("json"))
+    if told is None or told.get("fingerprint") != task.capture.fingerprint:
+        return None
+    if told.get("sha256") != _sha256(task.path("h5")):
+        return None
+    figures = {**told["result"], "left_out": tuple(told["result"]["left_out"])}
+    figures["status"] = Status(figures["status"])
+    result = Reconstruction(
+        method=task.capture.method,
+        light_field=np.empty((0, 0, 0, 0, 3), np.float32),
+        objective=(),
+        seconds=told["seconds"],
+        **figures,
+    )
+    verdict = None if told["evidence"] is None else judged(Evidence.from_dict(told["evidence"]))
+    return DoneBlock(result, verdict, told["seconds"], told["peak_mib"])
+
+
+def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey:
+    """Return what holds for all blocks, from an earlier run where it is of the same capture.
+
+    alone: there is one block, which settles everything by itself.
+    """
+    job = _read_json(capture.kept / JOB)
+    if job is None or job.get("fingerprint") != capture.fingerprint:
+        for path in capture.kept.iterdir():
+            path.unlink()
+        _write_arrays(capture.kept / FRAMES, {"readings": frames.readings, "usable": frames.usable})
+        if alone:
+            found = _plain(Survey.of_one_block(capture.settings, len(frames.readings)))
+        else:
+            ((_, found),) = pool.run(survey_task, [capture])
+        survey = _survey(found)
+        readings, usable = survey.applied(frames.readings, frames.usable)
+        sha256 = _write_arrays(capture.kept / FRAMES, {"readings": readings, "usable": usable})
+        job = {"fingerprint": capture.fingerprint, "frames": sha256, "survey": found}
+        _write_json(capture.kept / JOB, job)
+    survey = _survey(job["survey"])
+    if _sha256(capture.kept / FRAMES) != job["frames"]:
+        readings, usable = survey.applied(frames.readings, frames.usable)
+        _write_arrays(capture.kept / FRAMES, {"readings": readings, "usable": usable})
+    return survey
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The blocks of a capture, all done: their grid, what was settled, and what each says."""
+
+    grid: Grid
+    survey: Survey
+    tasks: Mapping[str, BlockTask]
+    done: Mapping[str, DoneBlock]
+    seconds: float
+
+    def metrics(self) -> dict[str, Any]:
+        """Return what metrics.json has of the blocks: peak_gib is the largest of a worker."""
+        return {
+            "blocks": list(self.grid.shape),
+            "block_seconds": [one.seconds for one in self.done.values()],
+            "peak_gib": max(one.peak_mib for one in self.done.values()) / 2**10,
+        }
+
+    def result(self) -> Reconstruction:
+        """Return the figures of all blocks together, without arrays."""
+        method = next(iter(self.tasks.values())).capture.method
+        results = [one.result for one in self.done.values()]
+        return summed_up(method, results, self.survey, self.seconds)
+
+    def verdict(self, binning: int) -> Verdict:
+        """Return the verdict on all blocks; raises AppError where none could be judged."""
+        found = [
+            judged_block(one.verdict, self.tasks[name].block, binning)
+            for name, one in self.done.items()
+            if one.verdict is not None
+        ]
+        if not found:
+            raise AppError("no usable pixel: every one is saturated or excluded")
+        return judged_together(found)
+
+    def shapes(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+        """Return shape and type of the arrays of the whole, by name, which all blocks have."""
+        each: list[dict[str, tuple[tuple[int, ...], np.dtype]]] = []
+        for task in self.tasks.values():
+            with stored_arrays(task.path("h5"), AppError, AGAIN) as stored:
+                parts = {name: stored.dataset(name) for name in map(str, stored.file)}
+                each.append({name: (part.shape, part.dtype) for name, part in parts.items()})
+        found = {}
+        for name, (shape, dtype) in each[0].items():
+            if all(name in one for one in each):
+                axes = AXES.get(name, 0)
+                found[name] = (*shape[:axes], *self.grid.size, *shape[axes + 2 :]), dtype
+        return found
+
+    def write(self, name: str, out: Any) -> None:
+        """Write an array of the whole into an array or dataset, blocks in a fixed order."""
+        axes = AXES.get(name, 0)
+        for block in self.grid:
+            out[(slice(None),) * axes + block.inner] = assembled(
+                self.grid, block, name, axes, self._part
+            )
+
+    def _part(self, block: Block, name: str, at: tuple) -> NDArray:
+        with stored_arrays(self.tasks[block.name].path("h5"), AppError, AGAIN) as stored:
+            return stored.dataset(name)[at]
+
+
+def run_capture(
+    capture: Capture,
+    frames: Frames,
+    pool: Pool,
+    group: int | None = None,
+    on_block: Callable[[int, int], None] | None = None,
+) -> Blocks:
+    """Return the blocks of a capture, computed by a pool, those done before left as they are.
+
+    group: rows and columns in samples of the tiles that are handed out one after another; the
+    blocks in them, and so the light field, are the same for any. on_block: called with the blocks
+    done and their number. Raises WorkersError, AppError, and what a block raises.
+    """
+    started = time.perf_counter()
+    psi, dictionary = capture.psi, capture.opened_dictionary()
+    multiple = multiple_of(psi.binning, dictionary, capture.settings)
+    grid = Grid(psi.size, multiple, 0, capture.settings.blocks)
+    survey = _settle(capture, frames, pool, len(grid) == 1)
+    grid = replace(grid, halo=survey.halo)
+    tasks = {block.name: BlockTask(capture, survey.settings, block) for block in grid}
+    done = {name: one for name, task in tasks.items() if (one := done_block(task)) is not None}
+    left = [task for name, task in tasks.items() if name not in done]
+    if group is not None:
+        left.sort(key=lambda task: [part.start // group for part in task.block.inner])
+    if on_block is not None and done:
+        on_block(len(done), len(tasks))
+    for task, _ in pool.run(block_task, left):
+        one = done_block(task)
+        if one is None:
+            raise AppError(
+                f"{task.path('h5')}: a worker wrote it, but it cannot be read here; put frames, "
+                "Psi and --out on a disk that all workers share"
+            )
+        done[task.block.name] = one
+        if on_block is not None:
+            on_block(len(done), len(tasks))
+    ordered = {name: done[name] for name in tasks}
+    return Blocks(grid, survey, tasks, ordered, time.perf_counter() - started)

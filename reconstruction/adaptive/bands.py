@@ -14,7 +14,10 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
     threads = get_num_threads()
     count = min(rows, threads if bands is None else bands)
     edges = np.linspace(0, rows, count + 1).round().astype(int)
+    spans = [(band, int(edges[band]), int(edges[band + 1])) for band in range(count)]
+    if threads == 1:
+        for span in spans:
+            work(*span)
+        return
     with ThreadPoolExecutor(threads) as pool:
-        list(
-            pool.map(lambda band: work(band, int(edges[band]), int(edges[band + 1])), range(count))
-        )
+        list(pool.map(lambda span: work(*span), spans))

@@ -8,6 +8,7 @@ the frames, given the scene.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -117,16 +118,22 @@ def _width(lines: _Lines) -> int:
     return 0
 
 
-def dark_edges(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> DarkEdges | None:
+def dark_edges(
+    flat: FlatPsi,
+    frames: Array,
+    usable: NDArray[np.bool_],
+    sides: Collection[str] = SIDES,
+) -> DarkEdges | None:
     """Return the edges of the frames (shot, pixel_y, pixel_x) that are no part of the scene.
 
-    None if all are, and for frames too small to tell.
+    None if all are, and for frames too small to tell. sides: those of SIDES that may have one.
     """
     rows, columns = frames.shape[1:]
     if min(rows, columns) < 4 * (WIDEST + 1 + BESIDE):
         return None
     top, bottom, left, right = (
-        _width(_lines(flat, frames, usable, side)) for side in range(len(SIDES))
+        _width(_lines(flat, frames, usable, side)) if name in sides else 0
+        for side, name in enumerate(SIDES)
     )
     within = np.ones((rows, columns), dtype=bool)
     within[top : rows - bottom, left : columns - right] = False

@@ -40,6 +40,7 @@ from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.mixture import mean_deviation, mean_light_field, weighted
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.parsimony import (
+    Plane,
     colour_is_needed,
     grey_bound_db,
     grey_psi,
@@ -127,6 +128,18 @@ class AdaptiveSettings(Settings):
     rest: bool = Field(
         default=True, description="add what is missed, where readings kept from all speak for it"
     )
+    edges: tuple[Literal["top", "bottom", "left", "right"], ...] = Field(
+        default=("top", "bottom", "left", "right"),
+        description="sides that may be dark because views do not reach them",
+    )
+    brightness: float | None = Field(
+        default=None, gt=0, description="mean of the scene that this is a part of; None: its own"
+    )
+    plane: tuple[float, float, float] | None = Field(
+        default=None,
+        description="disparity, where parsimony is asked for and it is known to be one plane: in "
+        "the middle, px, and its change per pixel down and right",
+    )
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
@@ -169,12 +182,13 @@ def reconstruct_adaptive(
 
     given = Given(psi, frames, typical, noise, usable).over(darkness(psi), of_psi=True)
     flat = flat_psi(given.psi)
-    edges = dark_edges(flat, given.frames, usable)
+    edges = dark_edges(flat, given.frames, usable, settings.edges)
     if edges is not None:
         all_usable, usable = usable, usable & ~edges.within
         given = replace(given, usable=usable)
     picture = np.asarray(smooth_guess(flat, given.frames, usable), dtype=np.float32)
-    scale = min(1.0, max(float(picture.mean()), TINY) / DIM)
+    brightness = settings.brightness or float(picture.mean())
+    scale = min(1.0, max(brightness, TINY) / DIM)
     bright = given.over(scale)
     data = _unexplained_by(picture / np.float32(scale), flat, bright, settings)
     volume = _searched(data, settings, lambda: tell(1))
@@ -421,7 +435,7 @@ def _needed(
     psi, centre, picture, texture = asked.psi, asked.centre, asked.picture, asked.texture
     left_out = []
     pixels = psi.frames_shape[1:]
-    plane = one_plane(volume, pixels)
+    plane = one_plane(volume, pixels) if settings.plane is None else Plane(*settings.plane)
     if plane is not None:
         bound = plane_bound_db(plane, volume, pixels, picture)
         kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"

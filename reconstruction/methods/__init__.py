@@ -48,6 +48,18 @@ def offered() -> Iterator[Method]:
 METHODS = {method.name: method for method in sorted(offered(), key=lambda one: one.name)}
 
 
+class BlockSettings(Settings):
+    """The grid of blocks of a large light field, see `reconstruction.tiles`: part of the method."""
+
+    whole: int = Field(
+        default=2**19, ge=1, description="samples up to which a light field is one block"
+    )
+    side: int = Field(default=384, ge=16, description="rows and columns of a block, at most")
+    blend: int = Field(
+        default=16, ge=1, description="samples to both sides over which neighbours are averaged"
+    )
+
+
 class ShippedSettings(Settings):
     """Settings of every method; each takes its own part.
 
@@ -55,6 +67,7 @@ class ShippedSettings(Settings):
     """
 
     screening: bool = True
+    blocks: BlockSettings = Field(default_factory=BlockSettings)
     tv: TVSettings = Field(default_factory=TVSettings)
     sparse: SparseSettings = Field(default_factory=SparseSettings)
     adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)

@@ -1,0 +1,154 @@
+"""The verdict on a light field that was reconstructed in blocks: of all together, and of places."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from reconstruction.verdict.evidence import Evidence
+from reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, judged
+
+Combine = Callable[[Sequence[float], Sequence[float]], float]
+DOUBTED_SHARE = Limits(0.25, 1.0)
+"""Share of the blocks that are doubted alone, beyond which the whole is: each is judged by fewer
+readings than the whole, so that a few of them are doubted by chance."""
+REFUSED_SHARE = Limits(0.0, 0.5)
+"""Of those that alone are not to be used: one is a place to look at, half of them the capture."""
+
+
+@dataclass(frozen=True)
+class JudgedBlock:
+    """A block's verdict, its first row and column of pixels, and how many pixels it is."""
+
+    verdict: Verdict
+    row: int
+    column: int
+    pixels: int
+
+
+def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    return float(np.average(values, weights=weights))
+
+
+def _root_mean_square(values: Sequence[float], weights: Sequence[float]) -> float:
+    return float(np.sqrt(np.average(np.square(values), weights=weights)))
+
+
+def _error_of_mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    share = np.asarray(weights) / np.sum(weights)
+    return float(np.sqrt(np.sum(np.square(share * np.asarray(values)))))
+
+
+def _largest(values: Sequence[float], weights: Sequence[float]) -> float:
+    return float(max(values))
+
+
+COMBINED: dict[str, Combine] = {
+    "strength_errors": _error_of_mean,
+    "missed": _root_mean_square,
+    "plain": _root_mean_square,
+    "misfit": _root_mean_square,
+    "hole_px": _largest,
+}
+"""How figures of blocks become one; others by their mean."""
+
+
+def _combined(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
+    """Return one figure, or a collection of them, from those of the blocks that have any."""
+    having = [(value, weight) for value, weight in zip(values, weights, strict=True)
+              if value is not None]  # fmt: skip
+    if not having:
+        return None
+    first = having[0][0]
+    some, heavy = [one for one, _ in having], [weight for _, weight in having]
+    if isinstance(first, dict):
+        keys = dict.fromkeys(name for one in some for name in one)
+        return {name: _combined(name, [one.get(name) for one in some], heavy) for name in keys}
+    if isinstance(first, tuple):
+        return tuple(_combined(key, each, heavy) for each in zip(*some, strict=True))
+    return COMBINED.get(key, _mean)(some, heavy)
+
+
+def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
+    """Return what one block tells: the weakest masks, the largest hole, the most motion, misfit."""
+    found: dict[str, Any] = {}
+    e = [(block, block.verdict.evidence) for block in blocks]
+    weak = [
+        (one.lowest_strength, block, one) for block, one in e if one.lowest_strength is not None
+    ]
+    if weak:
+        strength, block, one = min(weak, key=lambda each: each[0])
+        found |= {"lowest_strength": strength, "lowest_at": _at(block, one.lowest_at)}
+    block, one = max(e, key=lambda each: each[1].hole_px)
+    found["hole_at"] = _at(block, one.hole_at)
+    moved = [(one.motion_effect, block, one) for block, one in e if one.motion_effect is not None]
+    if moved:
+        effect, block, one = max(moved, key=lambda each: each[0])
+        found |= {"motion_px": one.motion_px, "motion_effect": effect}
+        if one.moved_at is not None:
+            found["moved_at"] = (one.moved_at[0], *_at(block, one.moved_at[1:]))
+    return found
+
+
+def _at(block: JudgedBlock, place: Sequence[float]) -> tuple[int, int]:
+    return int(block.row + place[0]), int(block.column + place[1])
+
+
+def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
+    """Return the evidence of all blocks together: means by pixels, and the worst places."""
+    weights = [float(block.pixels) for block in blocks]
+    evidence = [block.verdict.evidence for block in blocks]
+    first = evidence[0]
+    same = {key: getattr(first, key) for key in ("method", "status")}
+    left_out = tuple(sorted({shot for one in evidence for shot in one.left_out}))
+    figures = {
+        key: _combined(key, [getattr(one, key) for one in evidence], weights)
+        for key in Evidence.__dataclass_fields__
+        if key not in (*same, "left_out", "kept", "lowest_at", "hole_at", "moved_at")
+    }
+    kept = sum(one.kept for one in evidence)
+    parameters = {**(figures["parameters"] or {})}
+    worst = max(blocks, key=lambda block: block.verdict.evidence.parameters.get("misfit", 0.0))
+    if "misfit" in parameters:
+        told = worst.verdict.evidence.parameters
+        row, column = _at(worst, (told["misfit_row"], told["misfit_column"]))
+        parameters |= {"misfit_row": float(row), "misfit_column": float(column)}
+    whole = {"lowest_at": (0, 0), "hole_at": (0, 0), "moved_at": None, **_places(blocks)}
+    figures |= {"parameters": parameters, "changes": figures["changes"] or {}}
+    return Evidence(**{**same, "left_out": left_out, "kept": kept, **figures, **whole})
+
+
+def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
+    """Return the verdict on all blocks; a reason more where some alone are worse than the whole.
+
+    blocks: at least one.
+    """
+    whole = judged(combined(blocks))
+    reasons = list(whole.reasons)
+    for level, limits in (("do not use", REFUSED_SHARE), ("doubt", DOUBTED_SHARE)):
+        bad = [block for block in blocks if _rank(block.verdict.level) >= _rank(level)]
+        share = len(bad) / len(blocks)
+        found = limits.level(share)
+        if found == "trust" or _rank(level) <= _rank(whole.level) or len(blocks) == 1:
+            continue
+        worst = max(bad, key=lambda block: _rank(block.verdict.level))
+        reason = worst.verdict.reasons[0]
+        reasons.append(
+            Reason(
+                f"{len(bad)} of {len(blocks)} blocks alone are worse, such as that from row "
+                f"{worst.row}, column {worst.column}: {reason.what}",
+                share,
+                reason.remedy,
+                found,
+            )
+        )
+        break
+    reasons.sort(key=lambda one: -_rank(one.level))
+    return replace(whole, level=reasons[0].level if reasons else "trust", reasons=tuple(reasons))
+
+
+def _rank(level: str) -> int:
+    return LEVELS.index(level)  # type: ignore[arg-type]

@@ -1,0 +1,250 @@
+"""Blocks on workers: the same bytes whoever computes them, and whatever is killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numba
+import numpy as np
+import pytest
+import yaml
+from programs import program
+
+from emmc_rig.commands.simulate import simulate_into
+from emmc_rig.errors import WrongUsageError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import result_folder
+from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.reconstruct.captures import parse_memory
+from emmc_rig.reconstruct.inputs import load_settings
+from emmc_rig.reconstruct.solve import reconstruct_folder
+
+CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
+BLOCKS = {"blocks": {"whole": 1000, "side": 32, "blend": 4}, "tv": {"max_steps": 20}}
+KILLS = int(os.environ.get("EMMC_KILLS", "2"))
+
+
+class StoppedHereError(Exception):
+    """Somebody stopped the tasks."""
+
+
+class Here:
+    """A pool that computes in this process, first things last if asked to, until it is stopped."""
+
+    size = 1
+
+    def __init__(self, backwards=False, stop_after=None):
+        self.backwards, self.stop_after, self.done = backwards, stop_after, []
+
+    def run(self, task, items):
+        numba.set_num_threads(1)
+        for item in reversed(items) if self.backwards else items:
+            if len(self.done) == self.stop_after:
+                raise StoppedHereError
+            self.done.append(item)
+            yield item, task(item)
+
+    def end(self):
+        pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def threads():
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with two captures, settings that make six blocks, and the result of one process."""
+    folder = tmp_path_factory.mktemp("blocks")
+    for name, seed in (("frames", 0), ("others", 1)):
+        (folder / name).mkdir()
+        simulate_into(folder / name, SCENE, CAMERA, find_camera(CAMERA), SIZE, seed)
+    (folder / "blocks.yaml").write_text(yaml.safe_dump(BLOCKS))
+    here(folder, "alone")
+    return folder
+
+
+def here(folder, out, pool=None, frames="frames", settings="blocks.yaml", **more):
+    """Reconstruct in this process; return the metrics."""
+    with result_folder(folder / out, "reconstruct", resumes=True) as new:
+        return reconstruct_folder(
+            folder / frames, new, "tv", settings=load_settings(folder / settings),
+            pool=pool or Here(), **more,
+        )  # fmt: skip
+
+
+def reconstructed(folder, out, *more, frames=("frames",)):
+    return program(
+        "reconstruct", *(folder / name for name in frames), "--method", "tv",
+        "--settings", folder / "blocks.yaml", "--out", folder / out, *more,
+    )  # fmt: skip
+
+
+def content(folder):
+    return (folder / "light_field.h5").read_bytes()
+
+
+def test_results_are_byte_identical_in_any_order_and_for_any_tile(place):
+    metrics = here(place, "backwards", Here(backwards=True))
+    assert metrics["blocks"] == [2, 3]
+    here(place, "tiled", tile=64)
+    for out in ("backwards", "tiled"):
+        assert content(place / out) == content(place / "alone")
+
+
+def test_the_truth_and_the_verdict_cover_all_blocks(place):
+    metrics = here(place, "compared", truth=SCENE)
+    assert 10 < metrics["psnr_db"] < 40
+    assert metrics["verdict"]["features"]["kept"] > 30
+    assert content(place / "compared") == content(place / "alone")
+
+
+def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others(place):
+    (place / "bad").mkdir()
+    code, out, _ = reconstructed(place, "all", "--workers", 2, frames=("frames", "bad", "others"))
+    assert code == 1
+    assert "holds no frames.h5" in out
+    assert content(place / "all/frames") == content(place / "alone")
+    assert content(place / "all/others") != content(place / "alone")
+    metrics = json.loads((place / "all/frames/metrics.json").read_text())
+    assert 0.05 < metrics["peak_gib"] < 1
+    assert not (place / "all/bad").exists()
+
+
+def test_a_capture_of_one_block_comes_out_as_without_workers(place):
+    (place / "none.yaml").write_text(yaml.safe_dump({"tv": BLOCKS["tv"]}))
+    here(place, "shared", settings="none.yaml")
+    with result_folder(place / "one", "reconstruct") as new:
+        settings = load_settings(place / "none.yaml")
+        reconstruct_folder(place / "frames", new, "tv", settings=settings)
+    for out in ("one", "shared"):
+        assert (place / out / "pictures").is_dir()
+    one, shared = (load_hdf5(place / out / "light_field.h5") for out in ("one", "shared"))
+    np.testing.assert_allclose(one, shared, atol=1e-5)
+
+
+def command(place, out, *more):
+    return subprocess.Popen(
+        [
+            sys.executable, "-c", "from emmc_rig.cli import main; raise SystemExit(main())",
+            "reconstruct", str(place / "frames"), "--method", "tv", "--settings",
+            str(place / "blocks.yaml"), "--out", str(place / out), *map(str, more),
+        ],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def kept(place, out):
+    return place / out / ".emmc-rig.partial/kept"
+
+
+def children(process):
+    task = Path(f"/proc/{process}/task/{process}/children")
+    return [int(one) for one in task.read_text().split()] if task.exists() else []
+
+
+def wait_for(condition, process, steps=6000):
+    """Return whether the condition came true before the process ended."""
+    for _ in range(steps):
+        if condition():
+            return True
+        if process.poll() is not None:
+            return False
+        time.sleep(0.01)
+    raise AssertionError("nothing happened")
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
+def test_killed_at_any_time_the_same_command_goes_on_to_the_same_bytes(place):
+    rng = np.random.default_rng(0)
+    resumed = 0
+    for kill in range(KILLS):
+        out = f"killed-{kill}"
+        after = int(rng.integers(0, 6))
+        running = command(place, out, "--workers", 1)
+
+        def far_enough(out=out, after=after):
+            return len(list(kept(place, out).glob("block-*.json"))) >= after
+
+        if wait_for(far_enough, running):
+            time.sleep(float(rng.uniform(0, 0.3)))
+            workers = children(running.pid)
+            if kill % 2 and workers:
+                os.kill(workers[-1], signal.SIGKILL)  # the command starts another
+            else:
+                running.kill()
+        _, err = running.communicate(timeout=300)
+        assert "Traceback" not in err
+        if running.returncode != 0:
+            resumed += len(list(kept(place, out).glob("block-*.json"))) > 0
+            again = command(place, out, "--workers", 1)
+            _, err = again.communicate(timeout=300)
+            assert again.returncode == 0, err
+        assert content(place / out) == content(place / "alone")
+        assert not kept(place, out).exists()
+    assert resumed > 0 or KILLS < 10
+
+
+def stopped_after(place, out, blocks):
+    """Reconstruct until so many blocks are done; return the folder that keeps them."""
+    with pytest.raises(StoppedHereError):
+        here(place, out, Here(stop_after=1 + blocks))
+    found = sorted(kept(place, out).glob("block-*.json"))
+    assert len(found) == blocks
+    return found
+
+
+def test_blocks_that_are_done_are_not_computed_again(place):
+    stopped_after(place, "stopped", 4)
+    pool = Here()
+    here(place, "stopped", pool)
+    assert len(pool.done) == 2
+    assert content(place / "stopped") == content(place / "alone")
+    assert not kept(place, "stopped").exists()
+
+
+def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
+    found = stopped_after(place, "damaged", 4)
+    with h5py.File(found[0].with_suffix(".h5"), "r+") as file:
+        file["light_field"][0, 0, 0, 0, 0] = 7.0
+    found[1].write_text('{"torn')
+    found[2].with_suffix(".h5").unlink()
+    pool = Here()
+    here(place, "damaged", pool)
+    assert len(pool.done) == 5
+    assert content(place / "damaged") == content(place / "alone")
+
+
+def test_blocks_of_other_frames_are_not_taken(place):
+    stopped_after(place, "changed", 4)
+    here(place, "changed", frames="others")
+    here(place, "fresh", frames="others")
+    assert content(place / "changed") == content(place / "fresh") != content(place / "alone")
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("2GiB", 2**31), ("800MB", 8 * 10**8), ("1.5 gib", 3 * 2**29), ("64", 64)]
+)
+def test_memory_is_read_with_its_unit(text, count):
+    assert parse_memory(text) == count
+
+
+def test_ceilings_and_places_that_cannot_be_are_told_in_one_line(place):
+    with pytest.raises(WrongUsageError, match="2GiB"):
+        parse_memory("much")
+    code, _, err = reconstructed(place, "small", "--memory", "10MB")
+    assert code == 1
+    assert "give more" in err
+    code, _, err = reconstructed(place, "both", "--workers", 2, "--cluster", "tcp://localhost:1")
+    assert code == 2
+    assert not (place / "both").exists()
+    code, _, err = reconstructed(place, "twice", frames=("frames", "frames"))
+    assert code == 2
