@@ -35,7 +35,7 @@ from emmc_rig.pages.timeline import (
     session_metrics,
     timeline_svg,
 )
-from emmc_rig.session.decisions import decided_words, decisions, ended
+from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -231,6 +231,8 @@ def _told(entry: Entry) -> str:
         return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
     if kind == "decided":
         return decided_words(entry)
+    if kind == "metered":
+        return metered_words(entry)
     if kind == "amended":
         return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
