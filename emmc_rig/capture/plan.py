@@ -8,7 +8,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -40,7 +47,9 @@ Exposures = Annotated[
 ]
 """One exposure in seconds, or several: a bracket."""
 MeteredExposures = Annotated[
-    Literal["auto"] | Exposures, WithJsonSchema({"anyOf": [{"const": AUTO}, *_SEVERAL_SCHEMAS]})
+    Annotated[Literal["auto"], Tag(AUTO)] | Annotated[Exposures, Tag("seconds")],
+    Discriminator(lambda value: AUTO if isinstance(value, str) else "seconds"),
+    WithJsonSchema({"anyOf": [{"const": AUTO}, *_SEVERAL_SCHEMAS]}),
 ]
 """As `Exposures`, or metered."""
 

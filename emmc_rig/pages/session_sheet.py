@@ -36,6 +36,7 @@ from emmc_rig.pages.timeline import (
     timeline_svg,
 )
 from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -115,6 +116,7 @@ def _cards(session: Session) -> list[Card]:
         state,
         Card("Frames", f"{stored} of {planned}", kinds),
         Card("Size", shown_bytes(size), "the camera's own bytes"),
+        *_exposure_cards(session),
         Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
     ]
     runs = run_entries(session.journal.entries)
@@ -123,6 +125,19 @@ def _cards(session: Session) -> list[Card]:
         note = f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked"
         cards.append(Card("Hidden writing", f"{last.hidden_share:.0%}", note))
     return cards
+
+
+def _exposure_cards(session: Session) -> list[Card]:
+    """Return what the brightest readings of the shots reach, with what speaks against it."""
+    shots = shot_exposures(session)
+    if not shots:
+        return []
+    levels = [one.level for one in shots]
+    reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
+    reasons = exposure_reasons(shots)
+    note = "; ".join(f"{one.level}: {one.what}; {one.remedy}" for one in reasons)
+    note = note or "of white, the brightest readings of each shot"
+    return [Card("Exposure", reached, note, "watch" if reasons else "good")]
 
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:

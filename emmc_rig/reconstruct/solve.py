@@ -11,12 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.folders import is_session
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.reconstruct.exposure import with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.result import Result
+from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
@@ -141,6 +144,8 @@ def reconstruct_folder(
     result = reconstruct(
         psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
     )
+    if is_session(folder):
+        result = with_exposure(result, Session(folder))
     metrics = {**result.metrics(), "chosen": chosen}
     if truth is not None:
         scene = open_scene(truth, size=psi.size, views=psi.layout.views)

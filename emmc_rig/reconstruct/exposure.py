@@ -1,0 +1,58 @@
+"""What a session's exposures cost its light field, for the verdict of `emmc-rig reconstruct`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from emmc_rig.reconstruct.result import Result
+from emmc_rig.session.exposure import UNDEREXPOSED, exposure_reasons, shot_exposures
+from emmc_rig.session.session import Session
+from reconstruction.adaptive.planning import expected_errors
+from reconstruction.errors import ReconstructionError
+from reconstruction.result import Reconstruction
+
+NEEDED = ("disparity", "disparity_sigma", "texture")
+
+
+def with_exposure(result: Result, session: Session) -> Result:
+    """Return the result with what speaks against the exposures of its shots in the verdict."""
+    shots = shot_exposures(session)
+    dark = [one for one in shots if one.level < UNDEREXPOSED]
+    gain_db = None
+    if dark:
+        factor = float(np.exp(np.mean([np.log(one.factor) for one in shots])))
+        gain_db = expected_gain_db(result, factor)
+    reasons = exposure_reasons(shots, gain_db)
+    return replace(result, verdict=result.verdict.with_reasons(reasons))
+
+
+def expected_gain_db(result: Result, factor: float) -> float | None:
+    """Return what an exposure `factor` times as long is expected to add to the PSNR.
+
+    From Psi and what the scene was estimated to be made of, with shot noise alone. None where the
+    method does not estimate that.
+    """
+    solved: Reconstruction = result.solved
+    if any(name not in solved.maps for name in NEEDED):
+        return None
+    views_v, views_u = solved.light_field.shape[:2]
+    every = [tuple(range(result.psi.shots))]
+    variance = result.frames.noise_sigma**2
+    try:
+        now, then = (
+            expected_errors(
+                result.psi,
+                every,
+                solved.maps["disparity"],
+                solved.maps["disparity_sigma"],
+                solved.maps["texture"],
+                solved.light_field[views_v // 2, views_u // 2],
+                one,
+            )[0]
+            for one in (variance, variance / factor)
+        )
+    except ReconstructionError:
+        return None
+    return float(10 * np.log10(now / then))
