@@ -111,7 +111,7 @@ def test_a_scene_with_a_bright_spot_is_bracketed_and_its_dark_part_read_with_les
     assert taken_s["shot-0-e1-r0"] == pytest.approx(
         BRACKET_STEP * taken_s["shot-0-e0-r0"], rel=0.01
     )
-    assert all(one.saturated < 0.001 for one in shot_exposures(session))
+    assert all(one.saturated < 0.01 for one in shot_exposures(session))
     assert verify(session).is_complete
     plain, _ = captured(AUTO + "metering: {bracket: false}\n", brightness=0.05, spot=8.0)
     assert not any(name.endswith("e1-r0") for name in plain.stored)

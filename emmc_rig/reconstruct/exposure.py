@@ -13,7 +13,7 @@ from reconstruction.adaptive.planning import expected_errors
 from reconstruction.errors import ReconstructionError
 from reconstruction.result import Reconstruction
 
-NEEDED = ("disparity", "disparity_sigma", "texture")
+NEEDED = ("disparity", "disparity_sigma", "texture", "sigma")
 
 
 def with_exposure(result: Result, session: Session) -> Result:
@@ -31,8 +31,9 @@ def with_exposure(result: Result, session: Session) -> Result:
 def expected_gain_db(result: Result, factor: float) -> float | None:
     """Return what an exposure `factor` times as long is expected to add to the PSNR.
 
-    From Psi and what the scene was estimated to be made of, with shot noise alone. None where the
-    method does not estimate that.
+    The method's own deviation says how large the error is. By how much less shot noise lessens it
+    follows from Psi and what the scene was estimated to be made of. None where the method does not
+    estimate that.
     """
     solved: Reconstruction = result.solved
     if any(name not in solved.maps for name in NEEDED):
@@ -55,4 +56,5 @@ def expected_gain_db(result: Result, factor: float) -> float | None:
         )
     except ReconstructionError:
         return None
-    return float(10 * np.log10(now / then))
+    stated = float(np.mean(np.square(solved.maps["sigma"], dtype=np.float64)))
+    return float(10 * np.log10(stated / max(stated - (now - then), then)))
