@@ -26,7 +26,7 @@ PLAN_YAML = """
 camera: rgbw-bayer-3shots
 shots:
   - exposure_s: [0.01, 0.04]
-  - mask_um: [48, 24]
+  - {mask_um: [48, 24], exposure_s: auto}
 whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
 darks: {repeats: 2}
 settle_s: 0.1

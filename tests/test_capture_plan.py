@@ -224,9 +224,7 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     assert planned_camera(plan).shots == camera.shots
     boards = Boards(open=(OpenBoard(held_out=True),))
     assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards) == plan
-    np.testing.assert_allclose(
-        [bracket[0] for bracket in exposures_s(plan, camera)], camera.exposures_s(), rtol=1e-5
-    )
+    assert exposures_s(plan, camera) == [None] * len(camera.shots)  # metered
 
 
 def test_what_differs_between_two_plans_is_named():

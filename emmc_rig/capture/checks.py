@@ -35,10 +35,11 @@ class SaturatedError(FrameRefusedError):
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one frame: share of saturated pixels; mean and 99.9th percentile above black, DN."""
+    """Of one frame: share of saturated pixels; mean, median, 99.9th percentile above black, DN."""
 
     saturated: float
     mean_dn: float
+    median_dn: float
     bright_dn: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -51,9 +52,11 @@ def figures(frame: RawFrame) -> Figures:
     black = float(frame.black_level_dn.mean())
     counts = np.bincount(thinned(frame.mosaic).ravel())
     levels, total = np.arange(counts.size), counts.sum()
-    bright = np.searchsorted(np.cumsum(counts), BRIGHT_PERCENTILE / 100 * total)
+    shares = np.array([0.5, BRIGHT_PERCENTILE / 100])
+    median, bright = np.searchsorted(np.cumsum(counts), shares * total)
     saturated = counts[frame.white_level_dn :].sum() / total
-    return Figures(float(saturated), float(counts @ levels / total) - black, float(bright) - black)
+    mean = float(counts @ levels / total)
+    return Figures(float(saturated), mean - black, float(median) - black, float(bright) - black)
 
 
 def check(
@@ -104,7 +107,10 @@ def exposure_setting(planned: PlannedFrame) -> str:
     if planned.kind == "dark":
         return "darks.exposure_s"
     if planned.kind == "shot":
-        return f"shots.{planned.bench.shot}.exposure_s"
+        metered = planned.exposure_s is None
+        return "metering.level" if metered else f"shots.{planned.bench.shot}.exposure_s"
+    if planned.kind == "metering" and planned.bench.target == "scene":
+        return "metering.longest_s"
     return "whiteboards.exposure_s" if planned.metered_by is None else "whiteboards.level"
 
 

@@ -246,10 +246,14 @@ def run_capture(
         planned = planned_frames(wish, rig)
         edit = None
         if session is None:
-            frames = planned
+            frames = tuple(frame for frame in planned if not frame.is_optional)
         elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
             watcher.tell(edit.words(len(session.stored)))
-            frames = tuple(frame for frame in edit.frames if frame.id not in session.stored)
+            frames = tuple(
+                frame
+                for frame in edit.frames
+                if frame.id not in session.stored and not frame.is_optional
+            )
         else:
             frames = still_possible(wish, session)
         refuse_impossible(rig, frames)

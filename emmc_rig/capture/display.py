@@ -98,6 +98,12 @@ class CaptureDisplay:
         if not self._console.is_terminal and done:
             self.tell(f"{done} of {planned} frames are there already")
 
+    def more(self, planned: int) -> None:
+        """Lengthen the bar."""
+        self._planned = planned
+        if self._task is not None:
+            self._progress.update(self._task, total=planned)
+
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Say what is under way."""
         if self._live is not None and self._task is not None and name != "write":

@@ -10,8 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 from calibration.whiteboard import LAMP_COLOURS
+from emmc_rig.capture.metering import BRACKET_STEP, MOST_STEPS
 from emmc_rig.capture.order import spread
-from emmc_rig.capture.plan import METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.capture.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
@@ -24,11 +25,13 @@ TURN_DEG = 90.0
 RESPONSE_REPEATS = 2
 
 
-def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...]]:
-    """Return each shot's exposures, shortest first; camera: as planned."""
+def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...] | None]:
+    """Return each shot's exposures, shortest first, None where metered; camera: as planned."""
     own = camera.exposures_s()
     return [
-        tuple(sorted(set(shot.exposure_s or (float(own[place]),))))
+        None
+        if shot.exposure_s == AUTO
+        else tuple(sorted(set(shot.exposure_s or (float(own[place]),))))
         for place, shot in enumerate(plan.shots)
     ]
 
@@ -220,7 +223,7 @@ def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[Plann
 
 
 def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
-    """Return how a whiteboard of the first shot is exposed; light: so many times less."""
+    """Return how a whiteboard of the first shot is exposed; light: how many times as long as metered."""
     boards = plan.whiteboards or Boards()
     if boards.exposure_s is not None:
         return {"exposure_s": boards.exposure_s * light, "light": light}
@@ -285,18 +288,59 @@ def _open_bench(
     return Bench("whiteboard", OPEN_LAMP, 0, 0, masks_in, {**(offsets_um or {}), **window})
 
 
+def _scene_bench(plan: Plan, camera: Camera, place: int, window_um: float) -> Bench:
+    """Return how the bench stands for a shot of the scene."""
+    offsets_um = mask_offsets_um(camera, place)
+    offsets_um |= {"aperture_x": window_um, "aperture_y": 0.0}
+    lamp = plan.shots[place].lamp
+    return Bench("scene", lamp, place, fittings(camera)[place], True, offsets_um)
+
+
+def _scene_meterings(plan: Plan, camera: Camera, window_um: float) -> dict[int, PlannedFrame]:
+    """Return the frame that meters each shot whose exposure is metered.
+
+    Shots that are to be exposed alike share it where masks, filter, lamp and gain are the same.
+    """
+    found: dict[int, PlannedFrame] = {}
+    shared: dict[object, PlannedFrame] = {}
+    for place, shot in enumerate(plan.shots):
+        if shot.exposure_s != AUTO:
+            continue
+        bench = _scene_bench(plan, camera, place, window_um)
+        group = (bench.fitting, shot.lamp, shot.gain) if plan.metering.alike else place
+        name = f"meter-shot-{place}"
+        frame = PlannedFrame(name, "metering", bench, METERING_EXPOSURE_S, shot.gain)
+        found[place] = shared.setdefault(group, frame)
+    return found
+
+
 def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    fitted = fittings(camera)
+    meterings = _scene_meterings(plan, camera, window_um)
+    yield from {frame.id: frame for frame in meterings.values()}.values()
+    steps = MOST_STEPS if plan.metering.bracket else 0
     for place, (shot, bracket) in enumerate(
         zip(plan.shots, exposures_s(plan, camera), strict=True)
     ):
-        offsets_um = mask_offsets_um(camera, place)
-        offsets_um |= {"aperture_x": window_um, "aperture_y": 0.0}
-        bench = Bench("scene", shot.lamp, place, fitted[place], True, offsets_um)
-        for step, exposure_s in enumerate(bracket):
+        bench = _scene_bench(plan, camera, place, window_um)
+        metered_by = meterings[place].id if bracket is None else None
+        exposures: list[tuple[float | None, float]] = (
+            [(exposure_s, 1.0) for exposure_s in bracket]
+            if bracket
+            else [(None, BRACKET_STEP**step) for step in range(steps + 1)]
+        )
+        for step, (exposure_s, light) in enumerate(exposures):
             for repeat in range(shot.repeats):
                 name = f"shot-{place}-e{step}-r{repeat}"
-                yield PlannedFrame(name, "shot", bench, exposure_s, shot.gain, repeat)
+                yield PlannedFrame(
+                    name,
+                    "shot",
+                    bench,
+                    exposure_s,
+                    shot.gain,
+                    repeat,
+                    metered_by=metered_by,
+                    light=light,
+                )
 
 
 def fittings(camera: Camera) -> list[int]:

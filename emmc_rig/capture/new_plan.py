@@ -19,6 +19,7 @@ camera: {name}              # a shipped camera (`emmc-rig cameras`), or a YAML f
 
 # The shots of the scene. Each takes masks, mask place and filter from the camera's own shot.
 #   mask_um: [x, y]         moves the mask stage elsewhere; or in cells: mask_cells: [x, y]
+#   exposure_s: auto        metered on the scene, see `metering`; or seconds
 #   exposure_s: [0.004, 0.016, 0.064]   a bracket, fused to one linear frame with its variance
 #   gain: 1   repeats: 1   lamp: white   camera_shot: which of the camera's shots this is
 shots:
@@ -35,6 +36,12 @@ whiteboards:
   repeats: 2
   references: 4
   level: 0.7                # of white, where metering aims; or exposure_s: of the references
+
+metering:                   # of shots with exposure_s: auto
+  level: 0.7                # of white, where the brightest readings come
+  bracket: true             # longer exposures too, where most of the scene is far darker
+  alike: true               # the same for all shots of one lamp and gain
+  longest_s: 30
 
 darks:
   exposure_s: [0.01]
@@ -64,5 +71,5 @@ def _shot(camera: Camera, place: int) -> str:
     ]
     chosen = camera.shots[place].filter
     notes = [*offsets, *([] if chosen == "none" else [f"{chosen} filter"])]
-    line = f"  - exposure_s: {float(camera.exposures_s()[place]):.6g}"
+    line = "  - exposure_s: auto"
     return f"{line:<28}# {'; '.join(notes)}" if notes else line

@@ -30,7 +30,9 @@ def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, .
         return frames
     groups: dict[object, list[PlannedFrame]] = {}
     for frame in frames:
-        key = (frame.part, frame.bench.lamp == "off", *frame.bench.set_by_hand)
+        # The scene is metered, all of it, before the first shot.
+        meters = frame.kind == "metering" and frame.bench.target == "scene"
+        key = (frame.part, frame.bench.lamp == "off", meters, *frame.bench.set_by_hand)
         groups.setdefault(key, []).append(frame)
     found: list[PlannedFrame] = []
     at_um: dict[str, float] = {}

@@ -8,7 +8,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -29,16 +36,22 @@ def _several(value: object) -> object:
     return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
+AUTO = "auto"
 _POSITIVE_SCHEMA = {"type": "number", "exclusiveMinimum": 0}
+_SEVERAL_SCHEMAS = [_POSITIVE_SCHEMA, {"type": "array", "items": _POSITIVE_SCHEMA, "minItems": 1}]
 Exposures = Annotated[
     tuple[Positive, ...],
     BeforeValidator(_several),
     Field(min_length=1),
-    WithJsonSchema(
-        {"anyOf": [_POSITIVE_SCHEMA, {"type": "array", "items": _POSITIVE_SCHEMA, "minItems": 1}]}
-    ),
+    WithJsonSchema({"anyOf": _SEVERAL_SCHEMAS}),
 ]
 """One exposure in seconds, or several: a bracket."""
+MeteredExposures = Annotated[
+    Annotated[Literal["auto"], Tag(AUTO)] | Annotated[Exposures, Tag("seconds")],
+    Discriminator(lambda value: AUTO if isinstance(value, str) else "seconds"),
+    WithJsonSchema({"anyOf": [{"const": AUTO}, *_SEVERAL_SCHEMAS]}),
+]
+"""As `Exposures`, or metered."""
 
 
 class PlannedShot(Settings):
@@ -53,8 +66,9 @@ class PlannedShot(Settings):
     )
     mask_um: tuple[float, float] | None = Field(default=None, description="x, y from the axis")
     mask_cells: tuple[float, float] | None = Field(default=None, description="x, y in mask cells")
-    exposure_s: Exposures | None = Field(
-        default=None, description="seconds; several are a bracket; default: the camera's own"
+    exposure_s: MeteredExposures | None = Field(
+        default=None,
+        description="auto: metered; or seconds, several are a bracket; default: the camera's own",
     )
     gain: Gain = 1.0
     repeats: Repeats = 1
@@ -117,6 +131,19 @@ class Boards(Settings):
     )
 
 
+class Metering(Settings):
+    """Of shots with `exposure_s: auto`: where their exposure is aimed at."""
+
+    level: float = Field(
+        default=0.7, gt=0, lt=1, description="of white, where the brightest readings come"
+    )
+    bracket: bool = Field(
+        default=True, description="longer exposures too, where most of a scene is far darker"
+    )
+    alike: bool = Field(default=True, description="the same for all shots of one lamp and gain")
+    longest_s: Positive = Field(default=30.0, description="no exposure is made longer than this")
+
+
 class Darks(Settings):
     """Dark frames, the lamp off."""
 
@@ -159,6 +186,7 @@ class Plan(Settings):
     shots: tuple[PlannedShot, ...] = Field(min_length=1)
     whiteboards: Boards | None = Boards()
     darks: Darks | None = Darks()
+    metering: Metering = Metering()
     order: Literal["least-travel", "as-planned"] = "least-travel"
     settle_s: float = Field(
         default=0.0, ge=0, le=3600, description="after a move, beyond the stage's own"

@@ -31,6 +31,7 @@ from emmc_rig.capture.checks import (
 from emmc_rig.capture.control import Control, uninterrupted
 from emmc_rig.capture.metering import (
     METERING_TRIES,
+    asked_of_scene,
     better_metering_s,
     first_meterings,
     metered_exposure_s,
@@ -45,6 +46,7 @@ from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.rig.hardware import Rig
 from emmc_rig.rig.registration import Shift, registered
 from emmc_rig.rig.trigger import EDGE_WAIT_S, signalling, triggered
+from emmc_rig.session.decisions import metered, metered_words
 from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
@@ -184,11 +186,32 @@ class Sequencer:
         self._applied = _Applied()
 
     def _take_all(self, frames: tuple[PlannedFrame, ...]) -> bool:
-        """Take the frames; returns False when the capture was told to stop."""
+        """Take the frames; returns False when the capture was told to stop.
+
+        Ends early where metering the scene asked for more frames than were known of.
+        """
         for frame in frames:
             if not self._control.may_go_on():
                 return False
+            if frame.is_metered_shot and self._decide_exposures():
+                return True
             self._take(frame)
+        return True
+
+    def _decide_exposures(self) -> bool:
+        """Decide once by what metered shots are exposed; returns whether frames were added."""
+        session = self._session
+        if metered(session.journal.entries) is not None:
+            return False
+        asked = asked_of_scene(
+            session.frames, self._metered, self._plan.metering, self._camera.exposure_limits_s
+        )
+        self._note("metered", **asked, wall=self._wall())
+        self._writer.flush()
+        self._watcher.tell(metered_words(asked))
+        if not asked["asked"]:
+            return False
+        self._watcher.more(len(session.needed))
         return True
 
     def _take(self, planned: PlannedFrame) -> None:
@@ -347,17 +370,24 @@ class Sequencer:
         """Return the exposure to ask the camera for."""
         if planned.exposure_s is not None:
             return planned.exposure_s
+        if planned.kind == "shot":
+            asked = metered(self._session.journal.entries)
+            assert asked is not None
+            return asked["exposures_s"][str(planned.bench.shot)] * planned.light
         assert planned.metered_by is not None
-        metered = self._metered[planned.metered_by]
+        entry = self._metered[planned.metered_by]
         level = (self._plan.whiteboards or Boards()).level
-        return metered_exposure_s(metered, level, planned.light, self._camera.exposure_limits_s)
+        return metered_exposure_s(entry, level, planned.light, self._camera.exposure_limits_s)
 
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         if planned.kind != "metering":
             return self._snap(planned, exposure_s)
+        low_s, high_s = self._camera.exposure_limits_s
+        if planned.bench.target == "scene":
+            high_s = min(high_s, self._plan.metering.longest_s)
         for _ in range(METERING_TRIES):
             frame, found = self._snap(planned, exposure_s)
-            next_s = better_metering_s(frame, found, exposure_s, self._camera.exposure_limits_s)
+            next_s = better_metering_s(frame, found, exposure_s, (low_s, high_s))
             if next_s is None:
                 break
             exposure_s = next_s
@@ -537,14 +567,18 @@ class Sequencer:
 
 def _may_saturate(frames: tuple[PlannedFrame, ...]) -> set[str]:
     """Return the ids of metering frames, and of those with a shorter exposure in their bracket."""
-    shortest_s: dict[int, float] = {}
+
+    def exposed(frame: PlannedFrame) -> float:
+        return frame.light if frame.exposure_s is None else frame.exposure_s
+
+    shortest: dict[int, float] = {}
     for frame in frames:
-        if frame.kind == "shot" and frame.exposure_s is not None:
+        if frame.kind == "shot":
             shot = frame.bench.shot
-            shortest_s[shot] = min(frame.exposure_s, shortest_s.get(shot, frame.exposure_s))
+            shortest[shot] = min(exposed(frame), shortest.get(shot, exposed(frame)))
     return {
         frame.id
         for frame in frames
         if frame.kind == "metering"
-        or (frame.kind == "shot" and frame.exposure_s != shortest_s[frame.bench.shot])
+        or (frame.kind == "shot" and exposed(frame) != shortest[frame.bench.shot])
     }

@@ -119,7 +119,7 @@ class Until:
             "expected_db": {str(shot): value for shot, value in found.expected_db.items()},
             "spared": spared,
             "spared_frames": sum(
-                frame.kind == "shot" and frame.bench.shot in spared for frame in session.frames
+                frame.kind == "shot" and frame.bench.shot in spared for frame in session.needed
             ),
             "method": METHOD,
             "advice": found.advice,

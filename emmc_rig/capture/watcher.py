@@ -18,6 +18,10 @@ class Watcher(Protocol):
         """So many frames are there already."""
         ...
 
+    def more(self, planned: int) -> None:
+        """So many frames are to be taken in all, more than were known of."""
+        ...
+
     def step(self, name: str, frame: PlannedFrame) -> None:
         """A step of a frame begins: one of `STEPS`."""
         ...
@@ -39,6 +43,9 @@ class Unwatched:
     """A watcher that shows nothing."""
 
     def begin(self, done: int, planned: int) -> None:
+        """Ignore it."""
+
+    def more(self, planned: int) -> None:
         """Ignore it."""
 
     def step(self, name: str, frame: PlannedFrame) -> None:

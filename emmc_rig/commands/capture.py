@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 from rich.console import Console
 
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -106,6 +108,7 @@ def _run(
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.rig.rig_config import rig_description
     from emmc_rig.session.decisions import decided_words, ended
+    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.session import REPORT
 
     chosen = None if rig is None else rig_description(rig, imaged)
@@ -143,4 +146,6 @@ def _run(
     last = ended(session.journal.entries)
     if last is not None:
         typer.echo(decided_words(last))
+    for reason in exposure_reasons(shot_exposures(session)):
+        show_reason(**asdict(reason))
     typer.echo(f"open {session.folder / REPORT}")

@@ -46,6 +46,7 @@ def show(session: Folder) -> None:
     """Show what a session holds, without reading its frames."""
     from emmc_rig.files.results import shown_bytes
     from emmc_rig.pages.session_sheet import events
+    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.listing import summary
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
@@ -68,6 +69,8 @@ def show(session: Folder) -> None:
         typer.echo(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
     for name in foreign:
         typer.echo(f"  {name}: not of this session")
+    for reason in exposure_reasons(shot_exposures(opened)):
+        typer.echo(f"  {reason.level:<12} {reason.what}; {reason.remedy}")
     for kind, line in events(opened):
         typer.echo(f"  {kind:<12} {line}")
 

@@ -7,11 +7,15 @@ import typer
 VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
 
 
+def show_reason(level: str, what: str, remedy: str, figure: float) -> None:
+    """Print one reason in a line."""
+    typer.secho(f"{level}: {what}; {remedy}", fg=VERDICT_COLOURS[level])
+
+
 def show_verdict(verdict: dict) -> None:
     """Print a verdict, a line for each reason."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
         typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
     for reason in verdict["reasons"]:
-        what, remedy = reason["what"], reason["remedy"]
-        typer.secho(f"{reason['level']}: {what}; {remedy}", fg=VERDICT_COLOURS[reason["level"]])
+        show_reason(**reason)

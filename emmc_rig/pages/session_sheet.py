@@ -35,7 +35,8 @@ from emmc_rig.pages.timeline import (
     session_metrics,
     timeline_svg,
 )
-from emmc_rig.session.decisions import decided_words, decisions, ended
+from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import KINDS, PlannedFrame
@@ -117,6 +118,7 @@ def _cards(session: Session) -> list[Card]:
         state,
         Card("Frames", f"{stored} of {planned}", kinds),
         Card("Size", shown_bytes(size), "the camera's own bytes"),
+        *_exposure_cards(session),
         Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
     ]
     runs = run_entries(session.journal.entries)
@@ -125,6 +127,19 @@ def _cards(session: Session) -> list[Card]:
         note = f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked"
         cards.append(Card("Hidden writing", f"{last.hidden_share:.0%}", note))
     return cards
+
+
+def _exposure_cards(session: Session) -> list[Card]:
+    """Return what the brightest readings of the shots reach, with what speaks against it."""
+    shots = shot_exposures(session)
+    if not shots:
+        return []
+    levels = [one.level for one in shots]
+    reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
+    reasons = exposure_reasons(shots)
+    note = "; ".join(f"{one.level}: {one.what}; {one.remedy}" for one in reasons)
+    note = note or "of white, the brightest readings of each shot"
+    return [Card("Exposure", reached, note, "watch" if reasons else "good")]
 
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
@@ -233,6 +248,8 @@ def _told(entry: Entry) -> str:
         return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
     if kind == "decided":
         return decided_words(entry)
+    if kind == "metered":
+        return metered_words(entry)
     if kind == "amended":
         return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
     return f"{entry['wall']}: every frame verified" if kind == "complete" else ""

@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from emmc_rig.pages.page import fragment
 from emmc_rig.session.decisions import decisions
+from emmc_rig.session.exposure import shot_exposures
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.session import Session
 
@@ -100,6 +101,7 @@ def session_metrics(session: Session) -> dict[str, object]:
         "stored": len(session.stored),
         "complete": session.is_complete,
         "bytes": sum(entry["bytes"] for entry in session.stored.values()),
+        "exposures": [asdict(one) for one in shot_exposures(session)],
         "retries": sum(entry["kind"] == "retry" for entry in entries),
         "runs": [
             {"frames": len(run), **asdict(told), "hidden_share": told.hidden_share}

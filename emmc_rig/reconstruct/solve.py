@@ -15,16 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.folders import kept_folder
+from emmc_rig.files.folders import is_session, kept_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.pool import Pool, opened_pool
 from emmc_rig.reconstruct.result import LIGHT_FIELD, MAPS, Result, compared, figures
 from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
+from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
@@ -158,6 +160,7 @@ def reconstruct_folder(
     find_method(method)
     settings = settings or MethodSettings()
     frames, psi_path = stored_frames(folder, out, psi_path)
+    session = Session(folder) if is_session(folder) else None
     saved = SavedPsi(psi_path)
     one_block = is_one_block(saved.size, settings)
     if one_block and pool is None:
@@ -165,10 +168,9 @@ def reconstruct_folder(
         result = reconstruct(
             psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
         )
-        metrics = {
-            **result.metrics(),
-            "chosen": chosen,
-        }
+        if session is not None:
+            result = with_exposure(result, session)
+        metrics = {**result.metrics(), "chosen": chosen}
         metrics |= _compared(result.light_field, truth, psi.layout)
         result.write(out, metrics)
         return metrics
@@ -197,10 +199,14 @@ def reconstruct_folder(
             ImagingMatrix.load(psi_path),
             frames,
         )
+        if session is not None:
+            small = with_exposure(small, session)
         metrics = {**small.metrics(), "chosen": chosen, **blocks.metrics()}
         metrics |= _compared(light_field, truth, saved)
         small.write(out, metrics)
         return metrics
+    if session is not None:
+        verdict = verdict_with_exposure(verdict, session)
     with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
         file.attrs["method"] = method
         for name, (shape, dtype) in blocks.shapes().items():

@@ -4,6 +4,10 @@ A capture that ends when the scene needs no more shots writes two kinds of line.
 on the wanted PSNR is `target_db`. `decided`: of the `shots` taken the PSNR stated is `stated_db`;
 `next` is the shot to take now; without one the `spared` shots are not taken, of `spared_frames`
 frames, for the reason in `why`. After an amendment of the plan it is decided anew.
+
+Where shots are metered, a line `metered` says before the first of them by what `exposures_s` each
+shot is taken, and which longer frames of brackets, not taken otherwise, are `asked` for. This too
+is decided anew after an amendment.
 """
 
 from __future__ import annotations
@@ -39,6 +43,27 @@ def spared_shots(entries: Sequence[Entry]) -> frozenset[int]:
     """Return the shots that need not be taken."""
     last = ended(entries)
     return frozenset(() if last is None else last["spared"])
+
+
+def metered(entries: Sequence[Entry]) -> Entry | None:
+    """Return what metering of the scene asks for; None while that is open."""
+    for entry in reversed(entries):
+        if entry["kind"] in ("metered", "amended"):
+            return entry if entry["kind"] == "metered" else None
+    return None
+
+
+def metered_words(entry: Entry) -> str:
+    """Return what metering asks for, for people."""
+    by_exposure: dict[float, list[str]] = {}
+    for shot, exposure_s in entry["exposures_s"].items():
+        by_exposure.setdefault(exposure_s, []).append(shot)
+    told = ", ".join(
+        f"shots {', '.join(shots)} by {exposure_s:.3g} s"
+        for exposure_s, shots in by_exposure.items()
+    )
+    longer = f"; {len(entry['asked'])} longer frames, for the dark parts" if entry["asked"] else ""
+    return f"metered: {told}{longer}"
 
 
 def decided_words(entry: Entry) -> str:

@@ -20,6 +20,7 @@ NEEDED: dict[str, dict[str, type]] = {
     "amended": {"sha256": dict, "frames": int},
     "frame": {"id": str, "file": str, "bytes": int, "sha256": str},
     "discarded": {"id": str},
+    "metered": {"exposures_s": dict, "asked": list},
     "decided": {"shots": list, "spared": list, "spared_frames": int},
 }
 """What a line of a kind holds at least, and of which type: one without it counts as damaged."""

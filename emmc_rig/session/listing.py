@@ -9,7 +9,7 @@ from pathlib import Path
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.model.reading import parse_json
-from emmc_rig.session.decisions import ended
+from emmc_rig.session.decisions import ended, metered
 from emmc_rig.session.journal import heads
 from emmc_rig.session.session import HEADER, JOURNAL, count_stored, found_complete
 
@@ -49,6 +49,8 @@ def summary(folder: Path) -> Summary:
     last = ended(entries)
     begun = next(e for e in reversed(entries) if e["kind"] in ("created", "amended"))
     planned = begun["frames"] - (0 if last is None else last["spared_frames"])
+    asked = metered(entries)
+    planned += 0 if asked is None else len(asked["asked"])
     return Summary(name, title, created, state, len(stored), planned, size)
 
 

@@ -49,10 +49,11 @@ class Bench:
 class PlannedFrame:
     """One frame; `id` is unique in its session.
 
-    exposure_s: None where it is metered: then `light` times less light than in the metering
-    frame `metered_by` comes to the sensor. view: (v, u) of a whiteboard's pinhole. Frames of one
-    shot that differ in exposure alone are its bracket; `repeat` counts equal ones. part: frames
-    of one come before those of the next, in whatever order else.
+    exposure_s: None where it is metered, by the frame `metered_by`: then it is exposed `light`
+    times as long as that frame asks for, a whiteboard because so much less light comes to the
+    sensor. view: (v, u) of a whiteboard's pinhole. Frames of one shot that differ in exposure
+    alone are its bracket; `repeat` counts equal ones. part: frames of one come before those of
+    the next, in whatever order else.
     """
 
     id: str
@@ -65,6 +66,16 @@ class PlannedFrame:
     metered_by: str | None = None
     light: float = 1.0
     part: int = 0
+
+    @property
+    def is_metered_shot(self) -> bool:
+        """Whether it shows the scene, exposed as metering asks for."""
+        return self.kind == "shot" and self.exposure_s is None
+
+    @property
+    def is_optional(self) -> bool:
+        """Whether it is only taken where metering asks for it: a longer one of a bracket."""
+        return self.is_metered_shot and self.light > 1
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, for JSON."""

@@ -45,7 +45,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import FILES, PARTIAL, SESSION_HEADER, SESSION_JOURNAL
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.reading import parse_json
-from emmc_rig.session.decisions import spared_shots, wanted_db
+from emmc_rig.session.decisions import metered, spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.storage import (
@@ -119,7 +119,7 @@ class Session:
             "kind": "created",
             "format": FORMAT,
             "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
-            "frames": len(frozen.frames),
+            "frames": _certain(frozen.frames),
         }
         try:
             make_folder_whole(
@@ -145,7 +145,7 @@ class Session:
             "amended",
             plan=number,
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
-            frames=len(frozen.frames),
+            frames=_certain(frozen.frames),
             kept=len(self.stored),
             changes=list(changes),
             wall=wall_time(),
@@ -261,9 +261,20 @@ class Session:
 
     @property
     def needed(self) -> tuple[PlannedFrame, ...]:
-        """Every frame to be taken but those of shots that the scene was found not to need."""
+        """Every frame to be taken.
+
+        Without those of shots that the scene was found not to need, and longer ones of brackets
+        that metering does not ask for.
+        """
         spared = spared_shots(self.journal.entries)
-        return tuple(f for f in self.frames if f.kind != "shot" or f.bench.shot not in spared)
+        decided = metered(self.journal.entries)
+        asked = set() if decided is None else set(decided["asked"])
+        return tuple(
+            frame
+            for frame in self.frames
+            if not (frame.kind == "shot" and frame.bench.shot in spared)
+            and not (frame.is_optional and frame.id not in asked)
+        )
 
     def missing(self) -> tuple[PlannedFrame, ...]:
         """Return the frames that are still to be taken, in order."""
@@ -425,6 +436,11 @@ def _planned_files(frozen: Frozen) -> dict[str, bytes]:
         RIG: _json(frozen.rig),
         ORDER: _json_lines([frame.as_dict() for frame in frozen.frames]),
     }
+
+
+def _certain(frames: Iterable[PlannedFrame]) -> int:
+    """Return how many frames are taken whatever metering asks for."""
+    return sum(not frame.is_optional for frame in frames)
 
 
 def _json(data: Mapping[str, Any]) -> bytes:

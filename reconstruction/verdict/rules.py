@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -87,6 +87,10 @@ class Verdict:
     reasons: tuple[Reason, ...]
     evidence: Evidence
 
+    def with_reasons(self, more: Iterable[Reason]) -> Verdict:
+        """Return the verdict with further reasons in it, none of which speaks for trust."""
+        return _of(self.evidence, (*self.reasons, *more))
+
     @property
     def words(self) -> str:
         """The verdict in one line."""
@@ -111,8 +115,12 @@ def judged(evidence: Evidence) -> Verdict:
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
-    found.sort(key=lambda one: -LEVELS.index(one.level))
-    return Verdict(found[0].level if found else "trust", tuple(found), evidence)
+    return _of(evidence, found)
+
+
+def _of(evidence: Evidence, reasons: Iterable[Reason]) -> Verdict:
+    gravest = sorted(reasons, key=lambda one: -LEVELS.index(one.level))
+    return Verdict(gravest[0].level if gravest else "trust", tuple(gravest), evidence)
 
 
 def _sensitivity(e: Evidence) -> Sensitivity:

@@ -1,0 +1,100 @@
+"""How well a session's shots are exposed, from the figures in its journal: no frame is read."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.session import Session
+from reconstruction.verdict.rules import Reason
+
+GOOD_LEVEL = 0.7
+"""Of white, as metering aims by default: what exposures are compared with."""
+UNDEREXPOSED = 0.25
+"""Of white: 4.5 dB of the readings' noise are given away below it. A camera of full stops comes to
+half of what metering aims at."""
+OVEREXPOSED = 0.001
+"""Share of the readings that are saturated by every exposure: the rest of 99.9 %, by which frames
+are metered."""
+
+
+@dataclass(frozen=True)
+class ShotExposure:
+    """Of one shot: how bright its brightest readings are, and the share that no exposure holds.
+
+    level: 1 at white, by its longest exposure. saturated: by its shortest.
+    """
+
+    shot: int
+    level: float
+    saturated: float
+
+    @property
+    def factor(self) -> float:
+        """By how much longer it could have been exposed; 1 or more."""
+        return max(1.0, GOOD_LEVEL / max(self.level, 1e-4))
+
+
+def shot_exposures(session: Session) -> list[ShotExposure]:
+    """Return how each shot of the scene is exposed whose frames are taken, by its place."""
+    frames: dict[int, list[Entry]] = defaultdict(list)
+    for frame in session.needed:
+        entry = session.stored.get(frame.id)
+        if frame.kind == "shot" and entry is not None:
+            frames[frame.bench.shot].append(entry)
+    return [_of_shot(shot, entries) for shot, entries in sorted(frames.items())]
+
+
+def _of_shot(shot: int, entries: Sequence[Entry]) -> ShotExposure:
+    levels = [
+        one["figures"]["bright_dn"] / (one["white_level_dn"] - np.mean(one["black_level_dn"]))
+        for one in entries
+    ]
+    return ShotExposure(
+        shot, float(max(levels)), float(min(one["figures"]["saturated"] for one in entries))
+    )
+
+
+def exposure_reasons(shots: Sequence[ShotExposure], gain_db: float | None = None) -> list[Reason]:
+    """Return what speaks against the exposures of shots; nothing for good ones.
+
+    gain_db: of the light field's PSNR, expected from exposing as long as is good.
+    """
+    found = []
+    dark = [one for one in shots if one.level < UNDEREXPOSED]
+    if dark:
+        worst = min(dark, key=lambda one: one.level)
+        quieter_db = 10 * math.log10(worst.factor)
+        gain = "" if gain_db is None else f"about {gain_db:.1f} dB of the light field to gain, and "
+        found.append(
+            Reason(
+                f"the brightest reading of {_shots(worst, dark)} is {worst.level:.1%} of white: "
+                f"{gain}{quieter_db:.1f} dB or more of the readings' noise",
+                worst.level,
+                f"expose {worst.factor:.2g} times as long, or write exposure_s: auto",
+                "doubt",
+            )
+        )
+    bright = [one for one in shots if one.saturated > OVEREXPOSED]
+    if bright:
+        worst = max(bright, key=lambda one: one.saturated)
+        found.append(
+            Reason(
+                f"{worst.saturated:.1%} of the readings of {_shots(worst, bright)} are saturated "
+                "by every exposure",
+                worst.saturated,
+                "add a shorter exposure, or write exposure_s: auto",
+                "doubt",
+            )
+        )
+    return found
+
+
+def _shots(worst: ShotExposure, alike: Sequence[ShotExposure]) -> str:
+    others = "" if len(alike) == 1 else f" (the worst of {len(alike)} such)"
+    return f"shot {worst.shot}{others}"
