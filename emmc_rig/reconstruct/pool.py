@@ -197,6 +197,7 @@ class Cluster:
         """Yield each item with its result, see `Pool.run`."""
         from distributed import CancelledError, KilledWorker
         from distributed import as_completed as completed
+        from distributed.comm.core import CommClosedError
 
         futures = self._client.map(partial(_on_one_thread, task), list(items), pure=False)
         of = dict(zip((future.key for future in futures), items, strict=True))
@@ -204,7 +205,7 @@ class Cluster:
             for future in completed(futures, loop=self._client.loop):
                 yield of[future.key], future.result()
                 future.release()
-        except (KilledWorker, CancelledError, OSError) as fault:
+        except (KilledWorker, CancelledError, CommClosedError) as fault:
             raise WorkersError(
                 f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
             ) from fault
