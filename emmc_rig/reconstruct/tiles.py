@@ -118,7 +118,7 @@ def fingerprint_of(
 
 def _write_json(path: Path, content: object) -> None:
     with whole_file(path) as partial, open(partial, "w", encoding="utf-8") as file:
-        json.dump(content, file)
+        json.dump(content, file, default=float)
         file.flush()
         os.fsync(file.fileno())
 
