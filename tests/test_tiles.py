@@ -132,8 +132,8 @@ def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
     part, expected = (source.window(slice(4, 20), slice(10, 30)) for source in (saved, psi))
     np.testing.assert_array_equal(part.weights, expected.weights)
     np.testing.assert_array_equal(part.colour, expected.colour)
-    found = [in_blocks("tv", source, frames, SMALL)[0].light_field for source in (psi, saved)]
-    np.testing.assert_array_equal(*found)
+    one, other = (in_blocks("tv", source, frames, SMALL)[0] for source in (psi, saved))
+    np.testing.assert_array_equal(one.light_field, other.light_field)
 
 
 def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):

@@ -1,5 +1,6 @@
 """Blocks on workers: the same bytes whoever computes them, and whatever is killed."""
 
+import errno
 import json
 import os
 import signal
@@ -8,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import h5py
 import numba
 import numpy as np
 import pytest
@@ -16,13 +16,15 @@ import yaml
 from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
-from emmc_rig.errors import WrongUsageError
+from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.reconstruct import tiles
 from emmc_rig.reconstruct.captures import parse_memory
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.solve import reconstruct_folder
+from reconstruction.errors import ReconstructionError
 
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 BLOCKS = {"blocks": {"whole": 1000, "side": 32, "blend": 4}, "tv": {"max_steps": 20}}
@@ -213,14 +215,48 @@ def test_blocks_that_are_done_are_not_computed_again(place):
 
 def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
     found = stopped_after(place, "damaged", 4)
-    with h5py.File(found[0].with_suffix(".h5"), "r+") as file:
-        file["light_field"][0, 0, 0, 0, 0] = 7.0
+    content_of = bytearray(found[0].with_suffix(".h5").read_bytes())
+    content_of[-1000] ^= 1
+    found[0].with_suffix(".h5").write_bytes(content_of)
     found[1].write_text('{"torn')
     found[2].with_suffix(".h5").unlink()
     pool = Here()
     here(place, "damaged", pool)
     assert len(pool.done) == 5
     assert content(place / "damaged") == content(place / "alone")
+
+
+def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, monkeypatch):
+    pool, written = Here(), tiles._write_arrays
+
+    def write_arrays(path, arrays):
+        if len(pool.done) == 4:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return written(path, arrays)
+
+    monkeypatch.setattr(tiles, "_write_arrays", write_arrays)
+    with pytest.raises(AppError, match="No space left"):
+        here(place, "full", pool)
+    monkeypatch.undo()
+    assert not (place / "full/light_field.h5").exists()
+    again = Here()
+    here(place, "full", again)
+    assert len(again.done) == 4
+    assert content(place / "full") == content(place / "alone")
+
+
+def test_a_block_that_fails_is_named_and_the_others_are_kept(place, monkeypatch):
+    pool, solved = Here(), tiles.solve_block
+
+    def solve_block(*given):
+        if len(pool.done) == 4:
+            raise ReconstructionError("the frames hold values that are not finite: exclude them")
+        return solved(*given)
+
+    monkeypatch.setattr(tiles, "solve_block", solve_block)
+    with pytest.raises(AppError, match=r"rows 0 to 32, columns 54 to 80 .* not finite"):
+        here(place, "bad-block", pool)
+    assert len(list(kept(place, "bad-block").glob("block-*.json"))) == 2
 
 
 def test_blocks_of_other_frames_are_not_taken(place):

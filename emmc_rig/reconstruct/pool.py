@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
@@ -145,9 +146,17 @@ class Processes:
                 self._executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _fingerprint() -> dict[str, str]:
+def fingerprint() -> dict[str, str]:
     """Return what workers and the program must have alike."""
     return {"emmc-rig": __version__, "python": ".".join(platform.python_version_tuple()[:2])}
+
+
+def _on_one_thread(task: Callable[[Item], Result], item: Item) -> Result:
+    """Return the result of a task in a thread of a worker, which may have others beside it."""
+    import numba
+
+    numba.set_num_threads(1)
+    return task(item)
 
 
 class Cluster:
@@ -165,14 +174,14 @@ class Cluster:
         """Raise WorkersError where there are no workers, or some with other versions."""
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
-            found: Mapping[str, dict[str, str]] = self._client.run(_fingerprint)
+            found: Mapping[str, dict[str, str]] = self._client.run(fingerprint)
         except Exception as fault:  # whatever a worker without this program raises
             kind = type(fault).__name__
             raise WorkersError(
                 f"--cluster {self._address}: no worker there runs emmc-rig "
                 f"({kind}: {one_line(fault)}); install emmc-rig {__version__} where the workers run"
             ) from fault
-        own = _fingerprint()
+        own = fingerprint()
         for worker, theirs in found.items():
             if theirs != own:
                 what = ", ".join(f"{key} {value}" for key, value in theirs.items())
@@ -188,14 +197,15 @@ class Cluster:
         """Yield each item with its result, see `Pool.run`."""
         from distributed import CancelledError, KilledWorker
         from distributed import as_completed as completed
+        from distributed.comm.core import CommClosedError
 
-        futures = self._client.map(task, list(items), pure=False, retries=0)
+        futures = self._client.map(partial(_on_one_thread, task), list(items), pure=False)
         of = dict(zip((future.key for future in futures), items, strict=True))
         try:
-            for future in completed(futures):
+            for future in completed(futures, loop=self._client.loop):
                 yield of[future.key], future.result()
                 future.release()
-        except (KilledWorker, CancelledError, OSError) as fault:
+        except (KilledWorker, CancelledError, CommClosedError) as fault:
             raise WorkersError(
                 f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
             ) from fault

@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.files import whole_file
@@ -41,6 +41,7 @@ from reconstruction.tiles import (
     Block,
     Grid,
     SavedPsi,
+    SolvedBlock,
     Survey,
     assembled,
     judged_block,
@@ -117,7 +118,7 @@ def fingerprint_of(
 
 def _write_json(path: Path, content: object) -> None:
     with whole_file(path) as partial, open(partial, "w", encoding="utf-8") as file:
-        json.dump(content, file)
+        json.dump(content, file, default=float)
         file.flush()
         os.fsync(file.fileno())
 
@@ -175,26 +176,24 @@ def _frames(path: Path, seen: Any) -> tuple[NDArray[np.floating], NDArray[np.boo
 
 
 def block_task(task: BlockTask) -> None:
-    """Compute a block in a worker, and write its two files."""
+    """Compute a block in a worker, and write its two files.
+
+    Raises AppError naming the block where it fails, and OSError where it cannot be written.
+    """
     started = time.perf_counter()
-    capture, block = task.capture, task.block
-    readings, usable = _frames(capture.kept / FRAMES, pixels_of(block.outer, capture.psi.binning))
-    solved = solve_block(
-        capture.method,
-        capture.psi.window(*block.outer),
-        readings,
-        capture.noise_sigma,
-        usable,
-        block,
-        capture.psi.size,
-        task.settings,
-        capture.opened_dictionary(),
-    )
+    try:
+        solved = _solved(task)
+    except ERRORS as fault:
+        rows, columns = (f"{part.start} to {part.stop}" for part in task.block.inner)
+        raise AppError(
+            f"rows {rows}, columns {columns} of the light field: {fault}; other blocks that are "
+            "done are kept"
+        ) from fault
     result = solved.result
     _write_json(
         task.path("json"),
         {
-            "fingerprint": capture.fingerprint,
+            "fingerprint": task.capture.fingerprint,
             "sha256": _write_arrays(task.path("h5"), solved.arrays),
             "result": {
                 key: getattr(result, key)
@@ -204,6 +203,22 @@ def block_task(task: BlockTask) -> None:
             "seconds": time.perf_counter() - started,
             "peak_mib": peak_memory_mib(),
         },
+    )
+
+
+def _solved(task: BlockTask) -> SolvedBlock:
+    capture, block = task.capture, task.block
+    readings, usable = _frames(capture.kept / FRAMES, pixels_of(block.outer, capture.psi.binning))
+    return solve_block(
+        capture.method,
+        capture.psi.window(*block.outer),
+        readings,
+        capture.noise_sigma,
+        usable,
+        block,
+        capture.psi.size,
+        task.settings,
+        capture.opened_dictionary(),
     )
 
 

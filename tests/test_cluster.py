@@ -1,0 +1,103 @@
+"""A Dask cluster computes the blocks: the same bytes as here, and one line where it cannot."""
+
+import pickle
+import sys
+import threading
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from programs import program
+
+from emmc_rig.commands.simulate import simulate_into
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import result_folder
+from emmc_rig.reconstruct import pool as pools
+from emmc_rig.reconstruct.pool import WorkersError, opened_pool
+from emmc_rig.reconstruct.solve import reconstruct_folder
+from emmc_rig.reconstruct.tiles import BlockTask, Capture
+from reconstruction.methods import BlockSettings, MethodSettings
+from reconstruction.tiles import Grid
+from reconstruction.tv import TVSettings
+
+CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
+SETTINGS = MethodSettings(
+    blocks=BlockSettings(whole=1000, side=32, blend=4), tv=TVSettings(max_steps=20)
+)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler and two workers in this process, answering at an address."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
+        protocol="tcp", host="127.0.0.1",
+    ) as cluster:  # fmt: skip
+        yield cluster
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with (
+        pytest.raises(WorkersError, match=r"pip install 'emmc-rig\[cluster\]'"),
+        opened_pool(1, "tcp://127.0.0.1:1"),
+    ):
+        pass
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_is_not_there_is_told_in_one_line(monkeypatch, tmp_path):
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    monkeypatch.setattr(pools, "CONNECT_S", 0.2)
+    for address in ("tcp://127.0.0.1:1", "nonsense"):
+        code, _, err = program(
+            "reconstruct", tmp_path, "--cluster", address, "--out", tmp_path / "out"
+        )
+        assert code == 1
+        assert "no Dask scheduler answers there" in err
+        assert "Traceback" not in err
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    simulate_into(frames, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0)
+    threads = numba.get_num_threads()
+    with opened_pool(1, cluster.scheduler_address) as pool:
+        assert pool.size == 2
+        with result_folder(tmp_path / "there", "reconstruct", resumes=True) as new:
+            metrics = reconstruct_folder(frames, new, "tv", settings=SETTINGS, pool=pool)
+    assert metrics["blocks"] == [2, 3]
+    assert numba.get_num_threads() == threads
+    with opened_pool(1) as pool, result_folder(tmp_path / "here", "reconstruct") as new:
+        reconstruct_folder(frames, new, "tv", settings=SETTINGS, pool=pool)
+    there, here = ((tmp_path / at / "light_field.h5").read_bytes() for at in ("there", "here"))
+    assert there == here
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_workers_of_another_version_are_refused(cluster, monkeypatch):
+    own = pools.fingerprint()
+
+    def fingerprint():
+        mine = threading.current_thread() is threading.main_thread()
+        return own if mine else {**own, "emmc-rig": "0.1"}
+
+    monkeypatch.setattr(pools, "fingerprint", fingerprint)
+    with (
+        pytest.raises(WorkersError, match=r"has emmc-rig 0\.1.*install the same"),
+        opened_pool(1, cluster.scheduler_address),
+    ):
+        pass
+
+
+def test_arrays_do_not_travel_with_the_tasks():
+    """A task is names and numbers: what 64 workers ask a scheduler for stays small."""
+    capture = Capture(Path("/kept"), Path("/psi.h5"), "adaptive", None, SETTINGS, 0.01, "0" * 64)
+    block = Grid((8000, 6000), 2, 40, MethodSettings().blocks).block(3, 4)
+    assert len(pickle.dumps(BlockTask(capture, SETTINGS, block))) < 10_000
+    assert np.prod([part.stop - part.start for part in block.outer]) > 10**5
