@@ -223,7 +223,7 @@ def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[Plann
 
 
 def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
-    """Return how a whiteboard of the first shot is exposed; light: how many times as long as metered."""
+    """Return how a whiteboard of the first shot is exposed, `light` times as long as metered."""
     boards = plan.whiteboards or Boards()
     if boards.exposure_s is not None:
         return {"exposure_s": boards.exposure_s * light, "light": light}
