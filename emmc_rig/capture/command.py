@@ -15,15 +15,17 @@ from typing import Any
 
 from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.estimate import Estimate, estimate
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.order import ordered
-from emmc_rig.capture.plan import (
-    METERING_EXPOSURE_S,
-    Plan,
-    load_plan,
-    planned_camera,
+from emmc_rig.capture.estimate import (
+    Estimate,
+    Exposures,
+    known_exposures,
+    last_session,
+    pace_of,
 )
+from emmc_rig.capture.expand import expand
+from emmc_rig.capture.metering import first_meterings
+from emmc_rig.capture.order import ordered
+from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Outcome, Sequencer
@@ -148,11 +150,18 @@ def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
     return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
 
 
-def estimated(frames: tuple[PlannedFrame, ...], plan: Plan, rig: Rig) -> Estimate:
-    """Return what frames will take."""
-    rows, columns = rig.camera.shape
-    speeds = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
-    return estimate(frames, 2 * rows * columns, speeds, plan.settle_s, METERING_EXPOSURE_S)
+def estimated(
+    frames: tuple[PlannedFrame, ...],
+    plan: Plan,
+    rig: Rig,
+    session: Session | None = None,
+    earlier: Session | None = None,
+) -> Estimate:
+    """Return what frames will take; earlier: another session of the same stage and camera."""
+    meterings = {} if session is None else first_meterings(session)
+    entries = [] if session is None else session.journal.entries
+    known = known_exposures(Exposures(plan, earlier), meterings, entries)
+    return pace_of(rig, plan).estimate(frames, known)
 
 
 def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
@@ -259,7 +268,8 @@ def run_capture(
         refuse_impossible(rig, frames)
         if session is not None:
             refuse_other_camera(session, rig)
-        expected = estimated(frames, wish.plan, rig)
+        earlier = last_session(wish.out, wish.rig)
+        expected = estimated(frames, wish.plan, rig, session, earlier)
         refuse_small_disk(wish.out, expected)
         if not agreed(expected):
             return None
@@ -273,7 +283,15 @@ def run_capture(
                 if wish.until_db not in (None, session.target_db):
                     session.note("until", target_db=wish.until_db, wall=wall_time())
                 choose = None if session.target_db is None else Until(session, watcher)
-                run = Sequencer(session, wish.plan, rig, watcher, control, choose)
+                run = Sequencer(
+                    session,
+                    wish.plan,
+                    rig,
+                    watcher,
+                    control,
+                    choose,
+                    exposures=Exposures(wish.plan, earlier),
+                )
                 return session, run.run()
 
 

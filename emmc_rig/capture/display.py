@@ -20,7 +20,6 @@ from rich.progress import (
     TaskID,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.text import Text
 
@@ -28,6 +27,7 @@ from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
 
@@ -44,8 +44,7 @@ class CaptureDisplay:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             TextColumn("{task.description}"),
             console=console,
         )
@@ -55,6 +54,7 @@ class CaptureDisplay:
         self._live: Live | None = None
         self._done = self._planned = 0
         self._asking = False
+        self._left = ""
 
     @contextmanager
     def shown(self) -> Iterator[None]:
@@ -94,7 +94,7 @@ class CaptureDisplay:
     def begin(self, done: int, planned: int) -> None:
         """Start the bar."""
         self._done, self._planned = done, planned
-        self._task = self._progress.add_task("frames", total=planned, completed=done)
+        self._task = self._progress.add_task("frames", total=planned, completed=done, left="")
         if not self._console.is_terminal and done:
             self.tell(f"{done} of {planned} frames are there already")
 
@@ -123,7 +123,8 @@ class CaptureDisplay:
             self._line = Text(line)
         elif not self._console.is_terminal:
             self._console.print(
-                f"{time.strftime('%H:%M:%S')} {self._done + 1}/{self._planned} {line}",
+                f"{time.strftime('%H:%M:%S')} {self._done + 1}/{self._planned} {line}"
+                + (f"; {self._left}" if self._left else ""),
                 highlight=False,
                 soft_wrap=True,
             )
@@ -133,6 +134,13 @@ class CaptureDisplay:
         """Advance the bar."""
         if self._task is not None:
             self._progress.update(self._task, advance=1)
+
+    def left(self, seconds: float, guessed: int) -> None:
+        """Show how long the rest will take."""
+        unknown = f" and {guessed} frames not metered yet" if guessed else ""
+        self._left = f"about {shown_seconds(seconds)} left{unknown}"
+        if self._task is not None:
+            self._progress.update(self._task, left=self._left)
 
     def tell(self, message: str) -> None:
         """Print a line."""

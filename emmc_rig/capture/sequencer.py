@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import Camera as CameraDevice
+from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import (
@@ -29,6 +30,7 @@ from emmc_rig.capture.checks import (
     figures,
 )
 from emmc_rig.capture.control import Control, uninterrupted
+from emmc_rig.capture.estimate import Exposures, known_exposures, pace_of
 from emmc_rig.capture.metering import (
     METERING_TRIES,
     asked_of_scene,
@@ -55,6 +57,8 @@ from emmc_rig.session.verify import verify_frames
 
 TOLD_BYTES = 1_000_000_000
 """Hashing more takes long enough to be told."""
+TELL_LEFT_S = 1.0
+"""Between two times that the time left is said."""
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
 
@@ -88,7 +92,8 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. timer: seconds that never run backwards, for the
+    choose: by default all that is missing. exposures: what is known of those that will be metered,
+    for the time that is left. timer: seconds that never run backwards, for the
     timeline; wall: the time of day, for people.
     """
 
@@ -102,12 +107,16 @@ class Sequencer:
         choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
+        exposures: Exposures | None = None,
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
         self._watcher = watcher or Unwatched()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
+        self._exposures = exposures or Exposures(plan)
+        self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
+        self._left_told_s = -TELL_LEFT_S
         self._camera: CameraDevice = rig.camera
         self._applied = _Applied()
         self._budget = Budget(plan.retries)
@@ -230,8 +239,28 @@ class Sequencer:
                 self._hand_over(planned, frame, found, read_um, spans, attempts)
             self._before = frame.mosaic
 
+        began_s, before_um = self._now_s(), dict(self._applied.offsets_um)
         self._retrying(planned.id, attempt)
         self._taken += 1
+        if attempts == 1:
+            by_hand_s = spans["attend"][1] - spans["attend"][0]
+            self._pace.learn(
+                self._now_s() - began_s - by_hand_s,
+                self._applied.exposure_s or 0.0,
+                self._pace.moving_s(planned, before_um),
+            )
+        self._tell_left(planned)
+
+    def _tell_left(self, taken: PlannedFrame) -> None:
+        """Say from time to time how long the rest will take."""
+        now_s = self._now_s()
+        if now_s - self._left_told_s < TELL_LEFT_S:
+            return
+        self._left_told_s = now_s
+        left = [frame for frame in self._session.missing() if frame.id != taken.id]
+        known = known_exposures(self._exposures, self._metered, self._session.journal.entries)
+        rest = self._pace.estimate(left, known, self._applied.offsets_um)
+        self._watcher.left(rest.seconds, rest.guessed)
 
     def _retrying(self, name: str, attempt: Callable[[], None]) -> None:
         """Try until it works or the budget is spent."""

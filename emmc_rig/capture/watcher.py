@@ -34,6 +34,10 @@ class Watcher(Protocol):
         """A frame is on the disk."""
         ...
 
+    def left(self, seconds: float, guessed: int) -> None:
+        """So long the rest will take; guessed: frames of which the exposure is not known yet."""
+        ...
+
     def tell(self, message: str) -> None:
         """Something that people should know."""
         ...
@@ -55,6 +59,9 @@ class Unwatched:
         """Ignore it."""
 
     def stored(self, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def left(self, seconds: float, guessed: int) -> None:
         """Ignore it."""
 
     def tell(self, message: str) -> None:

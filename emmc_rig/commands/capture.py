@@ -127,9 +127,10 @@ def _run(
         if expected.frames:
             most = "" if until_db is None else "at most "
             hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
+            yet = f"; {expected.guessed} of them not metered yet" if expected.guessed else ""
             display.tell(
                 f"{most}{expected.frames} frames to take, about "
-                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}"
+                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{yet}"
             )
         return not dry_run
 
