@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
     from emmc_rig.model.camera import Camera
+    from emmc_rig.session.readings import Scale
 
 DESIGN = "design"
 EVERYWHERE = ("0.0.0.0", "::")
@@ -57,6 +58,8 @@ def live(
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
+    if method is not None and psi is None:
+        raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
     listening = _listen(host, port)
     with closing(listening), _watch(rig, camera, stage, design, scene, size, psi, method) as watch:
         token = new_token()
@@ -106,7 +109,7 @@ def _watch(
     from emmc_rig.live.watch import Watch
     from emmc_rig.rig.hardware import SimulatedRig, open_camera, open_stage
 
-    described = find_camera(design)
+    described, scale = find_camera(design), _scale(psi)
     with ExitStack() as stack:
         if rig is not None:
             from emmc_rig.files.results import parse_size
@@ -123,37 +126,46 @@ def _watch(
             centre_um = dict(opened.zero_um)
             if "aperture_x" in centre_um:
                 centre_um["aperture_x"] += opened.window_um
-            field = _light_field(psi, method, described, opened.camera.shape)
+            field = _light_field(psi, scale, method, described, opened.camera.shape)
             watch = Watch(opened.camera, opened.stage, look, targets, centre_um, described, field)
         else:
             device = stack.enter_context(closing(open_camera(camera or "ptp:")))
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
-            field = _light_field(psi, method, described, device.shape)
+            field = _light_field(psi, scale, method, described, device.shape)
             watch = Watch(device, driven, design=described, light_field=field)
         stack.callback(watch.close)
         yield watch
 
 
+def _scale(psi: str | None) -> Scale | None:
+    """Return what --psi names; None where nothing, or the design, which needs the camera's size."""
+    if psi is None or psi == DESIGN:
+        return None
+    from emmc_rig.live.scale import open_scale
+
+    return open_scale(Path(psi))
+
+
 def _light_field(
-    psi: str | None, method: str | None, design: Camera, pixels: tuple[int, int]
+    psi: str | None,
+    scale: Scale | None,
+    method: str | None,
+    design: Camera,
+    pixels: tuple[int, int],
 ) -> LiveLightField | None:
     """Return what reconstructs while the camera watches; None without a Psi."""
     if psi is None:
-        if method is not None:
-            raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
         return None
     from emmc_rig.live.light_field import LiveLightField
-    from emmc_rig.live.scale import designed_scale, open_scale
+    from emmc_rig.live.scale import designed_scale
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     chosen = method or DEFAULT_METHOD
     if find_method(chosen).needs_dictionary:
         raise AppError(f"--method {chosen} needs a dictionary: choose one that needs none")
-    if psi == DESIGN:
+    if scale is None:
         k = design.sensor.binning
         scale = designed_scale(design.psi((pixels[0] * k, pixels[1] * k)))
-    else:
-        scale = open_scale(Path(psi))
     expected = scale.psi.frames_shape[1:]
     if expected != tuple(pixels):
         raise AppError(

@@ -275,7 +275,7 @@ function drawField() {
   if (!told) return;
   const parts = [told.stage];
   if (told.shots[1] > 1) parts.push(`${told.shots[0]} of ${told.shots[1]} shots`);
-  if (told.latency_s !== undefined && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
+  if (told.pictures && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
   if (told.why) parts.push(told.why);
   parts.push(told.verdict ? told.verdict.words : "no verdict yet");
   write("field-stage", parts.join("; "));

@@ -51,7 +51,7 @@ AWAY_UM = 5.0
 """From where an axis centres the mask or opens the aperture, it is not there."""
 AT_SHOT_UM = 2.0
 """From where a shot has the mask, it still stands there."""
-WANTED_LEVEL, LEVELS = 0.8, (0.6, 0.9)
+WANTED_LEVEL, LEVELS = 0.8, (0.7, 0.9)
 EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
 
 
@@ -95,6 +95,7 @@ class Watch:
         self._exposing = 0
         self._seek_at_s = 0.0
         self._gauge: MaskGauge | None = None
+        self._drawn, self._latency_s = 0, 0.0
         self._state: dict[str, Any] = {
             "version": 0,
             "frame": 0,
@@ -354,6 +355,7 @@ class Watch:
             except (ValueError, DriverError) as fault:
                 self._publish(setting=str(fault))
         if done:
+            self._seek_at_s = 0.0
             self._publish(settings=self._read_settings(), setting="")
 
     def _each(self, work: Callable[[Shown], None]) -> Callable[[], None]:
@@ -428,13 +430,16 @@ class Watch:
         ):
             self._ending.wait(POLL_S)
             return
+        if is_dark(newest.frame):
+            self._publish(mask={"place": None, "why": "the picture is dark"})
+            return
         try:
             if self._gauge is None:
                 self._gauge = MaskGauge(self._design, newest.frame.mosaic.shape)
             place = self._gauge.measure(newest.frame, self._mask_stands_um())
-            mask = {"frame": newest.number, "place": asdict(place), "why": ""}
+            mask = {"place": asdict(place), "why": ""}
         except (CalibrationError, CameraError) as fault:
-            mask = {"frame": newest.number, "place": None, "why": str(fault)}
+            mask = {"place": None, "why": str(fault)}
             self._seek_at_s = time.monotonic() + SEEK_S
         self._publish(mask=mask)
 
@@ -461,9 +466,11 @@ class Watch:
             self._publish(**{"light field": str(fault)})
             self._ending.wait(RETRY_S)
             return
-        latency_s = time.monotonic() - newest.at_s
+        drawn = (shown["pictures"] or {}).get("number", 0)
+        if drawn != self._drawn:
+            self._drawn, self._latency_s = drawn, time.monotonic() - newest.at_s
         self._publish(
-            light_field={"frame": newest.number, "latency_s": latency_s, **shown},
+            light_field={"frame": newest.number, "latency_s": self._latency_s, **shown},
             **{"light field": ""},
         )
 
