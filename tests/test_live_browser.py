@@ -100,7 +100,7 @@ def place_um(driver, axis):
     found = re.search(
         r"-?[\d.]+(?= um)", driver.find_element(By.CSS_SELECTOR, f"tr[data-axis={axis}]").text
     )
-    return float(found.group()) if found else None
+    return float(found.group()) if found else float("nan")
 
 
 def test_the_page_opens_and_its_frame_updates_without_a_complaint(page):
@@ -148,7 +148,7 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
 def test_keys_stop_jog_and_expose_and_a_button_keeps_the_focus(page, rig):
     click(page, "#centre")
     wait(page, lambda: text(page, "busy") == "")
-    wait(page, lambda: place_um(page, "mask_x") is not None)
+    wait(page, lambda: place_um(page, "mask_x") > 0)
     start = place_um(page, "mask_x")
     page.find_element(By.ID, "home").send_keys(Keys.ARROW_RIGHT)
     wait(page, lambda: place_um(page, "mask_x") == pytest.approx(start + 10, abs=0.5))

@@ -74,7 +74,8 @@ class Pictures:
 class LiveLightField:
     """Follows frames; `update` is called by one thread, all else by any.
 
-    scale: Psi, and what turns frames into its readings. method: of the reconstruction.
+    scale: Psi, and what turns frames into its readings. method: of the reconstruction. preview:
+    what the last frame moved on; None before the first.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class LiveLightField:
         self._scale, self._method, self._solve, self._clock = scale, method, solve, clock
         self._held: dict[int, RawFrame] = {}
         self._since_s = clock()
-        self._preview: Preview | None = None
+        self.preview: Preview | None = None
         self._level = 0.0
         self._pictures: Pictures | None = None
         self._numbers = 0
@@ -183,14 +184,14 @@ class LiveLightField:
         if level <= 0:
             raise ReconstructionError("the picture is dark: no light field to see")
         factor = max(self._level / level, level / max(self._level, 1e-12))
-        if self._preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
+        if self.preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
             psi = self._of_shots()[1]
             self._shots, self._level = len(shots), level
             step = FACTOR // np.gcd(FACTOR, psi.binning) * psi.binning
             noise = self._noise(shots, readings)
-            self._preview = Preview(psi, int(step), readings, noise, seen)
-        self._preview.follow(readings, STEPS)
-        self._draw(self._preview.light_field, None)
+            self.preview = Preview(psi, int(step), readings, noise, seen)
+        self.preview.follow(readings, STEPS)
+        self._draw(self.preview.light_field, None)
 
     _shots = 0
 
