@@ -1,8 +1,10 @@
 """Designing a mask: theory against draws, masks as printed, files read back by other means."""
 
 import json
+import re
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,7 +121,7 @@ def test_a_mask_tells_the_disparity_that_an_open_camera_cannot():
         return bounds(camera, printed_psi(camera, SIZE, PLAIN), (-1, 1)).disparity_px
 
     # Blur grows to both sides of focus alike: its sign is not told.
-    assert bound_px(1.0) > 10 * bound_px(0.5)
+    assert bound_px(1.0) > 4 * bound_px(0.5)
 
 
 def test_the_pareto_front_holds_what_nothing_else_beats_in_both():
@@ -223,11 +225,17 @@ def test_the_mask_covers_every_place_that_the_stage_reaches(tmp_path):
         )
 
 
+def test_the_bench_of_the_documentation_is_the_default():
+    text = (Path(__file__).parents[1] / "docs/design.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"^```yaml\n(.*?)^```", text, re.M | re.S)
+    assert DesignBench.model_validate(yaml.safe_load(shown)) == DesignBench()
+
+
 BENCH = {
     "size": [48, 64],
     "distances_mm": [0.12],
     "cells_um": [36],
-    "families": ["random_rgbw", "random_binary"],
+    "families": ["random_binary"],
     "open_shares": [0.5],
     "stage_travel_um": [200, 200],
 }
@@ -240,8 +248,8 @@ def test_the_command_writes_a_camera_a_mask_and_a_page_that_other_commands_take(
     assert code == 0, err
     assert "best shipped camera" in out
     metrics = json.loads((tmp_path / "emmc-design/metrics.json").read_text())
-    assert metrics["winner"]["family"] in BENCH["families"]
-    assert len(metrics["tried"]) == 2
+    assert metrics["winner"]["family"] == "random_binary"
+    assert len(metrics["tried"]) == 1
     assert {one["name"] for one in metrics["simulated"]} >= {"this design", "rgbw-bayer-1shot"}
     code, _, err = run("simulate", "--camera", "emmc-design/camera.yaml", *small)
     assert code == 0, err

@@ -39,6 +39,8 @@ WRITERS = {
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
     "demo": (*SIZE,),
+    "design": (),
+    "design --check": (),
     "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
@@ -66,6 +68,8 @@ READERS = {
 JOURNALS = {
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
+    "design": "simulations.jsonl",
+    "design --check": "simulations.jsonl",
     "stability": "points.jsonl",
     "stability --theory": "points.jsonl",
     "stability --verdicts": "verdicts.jsonl",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def design(
     bench: Annotated[
         Path | None,
-        typer.Argument(help="a YAML file of what the bench has (default: docs/design.md's)"),
+        typer.Argument(help="a YAML file of what the bench has (default: see docs/design.md)"),
     ] = None,
     scene: ScenesOption = None,
     check: Annotated[
