@@ -56,6 +56,7 @@ WRITERS = {
     "stability": ("--fast",),
     "stability --theory": ("--fast",),
     "stability --verdicts": ("--fast",),
+    "stability --worst": ("--fast",),
     "tables": ("--fast",),
     "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
               "--sparsity", 2, "--iterations", 1),
@@ -73,6 +74,7 @@ JOURNALS = {
     "stability": "points.jsonl",
     "stability --theory": "points.jsonl",
     "stability --verdicts": "verdicts.jsonl",
+    "stability --worst": "worst.jsonl",
     "tables": "cells.jsonl",
 }
 """What lies in a folder that a study goes on with."""
