@@ -39,6 +39,8 @@ WRITERS = {
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
     "demo": (*SIZE,),
+    "design": (),
+    "design --check": (),
     "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
@@ -54,6 +56,7 @@ WRITERS = {
     "stability": ("--fast",),
     "stability --theory": ("--fast",),
     "stability --verdicts": ("--fast",),
+    "stability --worst": ("--fast",),
     "tables": ("--fast",),
     "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
               "--sparsity", 2, "--iterations", 1),
@@ -66,9 +69,12 @@ READERS = {
 JOURNALS = {
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
+    "design": "simulations.jsonl",
+    "design --check": "simulations.jsonl",
     "stability": "points.jsonl",
     "stability --theory": "points.jsonl",
     "stability --verdicts": "verdicts.jsonl",
+    "stability --worst": "worst.jsonl",
     "tables": "cells.jsonl",
 }
 """What lies in a folder that a study goes on with."""
