@@ -171,7 +171,8 @@ class Pace:
         if not self._waits:
             moving_s = exposing_s = 0.0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
-        return Estimate(count, moving_s, exposing_s, count * self._frame_s, size, by_hand, guessed)
+        frame_s = median(self._learnt_s) if self._learnt_s else self._usual_s
+        return Estimate(count, moving_s, exposing_s, count * frame_s, size, by_hand, guessed)
 
 
 def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:

@@ -66,6 +66,13 @@ class Result:
         return self.maps.get("sigma")
 
     @property
+    def stated_db(self) -> float | None:
+        """The PSNR that `sigma` stands for, dB; None where the method has none."""
+        if self.sigma is None:
+            return None
+        return float(-10 * np.log10(np.mean(np.square(self.sigma, dtype=np.float64))))
+
+    @property
     def disparity(self) -> NDArray[np.floating] | None:
         """Disparity (y, x) of the centre view, pixels per view step; None without an estimate."""
         return self.maps.get("disparity")
@@ -112,6 +119,7 @@ class Result:
             "left_out": list(self.solved.left_out),
             "screening": list(self.solved.screening),
             "verdict": self.verdict.as_dict(),
+            "stated_db": self.stated_db,
             "steps": self.solved.steps,
             "seconds": self.seconds,
             "parameters": self.solved.parameters,
