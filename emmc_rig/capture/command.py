@@ -22,6 +22,7 @@ from emmc_rig.capture.estimate import (
     last_session,
     pace_of,
 )
+from emmc_rig.capture.events import EventWatcher, OnEvent
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.metering import first_meterings
 from emmc_rig.capture.order import ordered
@@ -29,6 +30,7 @@ from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.errors import AppError, StoppedError
@@ -240,6 +242,7 @@ def run_capture(
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
+    suspend: Suspend | None = None,
 ) -> tuple[Session, Outcome] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
@@ -266,6 +269,8 @@ def run_capture(
         else:
             frames = still_possible(wish, session)
         refuse_impossible(rig, frames)
+        details = getattr(rig.camera, "details", dict)
+        suspended = suspended_by(wish.plan.suspend, details, suspend)
         if session is not None:
             refuse_other_camera(session, rig)
         earlier = last_session(wish.out, wish.rig)
@@ -291,6 +296,7 @@ def run_capture(
                     control,
                     choose,
                     exposures=Exposures(wish.plan, earlier),
+                    suspended=suspended,
                 )
                 return session, run.run()
 
@@ -321,6 +327,7 @@ def capture_session(
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
+    suspend: Suspend | None = None,
 ) -> tuple[Session, Outcome] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
@@ -334,7 +341,7 @@ def capture_session(
     with held(folder):
         wish = asked_for(plan, folder, rig, until_db)
         try:
-            captured = run_capture(wish, watcher, ask, agreed, control)
+            captured = run_capture(wish, watcher, ask, agreed, control, suspend)
         except KeyboardInterrupt as stop:
             begun = is_session(folder)
             kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
@@ -346,6 +353,7 @@ def capture_session(
             write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
             watcher.tell(f"no report: {fault}")
+    watcher.ended(session, outcome)
     if not outcome.complete:
         raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
@@ -366,6 +374,8 @@ def capture(
     out: str | Path | None = None,
     until_db: float | None = None,
     watcher: Watcher | None = None,
+    on_event: OnEvent | None = None,
+    suspend: Suspend | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
     """Run a plan on a rig and return its session; run again, it goes on where it stopped.
@@ -376,6 +386,9 @@ def capture(
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         watcher: is told what is captured.
+        on_event: is called with each `emmc_rig.capture.events.Event`, as `frame.written` or
+            `shot.done`; one that raises is not called again.
+        suspend: is asked before each frame, returns why the capture has to wait, "" to go on.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
     Raises:
@@ -384,8 +397,11 @@ def capture(
     """
     description = None if rig is None else rig.description
     folder = None if out is None else Path(out)
+    told = watcher or Unwatched()
+    if on_event is not None:
+        told = EventWatcher(on_event, told)
     captured = capture_session(
-        Path(plan), description, folder, until_db, watcher or Unwatched(), ask
+        Path(plan), description, folder, until_db, told, ask, suspend=suspend
     )
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]

@@ -27,6 +27,7 @@ from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.capture.watcher import Unwatched
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
@@ -35,7 +36,7 @@ KEY_POLL_S = 0.1
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
-class CaptureDisplay:
+class CaptureDisplay(Unwatched):
     """A `Watcher` of the sequencer."""
 
     def __init__(self, console: Console, control: Control) -> None:
@@ -137,10 +138,18 @@ class CaptureDisplay:
 
     def left(self, seconds: float, guessed: int) -> None:
         """Show how long the rest will take."""
-        unknown = f" and {guessed} frames not metered yet" if guessed else ""
+        unknown = f", and the exposures of {guessed} not metered yet" if guessed else ""
         self._left = f"about {shown_seconds(seconds)} left{unknown}"
         if self._task is not None:
             self._progress.update(self._task, left=self._left)
+
+    def paused(self, reason: str) -> None:
+        """Say why nothing happens."""
+        self.tell(f"waiting: {reason}")
+
+    def resumed(self, seconds: float) -> None:
+        """Say that it goes on."""
+        self.tell(f"going on after {shown_seconds(seconds)}")
 
     def tell(self, message: str) -> None:
         """Print a line."""

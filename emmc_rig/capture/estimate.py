@@ -6,9 +6,11 @@ of the last session of the same stage and camera, or a guess, and it is said how
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from drivers.stage import needs_approach
@@ -31,8 +33,8 @@ EXCHANGES_S = 0.15
 """Commands to the camera and the stage that a frame needs, and what a camera takes to be ready."""
 MOVE_S = 0.2
 """A move's acceleration, polling and settling."""
-LEARNT_SHARE = 0.1
-"""Of the last frame in what a frame is taken to cost: some ten frames count."""
+LEARNT_FROM = 9
+"""The last frames whose median cost counts: one that had to wait for something is no rule."""
 ANY_LIMITS = (0.0, float("inf"))
 
 
@@ -128,13 +130,13 @@ class Pace:
     ) -> None:
         self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
         self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
-        self._frame_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
+        self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
+        self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
 
     def learn(self, seconds: float, exposure_s: float, moving_s: float) -> None:
         """Take note of what a frame took, by hand excepted, and of what was foreseen."""
         foreseen_s = exposure_s + moving_s if self._waits else 0.0
-        beside_s = max(0.0, seconds - foreseen_s)
-        self._frame_s += LEARNT_SHARE * (beside_s - self._frame_s)
+        self._learnt_s.append(max(0.0, seconds - foreseen_s))
 
     def moving_s(self, frame: PlannedFrame, at_um: Mapping[str, float]) -> float:
         """Return what it takes to bring the stage from where it stands to a frame's place."""
@@ -169,7 +171,8 @@ class Pace:
         if not self._waits:
             moving_s = exposing_s = 0.0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
-        return Estimate(count, moving_s, exposing_s, count * self._frame_s, size, by_hand, guessed)
+        frame_s = median(self._learnt_s) if self._learnt_s else self._usual_s
+        return Estimate(count, moving_s, exposing_s, count * frame_s, size, by_hand, guessed)
 
 
 def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:

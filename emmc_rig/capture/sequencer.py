@@ -41,6 +41,7 @@ from emmc_rig.capture.metering import (
 from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
+from emmc_rig.capture.suspend import Suspend
 from emmc_rig.capture.watcher import Unwatched, Watcher
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
@@ -93,8 +94,8 @@ class Sequencer:
     """A run over a session; `run` once.
 
     choose: by default all that is missing. exposures: what is known of those that will be metered,
-    for the time that is left. timer: seconds that never run backwards, for the
-    timeline; wall: the time of day, for people.
+    for the time that is left. suspended: why it has to wait. timer: seconds that never run
+    backwards, for the timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -108,12 +109,14 @@ class Sequencer:
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
         exposures: Exposures | None = None,
+        suspended: Suspend = lambda: "",
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
         self._watcher = watcher or Unwatched()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
+        self._suspended = suspended
         self._exposures = exposures or Exposures(plan)
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._left_told_s = -TELL_LEFT_S
@@ -124,6 +127,7 @@ class Sequencer:
         self._before: NDArray[np.uint16] | None = None
         self._metered: dict[str, Entry] = {}
         self._triggered = False
+        self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
         self._taken = self._run = 0
         # How long the frame before took to hand over: its own line is written by then.
@@ -148,6 +152,7 @@ class Sequencer:
             missing, needed = session.missing(), len(session.needed)
             self._watcher.begin(needed - len(missing), needed)
             refuse_impossible(self._rig, missing)
+            self._left_of_shot = self._missing_of_shots()
             frames = self._choose(self._now_s)
             if frames:
                 self._retrying("home", self._home)
@@ -157,7 +162,7 @@ class Sequencer:
                 taken = {frame.id for frame in frames}
                 for name, fault in self._discard_damaged(taken).items():
                     self._budget.spend(name, DriverError(fault), 1)
-                frames = self._choose(self._now_s) if self._control.may_go_on() else ()
+                frames = self._choose(self._now_s) if self._may_go_on() else ()
             self._writer.flush()
             left = len(session.missing())
             if not left and not session.is_complete:
@@ -165,6 +170,14 @@ class Sequencer:
         return Outcome(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
+
+    def _missing_of_shots(self) -> dict[int, set[str]]:
+        """Return by shot which frames of it are still to be taken."""
+        found: dict[int, set[str]] = {}
+        for frame in self._session.missing():
+            if frame.kind == "shot":
+                found.setdefault(frame.bench.shot, set()).add(frame.id)
+        return found
 
     def _facts(self) -> dict[str, Any]:
         rig, camera = self._rig, self._camera
@@ -200,12 +213,30 @@ class Sequencer:
         Ends early where metering the scene asked for more frames than were known of.
         """
         for frame in frames:
-            if not self._control.may_go_on():
+            if not self._may_go_on():
                 return False
             if frame.is_metered_shot and self._decide_exposures():
                 return True
             self._take(frame)
         return True
+
+    def _may_go_on(self) -> bool:
+        """Wait while somebody or a condition wants it; returns False when the run is to end."""
+        reason = self._why_wait()
+        if reason and not self._control.stopping:
+            began_s = self._now_s()
+            self._note("paused", reason=reason, wall=self._wall())
+            self._watcher.paused(reason)
+            while reason and not self._control.stopping:
+                self._control.wait()
+                reason = self._why_wait()
+            seconds = self._now_s() - began_s
+            self._note("resumed", seconds=seconds, wall=self._wall())
+            self._watcher.resumed(seconds)
+        return not self._control.stopping
+
+    def _why_wait(self) -> str:
+        return "somebody asked for it" if self._control.paused else self._suspended()
 
     def _decide_exposures(self) -> bool:
         """Decide once by what metered shots are exposed; returns whether frames were added."""
@@ -218,8 +249,10 @@ class Sequencer:
         self._note("metered", **asked, wall=self._wall())
         self._writer.flush()
         self._watcher.tell(metered_words(asked))
+        self._left_told_s = -TELL_LEFT_S
         if not asked["asked"]:
             return False
+        self._left_of_shot = self._missing_of_shots()
         self._watcher.more(len(session.needed))
         return True
 
@@ -495,8 +528,14 @@ class Sequencer:
         def facts() -> Entry:
             return {**entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
 
-        self._session.store(planned, suffix, data, sha256, facts)
+        session, shot = self._session, planned.bench.shot
+        session.store(planned, suffix, data, sha256, facts)
         self._watcher.stored(planned)
+        left = self._left_of_shot.get(shot, set())
+        if planned.id in left:
+            left.remove(planned.id)
+            if not left:
+                self._watcher.shot_done(shot)
 
     def _discard_damaged(self, ids: set[str]) -> dict[str, str]:
         """Read files again; returns, by id, what is wrong with those that no longer count."""

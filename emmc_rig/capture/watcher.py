@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
 from emmc_rig.session.planned import PlannedFrame
+
+if TYPE_CHECKING:
+    from emmc_rig.capture.sequencer import Outcome
+    from emmc_rig.session.session import Session
 
 STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
 
@@ -38,8 +42,24 @@ class Watcher(Protocol):
         """So long the rest will take; guessed: frames of which the exposure is not known yet."""
         ...
 
+    def shot_done(self, shot: int) -> None:
+        """Every frame of a shot is on the disk."""
+        ...
+
+    def paused(self, reason: str) -> None:
+        """The capture waits."""
+        ...
+
+    def resumed(self, seconds: float) -> None:
+        """It goes on after so long."""
+        ...
+
     def tell(self, message: str) -> None:
         """Something that people should know."""
+        ...
+
+    def ended(self, session: Session, outcome: Outcome) -> None:
+        """A run is over, complete or not."""
         ...
 
 
@@ -64,5 +84,17 @@ class Unwatched:
     def left(self, seconds: float, guessed: int) -> None:
         """Ignore it."""
 
+    def shot_done(self, shot: int) -> None:
+        """Ignore it."""
+
+    def paused(self, reason: str) -> None:
+        """Ignore it."""
+
+    def resumed(self, seconds: float) -> None:
+        """Ignore it."""
+
     def tell(self, message: str) -> None:
+        """Ignore it."""
+
+    def ended(self, session: Session, outcome: Outcome) -> None:
         """Ignore it."""

@@ -94,6 +94,13 @@ class Result:
         return self.maps.get("sigma")
 
     @property
+    def stated_db(self) -> float | None:
+        """The PSNR that `sigma` stands for, dB; None where the method has none."""
+        if self.sigma is None:
+            return None
+        return float(-10 * np.log10(np.mean(np.square(self.sigma, dtype=np.float64))))
+
+    @property
     def disparity(self) -> NDArray[np.floating] | None:
         """Disparity (y, x) of the centre view, pixels per view step; None without an estimate."""
         return self.maps.get("disparity")
@@ -130,6 +137,7 @@ class Result:
         """Return the figures of the reconstruction, as metrics.json has them."""
         return {
             **figures(self.solved, self.verdict, self.frames),
+            "stated_db": self.stated_db,
             "shots": self.psi.shots,
             "size": list(self.psi.size),
             "psi_sha256": self.psi.checksum(),
