@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+import h5py
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
@@ -58,6 +60,13 @@ def read_maps(folder: Path) -> dict[str, NDArray]:
         return {}
     with stored_arrays(folder / MAPS, AppError, "reconstruct it again") as stored:
         return {name: stored.array(name) for name in map(str, stored.file)}
+
+
+def save_maps(folder: Path, maps: Mapping[str, NDArray]) -> None:
+    """Write the maps of a result into its folder."""
+    with h5py.File(folder / MAPS, "w") as file:
+        for name, values in maps.items():
+            file.create_dataset(name, data=values, compression="lzf")
 
 
 def _fits(values: NDArray, shape: tuple[int, ...]) -> bool:

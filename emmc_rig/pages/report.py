@@ -29,6 +29,7 @@ from emmc_rig.pages.display import (
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import Card, data_address, fragment
 from emmc_rig.pages.psi_panels import psi_panels
+from emmc_rig.pages.viewer import ViewerContent, viewer_data
 
 Array = NDArray[np.floating]
 ERROR_JPEG_QUALITY = 72  # an error map is mostly noise, and noise is what costs bytes
@@ -41,7 +42,8 @@ class ReportContent:
     Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x);
     psi and psi_std (v, u, y, x), the weights of shot 0; cfa_tile (y, x, rgb), the colour each
     pixel of the tile lets through. Under a sensor that bins, frames are smaller than views.
-    disparity_range_px is in pixels per view step; None where it is not known.
+    disparity_range_px is in pixels per view step; None where it is not known. maps: what is laid
+    over the picture in the viewer, by name, see `ViewerContent`.
     """
 
     title: str
@@ -63,6 +65,7 @@ class ReportContent:
     disparity_range_px: tuple[float, float] | None = None
     warnings: Sequence[str] = ()
     command: str = ""
+    maps: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self):
         _expect_axes("estimate", self.estimate, "v u y x c")
@@ -103,7 +106,7 @@ def render(content: ReportContent) -> str:
         content=content,
         caveats=(),
         lead="",
-        styles=(),
+        styles=("viewer.css",),
         heat=HEAT,
         warnings=_warnings(content),
         cards=_cards(content),
@@ -126,8 +129,24 @@ def render(content: ReportContent) -> str:
         timings=_timings(content.stage_s),
         figures=_figures(content.metrics),
         provenance=_provenance(content),
-        data={"data": _page_data(content, shown, curve, errors)},
-        scripts=("report.js",),
+        data={
+            "data": _page_data(content, shown, curve, errors),
+            "viewer-data": viewer_data(_viewer_content(content), atlases=False),
+        },
+        scripts=("report.js", "viewer.js"),
+    )
+
+
+def _viewer_content(content: ReportContent) -> ViewerContent:
+    maps = content.maps
+    return ViewerContent(
+        content.title,
+        content.estimate,
+        truth=content.truth,
+        disparity=maps.get("disparity"),
+        sigma=maps.get("sigma"),
+        model=maps.get("model"),
+        misfit=maps.get("misfit"),
     )
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from emmc_rig.files.formats import Export, Format
@@ -95,7 +94,7 @@ def write_viewer(path: str | Path, content: ViewerContent) -> None:
     write_text(Path(path), render_viewer(content))
 
 
-def render_viewer(content: ViewerContent) -> Markup:
+def render_viewer(content: ViewerContent) -> str:
     """Return the page as text."""
     return fragment(
         "viewer_page.html",
@@ -106,8 +105,8 @@ def render_viewer(content: ViewerContent) -> Markup:
     )  # fmt: skip
 
 
-def viewer_data(content: ViewerContent) -> dict[str, object]:
-    """Return what viewer.js reads."""
+def viewer_data(content: ViewerContent, atlases: bool = True) -> dict[str, object]:
+    """Return what viewer.js reads; without atlases it takes those of the report it is part of."""
     shown = reduced(content.light_field)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
@@ -127,10 +126,7 @@ def viewer_data(content: ViewerContent) -> dict[str, object]:
         "scale": shrink,
         "tile": TILE_MULTIPLE_PX,
         "gamma": curve.gamma,
-        "estimate": _atlas(curve, shown, content.lossless),
-        "truth": None
-        if content.truth is None
-        else _atlas(curve, reduced(content.truth), content.lossless),
+        **(_atlases(curve, shown, content) if atlases else {}),
         "disparity": {"atlas": _grey_atlas(codes), "low": low, "high": low + span},
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
         "overlays": [_overlay(one, shown) for one in overlays_of(content)],
@@ -184,6 +180,14 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
         "colours": one.colours, "names": one.names,
         "picture": png_of(np.rint(levels * 255).astype(np.uint8)),
     }  # fmt: skip
+
+
+def _atlases(curve: DisplayCurve, shown: Array, content: ViewerContent) -> dict[str, str | None]:
+    truth = None if content.truth is None else reduced(content.truth)
+    return {
+        "estimate": _atlas(curve, shown, content.lossless),
+        "truth": None if truth is None else _atlas(curve, truth, content.lossless),
+    }
 
 
 def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:

@@ -2,6 +2,10 @@
 // A light field to turn, focus and look into. The shader is the twin of model/novel_view.py.
 (() => {
 const data = JSON.parse(document.getElementById("viewer-data").textContent);
+if (!data.estimate) { // a part of a report, which holds the views already
+  const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
+  Object.assign(data, { estimate, truth });
+}
 const byId = (id) => document.getElementById(`viewer-${id}`);
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const { rows, columns, width, height } = data.views;
