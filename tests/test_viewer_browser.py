@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, open_browser
+from browsers import MARKS, complaints, open_browser
 
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, photograph
@@ -20,9 +20,6 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
-
-HARMLESS = ("software WebGL", "GPU stall due to ReadPixels")
-"""What Chromium says of drawing without a graphics card, and of a test reading pictures back."""
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +90,7 @@ def opened(browser, address):
 @pytest.fixture
 def page(browser, written):
     yield opened(browser, written.as_uri())
-    complaints = [entry["message"] for entry in browser.get_log("browser")]
-    assert [one for one in complaints if not any(word in one for word in HARMLESS)] == []
+    assert complaints(browser) == []
 
 
 def shown(page, **state) -> np.ndarray:

@@ -109,6 +109,7 @@ def render(content: ReportContent) -> str:
         styles=("viewer.css",),
         heat=HEAT,
         warnings=_warnings(content),
+        verdict=_verdict_head(content),
         cards=_cards(content),
         capture={
             "shots": frames.shape[0],
@@ -363,7 +364,6 @@ def _cards(content: ReportContent) -> list[Card]:
             f"{total_s:.1f} s" if stages else "not measured",
             "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
         ),
-        _verdict_card(metrics.get("verdict")),
         Card(
             "Solver",
             status,
@@ -373,16 +373,27 @@ def _cards(content: ReportContent) -> list[Card]:
     ]
 
 
-def _verdict_card(verdict: object) -> Card:
-    """Return whether to trust the light field, with the gravest reason."""
+class VerdictHead(NamedTuple):
+    """The first thing on the page. next: remedies; tone: see `Card`."""
+
+    level: str
+    why: str
+    next: list[str]
+    tone: str
+
+
+def _verdict_head(content: ReportContent) -> VerdictHead | None:
+    """Return whether to trust the light field and what to do next; None where nobody judged."""
+    verdict = content.metrics.get("verdict")
     if not isinstance(verdict, dict):
-        return Card("Verdict", "not judged", "")
-    told = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
-    level = verdict["level"]
-    return Card(
-        "Verdict",
+        return None
+    level, reasons = verdict["level"], verdict["reasons"]
+    why = [reason["what"] for reason in reasons]
+    advice = str(content.metrics.get("advice") or "")
+    return VerdictHead(
         level,
-        told[0] if told else "nothing in frames, Psi and light field speaks against it",
+        "; ".join(why) or "nothing in frames, Psi and light field speaks against it",
+        [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
         {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
 

@@ -503,9 +503,7 @@ function prepareControls() {
   byId("aperture").max = farthest;
   byId("focus").min = data.focus.low;
   byId("focus").max = data.focus.high;
-  if (!data.truth) for (const element of document.querySelectorAll(".viewer-with-truth")) element.remove();
-  if (!data.truth) for (const id of ["wipe"]) document.body.append(Object.assign(
-    document.createElement("input"), { type: "hidden", id: `viewer-${id}` }));
+  for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
   const choices = [["nothing", -1], ...data.overlays.map((one, k) => [one.label, k])];
   for (const [label, value] of choices) {
     const row = byId("overlays").appendChild(document.createElement("label"));
