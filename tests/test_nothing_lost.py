@@ -46,6 +46,7 @@ WRITERS = {
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
+    "export": ("scene.h5", "--format", "png8"),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "reconstruct --tile": (8, "frames"),

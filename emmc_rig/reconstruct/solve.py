@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import is_session, kept_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
@@ -24,7 +25,7 @@ from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.pool import Pool, opened_pool
-from emmc_rig.reconstruct.result import LIGHT_FIELD, MAPS, Result, compared, figures
+from emmc_rig.reconstruct.result import Result, compared, figures
 from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
 from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
