@@ -52,7 +52,8 @@ class PlannedFrame:
     exposure_s: None where it is metered: then `light` times less light than in the metering
     frame `metered_by` comes to the sensor. view: (v, u) of a whiteboard's pinhole. Frames of one
     shot that differ in exposure alone are its bracket; `repeat` counts equal ones. part: frames
-    of one come before those of the next, in whatever order else.
+    of one come before those of the next, in whatever order else. window: by how many aperture
+    cells the plate's window is moved, x and y.
     """
 
     id: str
@@ -65,6 +66,7 @@ class PlannedFrame:
     metered_by: str | None = None
     light: float = 1.0
     part: int = 0
+    window: tuple[int, int] = (0, 0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, for JSON."""
@@ -86,6 +88,7 @@ class PlannedFrame:
             "metered_by": self.metered_by,
             "light": self.light,
             "part": self.part,
+            "window": list(self.window),
         }
 
     @classmethod
@@ -102,6 +105,7 @@ class PlannedFrame:
             data.get("board_turn_deg", 0.0),
         )
         view = data["view"]
+        window_x, window_y = data.get("window", (0, 0))
         return cls(
             data["id"],
             data["kind"],
@@ -113,4 +117,5 @@ class PlannedFrame:
             data["metered_by"],
             data["light"],
             data.get("part", 0),
+            (window_x, window_y),
         )
