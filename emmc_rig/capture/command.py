@@ -102,7 +102,9 @@ def wish_from_session(
 
 def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
     """Return every frame of a wish in the order of the capture."""
-    return ordered(expand(wish.plan, wish.camera, rig.window_um), wish.plan.order)
+    return ordered(
+        expand(wish.plan, wish.camera, rig.window_um, rig.window_side_um), wish.plan.order
+    )
 
 
 def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:

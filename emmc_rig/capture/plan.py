@@ -82,12 +82,17 @@ class PlannedShot(Settings):
 
 
 class OpenBoard(Settings):
-    """A whiteboard through the masks with the whole aperture open: what a fit of the mask needs.
+    """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
 
     mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
     """
 
     mask_um: tuple[float, float] = (0.0, 0.0)
+    window: tuple[int, int] = Field(
+        default=(0, 0),
+        description="x, y: by how many aperture cells the plate's window is moved, so that a part "
+        "of the aperture is open",
+    )
     repeats: Repeats = 2
     held_out: bool = False
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
-from emmc_rig.study.checks.bench import check_psi, check_sensor, check_stage
+from emmc_rig.study.checks.bench import check_few, check_psi, check_sensor, check_stage
 from emmc_rig.study.checks.effects import check_effect, effects
 from emmc_rig.study.checks.large import check_large
 from emmc_rig.study.checks.rows import Row
@@ -24,6 +24,7 @@ from emmc_rig.study.checks.statistics import check_bound, check_plan
 
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "psi": check_psi,
+    "few": check_few,
     "bound": check_bound,
     "plan": check_plan,
     "sensor": check_sensor,
