@@ -13,12 +13,13 @@ from reconstruction.adaptive import assembly
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.search import Volume, per_pixel
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out

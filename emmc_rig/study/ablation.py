@@ -16,7 +16,8 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
 WHOLE = "adaptive"
