@@ -26,7 +26,8 @@ BESIDE = 4
 ALONG_PX = 6.0
 """Deviation of the blur along an edge."""
 DARKER = 0.15
-"""Share by which an edge is darker than what is within: 0.22 to 1 on four real light fields."""
+"""Share by which every line of an edge is darker than what is within, and the next line by less than
+half of it: 0.22 to 1, and 0.05 at most, on four real light fields."""
 SUDDEN = 3.0
 """Times more that brightness changes, in squares, at the edge than at the next lines within: at
 least 3.5 on those four."""
@@ -116,7 +117,8 @@ def _width(lines: _Lines) -> int:
     for last in range(WIDEST):
         if mean[last] >= -DARKER:
             break
-        if square[last] > SUDDEN * max(square[last + 1 :]):
+        ends = mean[last + 1] > -DARKER / 2
+        if ends and square[last] > SUDDEN * max(square[last + 1 :]):
             width = last + 1
     return width
 
