@@ -26,8 +26,8 @@ BESIDE = 4
 ALONG_PX = 6.0
 """Deviation of the blur along an edge."""
 DARKER = 0.15
-"""Share by which every line of an edge is darker than what is within, and the next line by less than
-half of it: 0.22 to 1, and 0.05 at most, on four real light fields."""
+"""Share by which every line of an edge is darker than what is within, and the next line by less
+than half of it: 0.22 to 1, and 0.05 at most, on four real light fields."""
 SUDDEN = 3.0
 """Times more that brightness changes, in squares, at the edge than at the next lines within: at
 least 3.5 on those four."""

@@ -104,7 +104,7 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     k = given.psi.binning
     shares = mixture.shares_of(fits.residuals, given.noise, held)
     light_field = mixture.mean_light_field(fits.light_fields, shares, k)
-    spread = mixture.spread(fits.light_fields, light_field, fits.residuals, shares, k)
+    spread = mixture.spread(fits.light_fields, light_field, shares, k)
     residual = sum(share * one for share, one in zip(shares, fits.residuals, strict=True))
     sure = deviation(fits.scene, survey.scale, spread, np.asarray(residual), given.noise, held)
     return Mean(light_field, shares, sure)

@@ -17,7 +17,6 @@ How far the models differ from their mean, place by place, says where it is in d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -72,33 +71,16 @@ def mean_light_field(light_fields: Sequence[Array], shares: Array, binning: int)
     return total
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """Variance between the models about their mean, weighted by their shares: of the light field,
-    `samples` (v, u, y, x), the mean over colours, and of the readings, `frames` (shot, pixel_y,
-    pixel_x)."""
+def spread(light_fields: Sequence[Array], mean: Array, shares: Array, binning: int) -> Array:
+    """Return the variance (v, u, y, x) of light fields about their mean, averaged over colours.
 
-    samples: NDArray[np.float32]
-    frames: NDArray[np.float32]
-
-
-def spread(
-    light_fields: Sequence[Array],
-    mean: Array,
-    residuals: Sequence[Array],
-    shares: Array,
-    binning: int,
-) -> Spread:
-    """Return how far models differ from their mean. residuals: theirs, see `shares_of`."""
-    per_sample = _samples(shares, binning)
-    samples = np.zeros(mean.shape[:4], dtype=np.float32)
-    for share, one in zip(per_sample, light_fields, strict=True):
+    light_fields, mean: (v, u, y, x, c); shares: see `shares_of`.
+    """
+    out = np.zeros(mean.shape[:4], dtype=np.float32)
+    for share, one in zip(_samples(shares, binning), light_fields, strict=True):
         for v, u in np.ndindex(mean.shape[:2]):
-            samples[v, u] += share * np.square(one[v, u] - mean[v, u]).mean(axis=-1)
-    average = sum(share * one for share, one in zip(shares, residuals, strict=True))
-    pairs = zip(shares, residuals, strict=True)
-    frames = sum(share * np.square(one - average) for share, one in pairs)
-    return Spread(samples, np.asarray(frames, dtype=np.float32))
+            out[v, u] += share * np.square(one[v, u] - mean[v, u]).mean(axis=-1)
+    return out
 
 
 def _samples(shares: Array, binning: int) -> Array:

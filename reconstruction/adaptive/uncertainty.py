@@ -8,11 +8,14 @@ N, the noise that the last fit let into the texture or left in it; B, the square
 texture, for errors of position that all views share; E, the spread between the models of the mean
 (`mixture`), which is large where they disagree, at wrong disparities and occlusions.
 
-Each part predicts a variance of the held-out residuals r = I - Psi L. For N and B it follows from a
-correlation between the rays of a pixel; for E it is the spread of the models' frames itself. b and
-e maximise the likelihood of r, of a Student t since some residuals are wild. The scale s then makes
-a share WITHIN_ONE of them lie within one deviation: a split conformal calibration (Vovk et al.
-2005) on readings instead of samples, which needs no true light field.
+Each part predicts a variance of the held-out residuals r = I - Psi L, if errors are correlated
+along the texture: rays of one pixel that meet it far apart err independently. b and e maximise the
+likelihood of r, of a Student t since some residuals are wild. The scale s then makes a share
+WITHIN_ONE of them lie within one deviation: a split conformal calibration (Vovk et al. 2005) on
+readings instead of samples, which needs no true light field.
+
+It rests on the correlation, and errors that the rays of a pixel average out stay unseen: with the
+noise of a real light field's own views, say, fewer errors lie within sigma than stated.
 """
 
 from __future__ import annotations
@@ -25,13 +28,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from reconstruction.adaptive.joint import Scene
-from reconstruction.adaptive.mixture import Spread
 from reconstruction.adaptive.refine import slopes
 
 Array = NDArray[np.floating]
 HELD_SHARE, MOST_SHARE = 0.02, 0.06
 SMOOTH_PX = 2.0
-"""Deviation of the blur of every part, in pixels. Of E alone 1 and 0.7 change the scatter of the
+"""Deviation of the blur of every part, in pixels. For E alone, 1 and 0.7 change the scatter of the
 coverage over group A by less than 0.005."""
 CORRELATED_PX = 0.6
 """Errors of a texture are correlated as exp(-r / CORRELATED_PX) at a distance r."""
@@ -42,10 +44,6 @@ crops, five built-in scenes, one shot): without the second the coverage scatters
 WITHIN_ONE = 0.6827
 FREEDOM = 4.0
 """Of the Student t of the residuals."""
-SINGLE = 0.87
-"""Deviation of a sample over the one that its readings calibrate. A residual adds up the errors of
-many rays and so is nearly Gaussian; errors of samples have heavier tails, and 68 % of them lie
-closer. Fitted on group A at 96x96, noise 0.0005 and 0.004: 70 % within one deviation on average."""
 LEAST_SCALE = 0.1
 FEWEST = 50
 """Held-out readings below which no deviation is stated."""
@@ -64,15 +62,18 @@ def held_out(
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-def _parts(scene: Scene, noise_variance: float) -> Array:
-    """Return N and B of every sample, (2, v, u, y, x)."""
+def _parts(scene: Scene, brightness: float, noise_variance: float, spread: Array) -> Array:
+    """Return N, B and E of every sample, (3, v, u, y, x)."""
     let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
     steep = np.square(slopes(scene.clean[0])).mean(axis=1).sum(axis=0)
     smooth = np.stack([cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, steep)])
     layers = np.stack([smooth] * 2).astype(np.float32)
-    parts = np.moveaxis(np.maximum(scene.surfaces.light_field(layers), 0), -1, 0)
-    parts[0] *= np.float32(LET_IN)
-    parts[0] += np.float32(LEFT_IN * noise_variance)
+    seen = np.maximum(scene.surfaces.light_field(layers), 0) * np.float32(brightness**2)
+    parts = np.empty((3, *spread.shape), dtype=np.float32)
+    parts[0] = np.float32(LET_IN) * seen[..., 0] + np.float32(LEFT_IN * noise_variance)
+    parts[1] = seen[..., 1]
+    for v, u in np.ndindex(spread.shape[:2]):
+        parts[2, v, u] = cv2.GaussianBlur(spread[v, u], (0, 0), SMOOTH_PX)
     return parts
 
 
@@ -117,40 +118,35 @@ class Deviation:
 def deviation(
     scene: Scene,
     brightness: float,
-    spread: Spread,
+    spread: Array,
     residual: Array,
     noise: Array,
     held: NDArray[np.bool_],
 ) -> Deviation | None:
     """Return the standard deviation of a mean of models; None with too few readings held out.
 
-    scene: the last fit, of a light field over `brightness`. residual: of the mean; noise: variance
-    of the readings; held: those kept from the fits, all (shot, pixel_y, pixel_x).
+    scene: the last fit, of a light field over `brightness`. spread: variance (v, u, y, x) between
+    the models. residual: of the mean; noise: variance of the readings; held: those kept from the
+    fits, all (shot, pixel_y, pixel_x).
     """
     if held.sum() < FEWEST:
         return None
     allowed = noise[held].astype(np.float64)
-    parts = _parts(scene, float(np.median(allowed)) / brightness**2)
-    parts *= np.float32(brightness**2)
     square = np.square(residual[held], dtype=np.float64)
-    fixed, blur = _of_readings(scene, parts, held)
-    apart = cv2.GaussianBlur(np.moveaxis(spread.frames, 0, -1), (0, 0), SMOOTH_PX)
-    apart = np.moveaxis(apart.reshape(*noise.shape[1:], -1), -1, 0)[held].astype(np.float64)
-    base = allowed + fixed + 1e-12
+    parts = _parts(scene, brightness, float(np.median(allowed)), spread)
+    of_readings = _of_readings(scene, parts, held)
+
+    def predicted(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.append(1, np.exp(logs)) @ of_readings
 
     def surprise(logs: NDArray[np.float64]) -> float:
-        variance = base + np.exp(logs[0]) * blur + np.exp(logs[1]) * apart
+        variance = allowed + predicted(logs) + 1e-12
         tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
         return float(np.sum(np.log(variance) + tails))
 
-    b, e = np.exp(minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x)
-    predicted = np.maximum(fixed + b * blur + e * apart, 1e-20)
-    scale = float(np.quantile(np.maximum(square - allowed, 0) / predicted, WITHIN_ONE))
-    scale = SINGLE**2 * max(scale, LEAST_SCALE)
-    variance = parts[0]
-    variance += np.float32(b) * parts[1]
-    for v, u in np.ndindex(variance.shape[:2]):
-        around = cv2.GaussianBlur(spread.samples[v, u], (0, 0), SMOOTH_PX)
-        variance[v, u] += np.float32(e) * around
-    sigma = np.sqrt(np.float32(scale) * variance)
-    return Deviation(sigma, scale, float(b), float(e))
+    logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
+    over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), 1e-20)
+    scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
+    blur, apart = (float(one) for one in np.exp(logs))
+    weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
+    return Deviation(np.sqrt(np.tensordot(weights, parts, axes=1)), scale, blur, apart)
