@@ -38,6 +38,7 @@ WRITERS = {
     "chart --next-shot": (*SIZE,),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
+    "chart --stated": (*SIZE,),
     "demo": (*SIZE,),
     "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),

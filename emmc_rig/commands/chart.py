@@ -13,6 +13,7 @@ from emmc_rig.commands.chart_kernels import chart_kernels
 from emmc_rig.commands.chart_next_shot import chart_next_shot
 from emmc_rig.commands.chart_peers import chart_peers
 from emmc_rig.commands.chart_solvers import chart_solvers
+from emmc_rig.commands.chart_stated import chart_stated
 from emmc_rig.commands.options import (
     DEFAULT_SCENE,
     DictionaryOption,
@@ -61,6 +62,9 @@ def chart(
     guard: Annotated[
         bool, typer.Option("--guard", help="instead: PSNR of the default method, against figures")
     ] = False,
+    stated: Annotated[
+        bool, typer.Option("--stated", help="instead: PSNR and deviation as stated, and as true")
+    ] = False,
     until: Annotated[
         list[float] | None,
         typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
@@ -89,6 +93,8 @@ def chart(
         chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
     elif guard:
         chart_guard(scene or [], camera, shape, out or Path("emmc-guard"))
+    elif stated:
+        chart_stated(scene or [], camera, shape, out or Path("emmc-stated"))
     elif ablation:
         seen, cut = (scene or [DEFAULT_SCENE])[0], shape or STUDIED_SIZE
         chart_ablation(seen, one_camera, cut, seed, out or Path("emmc-ablation"))
