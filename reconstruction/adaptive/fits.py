@@ -70,7 +70,6 @@ def fitted_models(
             bright.precision(held, misfit),
             model.picture,
             model.texture,
-            settings.layers,
             on_step=lambda step, done=done: on_step(done + step),
             again=again if fit < len(settings.misfits) - 1 else None,
         )

@@ -32,9 +32,6 @@ class AdaptiveSettings(Settings):
     freedom: float = Field(
         default=3.0, gt=0, description="of the Student t of the readings; large: Gaussian"
     )
-    layers: bool = Field(
-        default=True, description="give what the centre view does not see a texture of its own"
-    )
     misfit: float = Field(
         default=0.004, gt=0, description="deviation of readings that no disparity explains"
     )

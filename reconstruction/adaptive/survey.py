@@ -176,7 +176,6 @@ def _trial(
         bright.precision(held, settings.misfits[-1]),
         model.picture,
         quick,
-        settings.layers,
     )
     return bright.frames - scene.surfaces.forward(scene.texture)
 

@@ -64,11 +64,10 @@ def held_out(
 
 def _parts(scene: Scene, brightness: float, noise_variance: float, spread: Array) -> Array:
     """Return N, B and E of every sample, (3, v, u, y, x)."""
-    let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
-    steep = np.square(slopes(scene.clean[0])).mean(axis=1).sum(axis=0)
+    let_in = np.square(scene.texture - scene.clean).mean(axis=0)
+    steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
     smooth = np.stack([cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, steep)])
-    layers = np.stack([smooth] * 2).astype(np.float32)
-    seen = np.maximum(scene.surfaces.light_field(layers), 0) * np.float32(brightness**2)
+    seen = np.maximum(scene.surfaces.light_field(smooth), 0) * np.float32(brightness**2)
     parts = np.empty((3, *spread.shape), dtype=np.float32)
     parts[0] = np.float32(LET_IN) * seen[..., 0] + np.float32(LEFT_IN * noise_variance)
     parts[1] = seen[..., 1]
