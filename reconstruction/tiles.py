@@ -28,8 +28,9 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.reading import StoredArrays, stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
 from reconstruction.adaptive.edges import SIDES, dark_edges
-from reconstruction.adaptive.method import TINY, AdaptiveSettings
 from reconstruction.adaptive.parsimony import may_be_grey
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import TINY
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError

@@ -38,6 +38,7 @@ WRITERS = {
     "chart --next-shot": (*SIZE,),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
+    "chart --stated": (*SIZE,),
     "demo": (*SIZE,),
     "design": (),
     "design --check": (),

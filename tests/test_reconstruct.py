@@ -15,7 +15,7 @@ from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.solve import reconstruct_folder
 from reconstruction.adaptive.joint import TextureSettings
-from reconstruction.adaptive.method import AdaptiveSettings
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError, ReconstructionError
 

@@ -62,10 +62,6 @@ def reconstruct(
     want: Annotated[
         str | None, typer.Option("--want", help="choose the quickest method for a PSNR, as 28dB")
     ] = None,
-    chart_folder: Annotated[
-        Path | None,
-        typer.Option("--chart", help="of `emmc-rig chart`, to choose by (default: the shipped)"),
-    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
     ] = False,
@@ -98,15 +94,11 @@ def reconstruct(
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget and --want choose the method and its settings")
         from emmc_rig.advice.recommend import advice_for
-        from emmc_rig.files.frames import PSI
-        from emmc_rig.model.sensing import ImagingMatrix
+        from emmc_rig.reconstruct.inputs import open_frames
 
-        measured = ImagingMatrix.load(psi or frames[0] / PSI)
-        advice = advice_for(measured, budget, want, chart_folder)
-        method, chosen, why = advice.method, advice.settings, advice.why
+        advice = advice_for(*open_frames(frames[0], psi), budget, want)
+        method, why = advice.method, advice.why
         console.print(why, highlight=False, soft_wrap=True)
-    elif chart_folder is not None:
-        raise typer.BadParameter("--chart serves --budget and --want")
     method = method or DEFAULT_METHOD
     requests = [
         Request(folder, place, method, psi, dictionary, chosen, truth, why, tile)

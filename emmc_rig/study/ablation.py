@@ -16,7 +16,8 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
 WHOLE = "adaptive"
@@ -29,7 +30,6 @@ LEFT_OUT = {
     "stacking of like blocks": {"texture": {"reach": 0}},
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},
     "momentum": {"texture": {"momentum": 0.0}},
-    "second layer": {"layers": False},
     "total variation in the mean": {"free": False},
     "a second fit, of less misfit": {"misfits": (0.004,)},
     "a second fit, of more misfit": {"misfits": (0.0015,)},
