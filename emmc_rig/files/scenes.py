@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emmc_rig.files import shards
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import load_hdf5, load_views, shifted
 from simulators.raycaster import World
@@ -77,7 +78,8 @@ def open_scene(
     """Open a scene.
 
     Args:
-        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, or a built-in name.
+        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr`
+            group with `light_field`, or a built-in name.
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 unless
             told), the middle that is cut from a measured one (all of it unless told).
         views: rows and columns of views, likewise (5x5 unless told).
@@ -209,7 +211,9 @@ def _described(name: str, views: tuple[int, int], size: tuple[int, int], seed: i
 def _measured(spec: str) -> tuple[np.ndarray, str]:
     """The light field in a folder or file, and a sentence about it."""
     path = Path(spec)
-    if path.is_dir():
+    if path.is_dir() and path.suffix == shards.ENDING:
+        light_field, kind = shards.load_light_field(path), "file"
+    elif path.is_dir():
         light_field, kind = load_views(path), "folder"
     elif path.suffix.lower() in _HDF5_ENDINGS:
         light_field, kind = load_hdf5(path), "file"
