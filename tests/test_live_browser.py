@@ -183,8 +183,8 @@ def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page, widt
         assert needed <= there
         nameless = page.execute_script(
             "return [...document.querySelectorAll('button, input, canvas, [tabindex]')]"
-            ".filter((one) => one.offsetParent && !(one.textContent.trim() || one.getAttribute('aria-label')"
-            " || one.labels?.length)).map((one) => one.outerHTML)"
+            ".filter((one) => one.offsetParent && !(one.textContent.trim()"
+            " || one.getAttribute('aria-label') || one.labels?.length)).map((one) => one.outerHTML)"
         )
         assert nameless == []
     finally:

@@ -52,6 +52,9 @@ def reconstruct(
         str | None,
         typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of them"),
     ] = None,
+    as_zarr: Annotated[
+        bool, typer.Option("--zarr", help="light field and maps as result.zarr, by all workers")
+    ] = False,
     memory: Annotated[
         str | None,
         typer.Option("--memory", help="of all processes together, as 2GiB: fewer at a time"),
@@ -101,7 +104,7 @@ def reconstruct(
         console.print(why, highlight=False, soft_wrap=True)
     method = method or DEFAULT_METHOD
     requests = [
-        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile)
+        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
         for folder, place in _places(frames, out)
     ]
     limit = None if memory is None else parse_memory(memory)
@@ -173,8 +176,9 @@ def _say_result(metrics: dict, request: Request) -> None:
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    pictures = request.out / "pictures"
-    typer.echo(f"open {pictures if pictures.is_dir() else request.out / 'light_field.h5'}")
+    written = ("pictures", "light_field.h5", "result.zarr")
+    shown = next(request.out / name for name in written if (request.out / name).exists())
+    typer.echo(f"open {shown}")
 
 
 def _list_methods() -> None:

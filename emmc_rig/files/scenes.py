@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
@@ -78,8 +79,9 @@ def open_scene(
     """Open a scene.
 
     Args:
-        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a built-in name, or what
-            another of `emmc_rig.files.formats` that can be read holds.
+        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
+            `light_field`, a built-in name, or what another of `emmc_rig.files.formats` that can
+            be read holds.
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 unless
             told), the middle that is cut from a measured one (all of it unless told).
         views: rows and columns of views, likewise (5x5 unless told).
@@ -215,6 +217,8 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
     if held is not None and held.read is not None:
         light_field = check_light_field(held.read(path), spec)
         kind = f"{held.name} {'folder' if path.is_dir() else 'file'}"
+    elif path.is_dir() and path.suffix == shards.ENDING:
+        light_field, kind = shards.load_light_field(path), "file"
     elif path.is_dir():
         light_field, kind = load_views(path), "folder"
     elif path.suffix.lower() in _HDF5_ENDINGS:
