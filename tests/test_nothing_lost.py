@@ -64,6 +64,8 @@ READERS = {
     "session prune", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
+    "calibrate --check": "checks.jsonl",
+    "chart --ablation": "ablation.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
     "stability": "points.jsonl",

@@ -239,7 +239,7 @@ def bench(
 ) -> None:
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
     from emmc_rig.study.benchmarks.trigger import capture_timing, trigger_timing
@@ -286,8 +286,6 @@ def bench(
                 "trigger": trigger.as_dict(),
                 "triggered_session": session.as_dict(),
                 "usb3_vision": [one.as_dict() for one in streams],
-                "command": command_line(),
-                "versions": versions(),
             }
             write_metrics(folder, metrics)
 

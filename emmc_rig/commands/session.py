@@ -163,7 +163,7 @@ def bench(
 ) -> None:
     """Time what capturing costs beside the devices, and verifying and listing sessions."""
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
 
     with nullcontext() if out is None else result_folder(out, "session bench") as results:
@@ -189,8 +189,6 @@ def bench(
                 "overhead": [one.as_dict() for one in measured],
                 "verification": rates.as_dict(),
                 "listing": {"shots": listed, "seconds": listing_s},
-                "command": command_line(),
-                "versions": versions(),
             }
             write_metrics(results, metrics)
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import refuse_edited, refuse_inside_session
+from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
@@ -62,7 +62,8 @@ def open_folder(out: Path, journal: str, command: str) -> Path:
     out = Path(os.path.abspath(out))
     if out.is_file():
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / journal).is_file():
+    known = (out / journal).is_file() or Listing.read(out) is not None
+    if out.is_dir() and any(out.iterdir()) and not known:
         raise AppError(
             f"--out {out}: the folder holds something else than an earlier `emmc-rig {command}`; "
             "choose another folder or empty it"
@@ -301,15 +302,6 @@ def csv_text(
     writer.writeheader()
     writer.writerows({name: written(name, value) for name, value in row.items()} for row in rows)
     return text.getvalue()
-
-
-def recorded(settings: Settings) -> dict[str, object]:
-    """Return what metrics.json says of how its figures were made."""
-    return {
-        "settings": settings.model_dump(mode="json"),
-        "command": command_line(),
-        "versions": versions(),
-    }
 
 
 def provenance(settings: Settings, seconds: float, **more: str) -> dict[str, str]:

@@ -31,7 +31,7 @@ from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS, Fault
 from emmc_rig.study.stability.fault_sweep import open_dictionary_once
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.stability.trial import Trial
-from emmc_rig.study.sweep import Results, Sweep, csv_text, recorded, sweep_folder
+from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, find_method
 from reconstruction.verdict.evidence import Evidence
@@ -327,7 +327,7 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
             "results": len(results),
             "tallies": tallies,
             "wrong": [told(one) for one in wrong(results)],
-            **recorded(settings),
+            "settings": settings.model_dump(mode="json"),
         }
         with result_folder(folder, "stability --verdicts", adds=True) as new:
             write_text(new / CSV, csv_text(rows, form=".3f", forms={"strength": "g"}))
