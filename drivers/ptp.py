@@ -17,7 +17,7 @@ from pathlib import PurePosixPath
 from typing import Protocol
 
 from drivers import ptp_codec as codec
-from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
+from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
@@ -479,7 +479,7 @@ def is_raw(info: ObjectInfo) -> bool:
     return info.format == Format.DNG or suffix in RAW_SUFFIXES
 
 
-class PtpCamera:
+class PtpCamera(ShapeFromFrames):
     """A still camera set to RAW (or RAW with JPEG) and manual exposure.
 
     PTP does not tell how large a RAW frame is: where `shape` is not given, asking for it before
@@ -518,22 +518,6 @@ class PtpCamera:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame; exposes one if there was none yet."""
-        if self._shape is None:
-            self.snap()
-        assert self._shape is not None
-        return self._shape
-
-    @property
-    def cfa(self) -> str:
-        """Colour phase or tile name of a frame; exposes one if there was none yet."""
-        if self._cfa is None:
-            self.snap()
-        assert self._cfa is not None
-        return self._cfa
 
     @property
     def exposure_s(self) -> float:

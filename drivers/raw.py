@@ -32,7 +32,6 @@ PANASONIC = b"IIU\x00"
 EXPOSURE_TIME_TAG = 33434
 EXIF_TAG = 34665
 IMAGE_DESCRIPTION_TAG = 270
-SUB_IFDS_TAG = 330
 CFA_TILE_PREFIX = "cfa_tile="
 """An ImageDescription that begins so names a colour tile that LibRaw's 2x2 phase cannot tell."""
 

@@ -43,7 +43,7 @@ class Countdown(Unwatched):
         if self.count == self.number:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def step(self, name, frame):
+    def phase(self, name, frame):
         self.event()
 
 
@@ -53,14 +53,14 @@ class Steps(Countdown):
     def taken(self, planned, frame, found):
         self.event()
 
-    def stored(self, frame):
+    def step(self, detail):
         self.event()
 
 
 class Lines(Countdown):
     """Counts lines of the code that stores."""
 
-    def step(self, name, frame):
+    def phase(self, name, frame):
         pass
 
     def watch(self):

@@ -33,8 +33,8 @@ class Promised(Unwatched):
     def __init__(self):
         self.frames = []
 
-    def stored(self, frame):
-        self.frames.append(frame.id)
+    def step(self, detail):
+        self.frames.append(detail)
 
 
 def run_on(disk, folder=ROOT, watcher=None):

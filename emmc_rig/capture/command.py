@@ -26,9 +26,9 @@ from emmc_rig.capture.plan import (
 )
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.sequencer import RunEnd, Sequencer
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -227,11 +227,11 @@ def way_on_told(wish: Wish, session: Session) -> Iterator[None]:
 
 def run_capture(
     wish: Wish,
-    watcher: Watcher,
+    watcher: CaptureWatcher,
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
-) -> tuple[Session, Outcome] | None:
+) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
     agreed: is told what it will take, once nothing speaks against it. Raises AppError or a
@@ -248,7 +248,7 @@ def run_capture(
         if session is None:
             frames = tuple(frame for frame in planned if not frame.is_optional)
         elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
-            watcher.tell(edit.words(len(session.stored)))
+            watcher.notify(edit.words(len(session.stored)))
             frames = tuple(
                 frame
                 for frame in edit.frames
@@ -266,7 +266,7 @@ def run_capture(
         if session is None:
             session = new_session(wish, planned)
             open_things.enter_context(held(session.folder))
-        with interruptible(control, watcher.tell), disk_faults_told(session):
+        with interruptible(control, watcher.notify), disk_faults_told(session):
             if edit is not None:
                 session = session.amend(_frozen(wish, edit.frames), edit.changes)
             with way_on_told(wish, session):
@@ -299,11 +299,11 @@ def capture_session(
     rig: Mapping[str, Any] | None,
     out: Path | None,
     until_db: float | None,
-    watcher: Watcher,
+    watcher: CaptureWatcher,
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
-) -> tuple[Session, Outcome] | None:
+) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
     See `asked_for` and `run_capture`. None where `agreed` says no. Raises StoppedError when
@@ -327,7 +327,7 @@ def capture_session(
         try:
             write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
-            watcher.tell(f"no report: {fault}")
+            watcher.notify(f"no report: {fault}")
     if not outcome.complete:
         raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
@@ -347,7 +347,7 @@ def capture(
     *,
     out: str | Path | None = None,
     until_db: float | None = None,
-    watcher: Watcher | None = None,
+    watcher: CaptureWatcher | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
     """Run a plan on a rig and return its session; run again, it goes on where it stopped.

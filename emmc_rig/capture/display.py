@@ -36,7 +36,7 @@ PAUSE_KEY, STOP_KEY = "p", "q"
 
 
 class CaptureDisplay:
-    """A `Watcher` of the sequencer."""
+    """A `CaptureWatcher` on a terminal."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
@@ -53,7 +53,8 @@ class CaptureDisplay:
         self._histogram = Text()
         self._line = Text()
         self._live: Live | None = None
-        self._done = self._planned = 0
+        self._done = 0
+        self._planned: int | None = None
         self._asking = False
 
     @contextmanager
@@ -91,12 +92,12 @@ class CaptureDisplay:
                 live.start()
             self._asking = False
 
-    def begin(self, done: int, planned: int) -> None:
+    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
         """Start the bar."""
-        self._done, self._planned = done, planned
-        self._task = self._progress.add_task("frames", total=planned, completed=done)
+        self._done, self._planned = done, steps
+        self._task = self._progress.add_task(stage, total=steps, completed=done)
         if not self._console.is_terminal and done:
-            self.tell(f"{done} of {planned} frames are there already")
+            self.notify(f"{done} of {steps} frames are there already")
 
     def more(self, planned: int) -> None:
         """Lengthen the bar."""
@@ -104,8 +105,8 @@ class CaptureDisplay:
         if self._task is not None:
             self._progress.update(self._task, total=planned)
 
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """Say what is under way."""
+    def phase(self, name: str, frame: PlannedFrame) -> None:
+        """Show the phase under way."""
         if self._live is not None and self._task is not None and name != "write":
             paused = "paused, p goes on: " if self._control.paused else ""
             self._progress.update(self._task, description=f"{paused}{frame.id}: {name}")
@@ -129,12 +130,12 @@ class CaptureDisplay:
             )
             self._done += 1
 
-    def stored(self, frame: PlannedFrame) -> None:
+    def step(self, detail: str) -> None:
         """Advance the bar."""
         if self._task is not None:
             self._progress.update(self._task, advance=1)
 
-    def tell(self, message: str) -> None:
+    def notify(self, message: str) -> None:
         """Print a line."""
         self._console.print(f"emmc-rig capture: {message}", highlight=False, soft_wrap=True)
 
@@ -149,7 +150,7 @@ class CaptureDisplay:
                     self._control.resume()
                 else:
                     self._control.pause()
-                    self.tell("pausing after this frame; p goes on")
+                    self.notify("pausing after this frame; p goes on")
             elif key == STOP_KEY:
                 self._control.stop()
-                self.tell("stopping after this frame")
+                self.notify("stopping after this frame")

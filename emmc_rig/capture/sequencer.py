@@ -39,7 +39,7 @@ from emmc_rig.capture.metering import (
 from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
-from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -60,7 +60,7 @@ LARGEST_EXPOSURE_RATIO = 1.5
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunEnd:
     """How a run ended: complete, or stopped by whoever controls it."""
 
     complete: bool
@@ -97,7 +97,7 @@ class Sequencer:
         session: Session,
         plan: Plan,
         rig: Rig,
-        watcher: Watcher | None = None,
+        watcher: CaptureWatcher | None = None,
         control: Control | None = None,
         choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
@@ -121,7 +121,7 @@ class Sequencer:
         self._handed: dict[str, list[float]] = {}
         self._may_saturate = _may_saturate(session.frames)
 
-    def run(self) -> Outcome:
+    def run(self) -> RunEnd:
         """Take what is missing.
 
         Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
@@ -137,7 +137,7 @@ class Sequencer:
             self._discard_damaged(whole)
             self._metered = first_meterings(session)
             missing, needed = session.missing(), len(session.needed)
-            self._watcher.begin(needed - len(missing), needed)
+            self._watcher.begin("frames", needed, done=needed - len(missing))
             refuse_impossible(self._rig, missing)
             frames = self._choose(self._now_s)
             if frames:
@@ -153,7 +153,7 @@ class Sequencer:
             left = len(session.missing())
             if not left and not session.is_complete:
                 session.note("complete", frames=len(session.needed), wall=self._wall())
-        return Outcome(
+        return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
 
@@ -247,7 +247,7 @@ class Sequencer:
                 faults += 1
                 self._note("retry", id=name, fault=str(error), attempt=faults, at_s=self._now_s())
                 self._budget.spend(name, error, faults)
-                self._watcher.tell(f"{name}, try {faults}: {error}")
+                self._watcher.notify(f"{name}, try {faults}: {error}")
                 todo = partial(self._mend, error, faults)
 
     def _mend(self, error: DriverError, faults: int) -> None:
@@ -460,14 +460,14 @@ class Sequencer:
         spans: dict[str, list[float]],
     ) -> None:
         """Write a frame and its journal line; runs in the writer's thread."""
-        self._watcher.step("write", planned)
+        self._watcher.phase("write", planned)
         began_s = self._now_s()
 
         def facts() -> Entry:
             return {**entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
 
         self._session.store(planned, suffix, data, sha256, facts)
-        self._watcher.stored(planned)
+        self._watcher.step(planned.id)
 
     def _discard_damaged(self, ids: set[str]) -> dict[str, str]:
         """Read files again; returns, by id, what is wrong with those that no longer count."""
@@ -476,11 +476,11 @@ class Sequencer:
         entries = [entry for name, entry in session.stored.items() if name in planned]
         size = sum(entry["bytes"] for entry in entries)
         if size > TOLD_BYTES:
-            self._watcher.tell(f"hashing {len(entries)} frames, {shown_bytes(size)}")
+            self._watcher.notify(f"hashing {len(entries)} frames, {shown_bytes(size)}")
         damaged = verify_frames(session, entries)
         for name, fault in damaged.items():
             session.discard(name, fault)
-            self._watcher.tell(f"{fault}; it is taken again")
+            self._watcher.notify(f"{fault}; it is taken again")
         return damaged
 
     def _compare_with_last_good(self) -> None:
@@ -533,7 +533,7 @@ class Sequencer:
     def _span(
         self, name: str, planned: PlannedFrame, spans: dict[str, list[float]]
     ) -> Iterator[None]:
-        self._watcher.step(name, planned)
+        self._watcher.phase(name, planned)
         began_s = self._now_s()
         yield
         spans[name] = [began_s, self._now_s()]

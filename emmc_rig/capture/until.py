@@ -13,7 +13,7 @@ from collections.abc import Callable
 from calibration.shadow import shadow_mask
 from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan
-from emmc_rig.capture.watcher import Watcher
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.session.decisions import decided_words, decisions, ended
@@ -66,7 +66,7 @@ def refuse_without_choice(plan: Plan, camera: Camera) -> None:
 class Until:
     """Says what a `Sequencer` takes next, of a session with a target; use it within one run."""
 
-    def __init__(self, session: Session, watcher: Watcher) -> None:
+    def __init__(self, session: Session, watcher: CaptureWatcher) -> None:
         self._session, self._watcher = session, watcher
         self._scale: Scale | None = None
 
@@ -105,7 +105,7 @@ class Until:
         session, target_db = self._session, self._session.target_db
         assert target_db is not None
         began_s = now_s()
-        self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
+        self._watcher.notify(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
         found = self._judged(shots, target_db)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         spared = [] if found.next is not None else sorted(planned - set(shots))
@@ -127,7 +127,7 @@ class Until:
             "wall": wall_time(),
         }
         session.note("decided", **entry)
-        self._watcher.tell(decided_words(entry))
+        self._watcher.notify(decided_words(entry))
 
     def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
         self._scale = self._scale or session_scale(self._session)

@@ -1,4 +1,7 @@
-"""Whoever shows a capture: what the sequencer tells him, and one who shows nothing."""
+"""What shows the progress of a capture: the interface that the sequencer calls, and a silent one.
+
+Its stages and steps are those of every `emmc_rig.progress.Watcher`: a step is a frame on the disk.
+"""
 
 from __future__ import annotations
 
@@ -6,56 +9,51 @@ from typing import Protocol
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
+from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.planned import PlannedFrame
 
-STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+PHASES = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+"""Of one frame, in order."""
 
 
-class Watcher(Protocol):
-    """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
+class CaptureWatcher(Watcher, Protocol):
+    """Shows a capture; `step` and `phase` may be called from the writer's thread."""
 
-    def begin(self, done: int, planned: int) -> None:
-        """So many frames are there already."""
+    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
+        """Begin a stage; `done` of its steps were done by an earlier run."""
         ...
 
     def more(self, planned: int) -> None:
-        """So many frames are to be taken in all, more than were known of."""
+        """Raise the number of steps: more frames are needed than were known."""
         ...
 
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """A step of a frame begins: one of `STEPS`."""
+    def phase(self, name: str, frame: PlannedFrame) -> None:
+        """Show that a phase of a frame begins: one of PHASES."""
         ...
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """A frame passed its checks."""
+        """Show a frame that passed its checks."""
         ...
 
-    def stored(self, frame: PlannedFrame) -> None:
-        """A frame is on the disk."""
-        ...
-
-    def tell(self, message: str) -> None:
-        """Something that people should know."""
+    def notify(self, message: str) -> None:
+        """Show a message."""
         ...
 
 
-class Unwatched:
-    """A watcher that shows nothing."""
+class Unwatched(Silent):
+    """A watcher of a capture that shows nothing."""
 
-    def begin(self, done: int, planned: int) -> None:
+    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
         """Ignore it."""
 
     def more(self, planned: int) -> None:
         """Ignore it."""
 
-    def step(self, name: str, frame: PlannedFrame) -> None:
+    def phase(self, name: str, frame: PlannedFrame) -> None:
         """Ignore it."""
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
         """Ignore it."""
 
-    def stored(self, frame: PlannedFrame) -> None:
-        """Ignore it."""
-
-    def tell(self, message: str) -> None:
+    def notify(self, message: str) -> None:
         """Ignore it."""

@@ -127,7 +127,7 @@ def _run(
         if expected.frames:
             most = "" if until_db is None else "at most "
             hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
-            display.tell(
+            display.notify(
                 f"{most}{expected.frames} frames to take, about "
                 f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}"
             )

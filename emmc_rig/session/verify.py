@@ -21,7 +21,6 @@ from emmc_rig.session.storage import Disk
 
 PIECE_BYTES = 1 << 20
 THREADS = min(8, os.cpu_count() or 1)
-GOOD = "good"
 
 
 @dataclass(frozen=True)

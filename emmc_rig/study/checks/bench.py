@@ -72,9 +72,7 @@ def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
     sheet = characterise(
         pairs(0.0, np.array([0.01, 1.0, 4.0])),
-        pairs(
-            1.0, brightest_s * np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1])
-        ),
+        pairs(1.0, brightest_s * np.array(FLAT_SHARES)),
         noise.white_level_dn,
     )
     known = {

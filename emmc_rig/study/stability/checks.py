@@ -31,8 +31,8 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a method: its PSNR, or why there is none.
+class Attempt:
+    """What a method made of a capture: its PSNR, or why there is none.
 
     refused: the error's line, "" where it ran. db: NaN where it did not run or is not finite.
     """
@@ -67,12 +67,12 @@ def solved(trial: Trial, method: str, settings: MethodSettings | None = None) ->
     )
 
 
-def outcome_of(trial: Trial, method: str, scale: float = 1.0) -> Outcome:
-    """Return the outcome of a method, its light field divided by `scale`."""
+def attempted(trial: Trial, method: str, scale: float = 1.0) -> Attempt:
+    """Return the attempt of a method, its light field divided by `scale`."""
     try:
         found = np.clip(solved(trial, method).light_field.astype(np.float64) / scale, 0, 1)
     except (ReconstructionError, ModelError) as fault:
-        return Outcome(math.nan, str(fault))
+        return Attempt(math.nan, str(fault))
     if not np.isfinite(found).all():
-        return Outcome(math.nan)
-    return Outcome(psnr_db(found, trial.truth))
+        return Attempt(math.nan)
+    return Attempt(psnr_db(found, trial.truth))
