@@ -22,7 +22,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent
 from emmc_rig.study.checks.check_sweep import CHECKS, run_checks
-from emmc_rig.study.checks.rows import judged
+from emmc_rig.study.checks.rows import target_row
 from emmc_rig.study.checks.scenes import moved_truth
 
 SIZE = ["--size", "32x40", "--rays", "64"]
@@ -114,7 +114,7 @@ def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
 
 
 def test_a_missed_target_of_a_check_is_exit_code_1_and_kept(run, monkeypatch, tmp_path):
-    rows = [judged("reached", 1.0, 2.0, ".1f"), judged("not reached", 3.0, 2.0, ".1f")]
+    rows = [target_row("reached", 1.0, 2.0, ".1f"), target_row("not reached", 3.0, 2.0, ".1f")]
     monkeypatch.setitem(CHECKS, "psi", lambda settings: (rows, {}))
     code, said, error = run("calibrate", "--check", "psi", "--out", tmp_path / "check")
     assert code == 1

@@ -154,11 +154,11 @@ def test_absurd_steps_stay_finite_and_are_told(capture):
 def test_the_worst_method_is_named():
     outcomes = {"tv": Attempt(20.0), "adaptive": Attempt(17.5), "dict-omp": Attempt(np.nan, "no")}
     wanted = dict.fromkeys(outcomes, 20.0)
-    figure, verdict = numerics.told(outcomes, wanted, True)
+    figure, verdict = numerics.condition_verdict(outcomes, wanted, True)
     assert figure == "refused: dict-omp; at most 2.5 dB apart (adaptive)"
     assert verdict == WEAK
     outcomes["tv"] = Attempt(np.nan)
-    figure, verdict = numerics.told(outcomes, wanted, True)
+    figure, verdict = numerics.condition_verdict(outcomes, wanted, True)
     assert figure.startswith("not finite: tv")
     assert verdict == BROKEN
     assert relative(np.ones(3, np.float32), np.ones(3)) == 0

@@ -100,7 +100,7 @@ def stability(
     for row in rows:
         table.add_row(f"{row.title}, {row.unit}", *row.cells)
     Console().print(table)
-    for line in beside.told:
+    for line in beside.lines:
         typer.echo(line)
     for line in outcome.left_out:
         say("left out", line)

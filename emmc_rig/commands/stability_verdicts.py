@@ -26,10 +26,10 @@ def stability_verdicts(
 
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.study.stability.detector import (
+        case_words,
         detector_settings,
         run_detector,
         tables,
-        told,
         wrong,
     )
 
@@ -58,5 +58,5 @@ def stability_verdicts(
     Console().print(table)
     for one in wrong(results):
         kind = "missed" if one.kind == "broken" else "false alarm"
-        say(kind, told(one))
+        say(kind, case_words(one))
     typer.echo(f"open {out / 'verdicts.csv'}")

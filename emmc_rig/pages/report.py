@@ -358,12 +358,12 @@ def _verdict_card(verdict: object) -> Card:
     """Return whether to trust the light field, with the gravest reason."""
     if not isinstance(verdict, dict):
         return Card("Verdict", "not judged", "")
-    told = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
+    reasons = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
     level = verdict["level"]
     return Card(
         "Verdict",
         level,
-        told[0] if told else "nothing in frames, Psi and light field speaks against it",
+        reasons[0] if reasons else "nothing in frames, Psi and light field speaks against it",
         {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
 

@@ -125,7 +125,7 @@ def _overhead(
     session, plan = _begun(shots, disk, folder)
     steps = _Steps(device)
     Sequencer(session, plan, rig, steps).run()
-    told = overlap(run_entries(session.journal.entries)[-1])
+    overlapping = overlap(run_entries(session.journal.entries)[-1])
     program_s = steps.looped_s - steps.device_s - steps.handing_over_s
     return Overhead(
         shape[0] * shape[1] / 1e6,
@@ -133,7 +133,7 @@ def _overhead(
         move_s,
         1e3 * program_s / (shots - 1),
         1e3 * steps.handing_over_s / (shots - 1),
-        told.hidden_share,
+        overlapping.hidden_share,
     )
 
 

@@ -35,15 +35,15 @@ def timing_lock(
     path = path or lock_path()
     descriptor = _opened(path)
     try:
-        told = False
+        announced = False
         while True:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                if on_wait is not None and not told:
+                if on_wait is not None and not announced:
                     on_wait(holder(path))
-                told = True
+                announced = True
                 sleep(0.2)
         _write(descriptor, f"process {os.getpid()}, {purpose}")
         yield descriptor

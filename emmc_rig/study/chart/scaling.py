@@ -73,8 +73,8 @@ def fitted_exponent(at: Sequence[float], values: Sequence[float]) -> float:
 
 def _memory_exponent(at: Sequence[float], rows: Sequence[dict]) -> float | None:
     added = [(x, row["peak_mib"] - row["base_mib"]) for x, row in zip(at, rows, strict=True)]
-    told = [(x, mib) for x, mib in added if mib > NOISE_MIB]
-    return fitted_exponent(*zip(*told, strict=True)) if len(told) > 1 else None
+    clear = [(x, mib) for x, mib in added if mib > NOISE_MIB]
+    return fitted_exponent(*zip(*clear, strict=True)) if len(clear) > 1 else None
 
 
 def expected_exponent(scaling: Scaling, at: Sequence[float], rows: Sequence[dict]) -> float | None:

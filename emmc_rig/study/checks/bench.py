@@ -20,7 +20,7 @@ from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.calibrate.simulated import measured_stage, run_calibration
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.progress import Silent
-from emmc_rig.study.checks.rows import Row, judged
+from emmc_rig.study.checks.rows import Row, target_row
 
 Array = NDArray[np.floating]
 FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
@@ -41,14 +41,14 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     distance = (1 + at.distance_share) / (1 + truth["distance_share"]) - 1
     turn = abs(np.degrees(at.rotation_rad - truth["rotation_rad"]))
     rows = [
-        judged("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
-        judged("Psi, mixed", errors["mixed"], None, ".3%"),
-        judged("Psi, free", errors["free"], 0.02, ".3%"),
-        judged("Psi, combined", errors["combined"], 0.005, ".3%"),
-        judged("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
-        judged("distance d", abs(float(distance)), 0.005, ".4%"),
-        judged("shift, px", float(shift_px) / pitch_um, 0.02, ".5f"),
-        judged("rotation, degrees", float(turn), 0.005, ".6f"),
+        target_row("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
+        target_row("Psi, mixed", errors["mixed"], None, ".3%"),
+        target_row("Psi, free", errors["free"], 0.02, ".3%"),
+        target_row("Psi, combined", errors["combined"], 0.005, ".3%"),
+        target_row("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
+        target_row("distance d", abs(float(distance)), 0.005, ".4%"),
+        target_row("shift, px", float(shift_px) / pitch_um, 0.02, ".5f"),
+        target_row("rotation, degrees", float(turn), 0.005, ".6f"),
     ]
     return rows, metrics
 
@@ -114,7 +114,7 @@ def check_stage(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     off_um = float(np.hypot(place.x_um - real[0], place.y_um - real[1]))
     pitch_um = camera.sensor.sample_pitch_um
     rows = [
-        judged("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
+        target_row("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
         Row("scale of the stage", f"{found.scale[0]:.5f}", f"{faults.scale:.5f}"),
         Row(
             "rotation of the stage, degrees",

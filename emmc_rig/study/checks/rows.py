@@ -20,7 +20,7 @@ class Row:
     verdict: str = ""
 
 
-def judged(what: str, value: float, limit: float | None, form: str, above: bool = False) -> Row:
+def target_row(what: str, value: float, limit: float | None, form: str, above: bool = False) -> Row:
     """Return the row of a figure that is to be at most, or at least, a limit (None: nothing)."""
     if limit is None:
         return Row(what, format(value, form))

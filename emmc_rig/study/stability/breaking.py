@@ -85,7 +85,7 @@ def strength_at(strengths: Sequence[float], place: float) -> float:
     return first + (last - first) * part
 
 
-def told(found: Span | None, strengths: Sequence[float]) -> str:
+def span_words(found: Span | None, strengths: Sequence[float]) -> str:
     """Return a span as what the table says of it."""
     if found is None:
         return "already at the mildest"

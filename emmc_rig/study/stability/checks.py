@@ -11,7 +11,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.result import Reconstruction
@@ -53,7 +53,7 @@ def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) 
     chosen = find_camera(camera)
     sensor = chosen.sensor.model_copy(update={"binning": binning})
     chosen = chosen.with_shots(shots).model_copy(update={"views": VIEWS, "sensor": sensor})
-    return taken(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
+    return trial_of(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
 
 
 def solved(trial: Trial, method: str, settings: MethodSettings | None = None) -> Reconstruction:

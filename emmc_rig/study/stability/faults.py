@@ -15,7 +15,7 @@ from emmc_rig.study.stability import (
     shot_faults,
 )
 from emmc_rig.study.stability.fault import Fault
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
 
 KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults, design_faults)
@@ -48,7 +48,7 @@ def trial(
     """
     setup = Setup(scene, camera_for(fault, camera), size, seed, zoom)
     if fault.is_clean(strength):
-        return taken(setup)
+        return trial_of(setup)
     return fault.make(setup, strength)
 
 

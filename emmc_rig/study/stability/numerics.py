@@ -54,7 +54,7 @@ def card_db(trial: Trial) -> float:
     return psnr_db(np.broadcast_to(mean, trial.truth.shape), trial.truth)
 
 
-def told(
+def condition_verdict(
     outcomes: Mapping[str, Attempt], wanted: Mapping[str, float], same: bool
 ) -> tuple[str, str]:
     """Return figure and verdict of a condition: the worst over the methods."""
@@ -149,14 +149,16 @@ def measure_numerics(
         trial = condition.change(one if condition.shots == 1 else two)
         found = {name: attempted(trial, name) for name in methods}
         outcomes[condition.name] = found
-        figure, verdict = told(found, usual if condition.same else card, condition.same)
+        figure, verdict = condition_verdict(
+            found, usual if condition.same else card, condition.same
+        )
         findings.append(Finding(condition.name, figure, verdict, condition.meaning))
         watcher.step(condition.name)
     by_scale = {}
     for factor in scales:
         trial = scaled(one, factor)
         by_scale[factor] = {name: attempted(trial, name, factor) for name in methods}
-        figure, verdict = told(by_scale[factor], usual, True)
+        figure, verdict = condition_verdict(by_scale[factor], usual, True)
         meaning = "a scene so much dimmer: the same light field, so much dimmer"
         if factor > 1:
             meaning = "a scene so much brighter than white cannot be: to be refused"

@@ -191,7 +191,7 @@ def predicted(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
         sums["found"] += min(expected.error + lost, 2 * expected.prior)
         sums["crb"] += crb
         sums["gain"] += expected.noise_gain
-        sums["told"] += expected.told
+        sums["told"] += expected.degrees_of_freedom
         part = (slice(None), slice(None), *(slice(at, at + SIDE) for at in place.corner))
         flat = np.broadcast_to(place.mean, truth[part].shape).reshape(-1, 3) @ OPPONENT.T
         plain = np.einsum("omr,ro->m", patch.opponent, flat)

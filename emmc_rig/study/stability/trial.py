@@ -88,7 +88,7 @@ class Trial:
     peak: float = 1.0
 
 
-def taken(
+def trial_of(
     setup: Setup,
     *,
     scene: Scene | None = None,
