@@ -54,7 +54,7 @@ def capture(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
+        bool, typer.Option("--dry-run", help="only check the plan, and estimate time and space")
     ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
@@ -118,7 +118,7 @@ def _run(
     def ask(what: str) -> None:
         if not sys.stdin.isatty():
             raise AppError(
-                f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
+                f"a person has to {what}: run this on a terminal, or automate the lamp and masks"
             )
         with display.aside():
             input(f"please {what}, then press Enter ")

@@ -1,4 +1,4 @@
-"""`emmc-rig chart --ablation`: what each piece of the adaptive method buys."""
+"""`emmc-rig chart --ablation`: gain and cost of each part of the adaptive method."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def chart_ablation(scene: str, camera: str, size: tuple[int, int], seed: int, out: Path) -> None:
-    """Measure the adaptive method without each of its pieces, and print a table."""
+    """Measure the adaptive method without each of its parts, and print a table."""
     from rich.console import Console
     from rich.table import Table
 

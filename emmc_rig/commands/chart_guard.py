@@ -37,7 +37,7 @@ def chart_guard(
     if fallen:
         typer.echo(
             f"{len(fallen)} figure(s) fell by more than {guard.MOST_FALL_DB} dB: "
-            f"{'; '.join(fallen)}: mend the method, or store {out / guard.STORED} if it is meant",
+            f"{'; '.join(fallen)}: fix the method, or store {out / guard.STORED} where intended",
             err=True,
         )
         raise typer.Exit(1)

@@ -133,7 +133,7 @@ def probe(
     if not chosen:
         raise AppError("no port with a known adapter: name the ports to ask")
     for port in chosen:
-        typer.echo(f"{port}: {probe_port(port) or 'nobody answers in Zaber ASCII, Grbl or APT'}")
+        typer.echo(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
 
 
 @app.command()
@@ -305,7 +305,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
         try:
             yield opened
         except KeyboardInterrupt as stop:
-            notes = getattr(stop, "__notes__", ["the stage was told to stop"])
+            notes = getattr(stop, "__notes__", ["the stage was stopped"])
             _told.print("; ".join(notes), highlight=False, soft_wrap=True)
             raise
         except DriverError as fault:

@@ -47,10 +47,10 @@ def stability(
     ] = False,
     mismatch: Annotated[
         bool,
-        typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
+        typer.Option("--mismatch", help="beside it: a wrong Psi, corrected blindly or exactly"),
     ] = False,
     verdicts: Annotated[
-        bool, typer.Option("--verdicts", help="instead: how well verdicts tell broken results")
+        bool, typer.Option("--verdicts", help="instead: how often verdicts flag broken results")
     ] = False,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,

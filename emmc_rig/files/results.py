@@ -1,4 +1,4 @@
-"""What results say of themselves: metrics, versions, and figures for people."""
+"""metrics.json of a result: figures, command and versions; and figures formatted for people."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ FIGURES = {
         "Mean standard deviation of Psi", ".2e", "", "of one coefficient, as calibration states it"
     ),
     "noise_sigma": Figure(
-        "Noise of the readings", ".2e", "", "standard deviation that the reconstruction was told"
+        "Noise of the readings", ".2e", "", "standard deviation given to the reconstruction"
     ),
     "saturated_share": Figure("Saturated readings", ".2%", "", "share left out as clipped"),
     "whiteboard_frames": Figure("Whiteboard frames", "", "", "exposures taken to measure Psi"),
@@ -363,7 +363,7 @@ def _verdict_card(verdict: object) -> Card:
     return Card(
         "Verdict",
         level,
-        reasons[0] if reasons else "nothing in frames, Psi and light field speaks against it",
+        reasons[0] if reasons else "frames, Psi and light field agree",
         {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
 

@@ -1,4 +1,4 @@
-"""When the bench worked and when the disk did: from the journal's spans to figures and a chart."""
+"""The timeline of a capture, bench and disk, from the journal's spans: figures and a chart."""
 
 from __future__ import annotations
 

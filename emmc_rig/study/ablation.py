@@ -1,7 +1,7 @@
-"""What each piece of the adaptive method buys in dB and costs in seconds, on one scene's shot.
+"""Gain in dB and cost in seconds of each part of the adaptive method, on one scene's shot.
 
-Every row leaves one piece out of the whole; the rows after them are what else there is to compare
-with, on the same frames.
+Every row leaves one part out. The rows after them are other methods, the true disparity and the
+copied centre view, on the same frames.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LEFT_OUT = {
     "a second fit, of more misfit": {"misfits": (0.0015,)},
     "disparity (all at 0)": {"furthest_px": 0.01},
 }
-"""Pieces of the method, and the settings without them."""
+"""Parts of the method, and the settings without them."""
 WITHOUT = "without "
 ORACLE = "true disparity in place of the searched one"
 COPIED = "copied true centre view"
@@ -154,7 +154,7 @@ def _reconstructed(given: Exposure, row: str) -> tuple[np.ndarray, float]:
 
 
 def ablations(given: Exposure, folder: Path, watcher: Watcher) -> list[Ablation]:
-    """Return the whole method, then it without each piece, its rivals, the oracle and the copy.
+    """Return the whole method, then it without each part, its rivals, the oracle and the copy.
 
     Rows that the folder holds are not measured again; see `Sweep.run`.
     """

@@ -1,7 +1,7 @@
-"""The engine of every study: points measured one by one, each kept, and gone on with after a stop.
+"""The engine of every study: points are measured one by one, stored, and resumed after a stop.
 
-A point is found again by a digest of everything that it depends on, so changed settings never meet
-old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
+A point is identified by a digest of everything that it depends on, so that changed settings never
+reuse old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def open_folder(out: Path, journal: str, command: str) -> Path:
     command: as typed, such as "chart". What is drawn and written of the points is replaced later by
     `result_folder`; what that would refuse is refused here, before anything is measured.
 
-    Raises AppError when the folder holds something else, or results that somebody edited, and
+    Raises AppError when the folder holds something else, or results that were edited, and
     where a session is.
     """
     refuse_inside_session(out)
@@ -81,7 +81,7 @@ def open_folder(out: Path, journal: str, command: str) -> Path:
 def kept_when_stopped(
     out: Path, folder: Path, what: Callable[[], str] = lambda: "every point that was done is"
 ) -> Iterator[None]:
-    """Say what is kept when Ctrl-C or a full disk ends the block.
+    """Add to the error what is kept when Ctrl-C or a full disk ends the block.
 
     out: the folder as asked for, folder: where it is. what: such as "3 of 10 points are". Raises
     SweepStopped and AppError.
@@ -202,7 +202,7 @@ class Sweep(Generic[P]):
         return {"version": __version__, **revision, **self.inputs(point)}
 
     def digest(self, point: P) -> str:
-        """Return the digest by which a point is found again."""
+        """Return the digest that identifies a point."""
         if point not in self._digests:
             self._digests[point] = digest_of(self.all_inputs(point))
         return self._digests[point]
@@ -278,7 +278,7 @@ class Sweep(Generic[P]):
 
 
 def plain(result: Mapping[str, object]) -> dict:
-    """Return a result as JSON gives it back: None for what is not finite, lists for tuples."""
+    """Return a result as read back from JSON: None for what is not finite, lists for tuples."""
     return json.loads(metrics_text(result))
 
 
@@ -343,7 +343,7 @@ def machine() -> str:
 
 
 def dictionary_identity(dictionary: str | None) -> str:
-    """Return what tells a dictionary from another: its name, and of a file its size and time."""
+    """Return what identifies a dictionary: its name, and of a file its size and time."""
     if dictionary is None or not Path(dictionary).is_file():
         return dictionary or "lambertian"
     seen = Path(dictionary).stat()

@@ -1,4 +1,4 @@
-"""Which points nothing else beats, in one scene and over all of them, and what they advise."""
+"""The Pareto front of speed and accuracy, by scene and over all scenes, and the advice from it."""
 
 from __future__ import annotations
 

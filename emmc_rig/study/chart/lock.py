@@ -1,4 +1,4 @@
-"""One timed run at a time on this machine: a lock file that names who holds it.
+"""A lock for timed runs, one at a time on this machine; its file names the process that holds it.
 
 The lock is the kernel's (flock), so that it ends with the processes that hold it, however they end.
 """

@@ -46,7 +46,7 @@ def measured(job: dict) -> dict:
     """Return the figures of a job: capture, method, settings, dictionary, repeats, ...
 
     seconds: median of the repeats. cpu_seconds: likewise, of all cores together. window_cpu_s: of
-    the warm-up's window once it is warm, which tells what does not grow with the picture.
+    the warm-up's window once it is warm, the part that does not grow with the picture.
     base_mib: resident memory of the process before the timed runs, with Psi and frames; peak_mib:
     at most during them. dictionary_s: of the one that this process has made.
     """

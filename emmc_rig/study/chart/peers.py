@@ -1,4 +1,4 @@
-"""Other libraries on the same Psi and frames (extra `peers`): rivals in the same chart."""
+"""Methods of other libraries on the same Psi and frames (extra `peers`), for comparison."""
 
 from __future__ import annotations
 

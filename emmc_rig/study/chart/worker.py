@@ -1,6 +1,6 @@
 """A process that measures the points of one configuration, one after another.
 
-Starting one costs more than most points. Where the peak of memory cannot be told for each point,
+Starting one costs more than most points. Where the peak of memory is not known for each point,
 and after a point that its process did not outlive, the next gets a new one.
 """
 

@@ -1,4 +1,4 @@
-"""Psi, sensor and stage on the simulated bench that is wrong in ways nobody is told of."""
+"""Psi, sensor and stage on the simulated bench, whose faults are unknown to the calibration."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
 
 def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
-    """EMVA 1288 figures of the simulated sensor against what it was made with."""
+    """EMVA 1288 figures of the simulated sensor against its true parameters."""
     noise, flaws = settings.camera.sensor.noise, settings.truth.sensor
     size, rng = settings.size, np.random.default_rng(settings.seed)
     well = flaws.full_well_electrons or noise.white_level_dn / noise.gain_dn_per_electron

@@ -1,4 +1,4 @@
-"""`emmc-rig calibrate --check`: what calibration reaches, against what was asked of it."""
+"""`emmc-rig calibrate --check`: accuracy and cost of the calibration, against targets."""
 
 from __future__ import annotations
 

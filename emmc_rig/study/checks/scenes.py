@@ -1,4 +1,4 @@
-"""What calibration means to reconstructions: its cost, its frames, drifts and false alarms.
+"""Effect of the calibration on reconstructions: cost in dB, frames, drifts and false alarms.
 
 Scenes are captured ray by ray through the same bench as the whiteboards.
 """
@@ -198,7 +198,7 @@ def _drift_of(
     usable = calibration.usable(captured.frames_dn, white)
     variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
     if design.colour is None:
-        raise AppError("a drift is sought on sensors with a colour filter")
+        raise AppError("a drift is estimated on sensors with a colour filter only")
     return find_drift(
         readings,
         variance,
@@ -270,14 +270,14 @@ def check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
                     f"{what}, {name}: ideal / mismatched / oracle / blind",
                     " / ".join(f"{value:.2f}" for value in db.values())
                     + f" dB; left {left_px:.3f} px; "
-                    + ("told" if found.drifted else "not told"),
+                    + ("drift detected" if found.drifted else "no drift detected"),
                 )
             )
         if lost > 0.05:
             share = gained / lost
             rows.append(target_row(f"{what}: lost dB recovered", share, 0.85, ".0%", above=True))
         else:
-            rows.append(Row(f"{what}: next to nothing is lost", f"{lost:.3f} dB in all"))
+            rows.append(Row(f"{what}: loss below 0.05 dB", f"{lost:.3f} dB in all"))
     return rows, detail
 
 

@@ -1,4 +1,4 @@
-"""What stands beside the sweeps: theory, numerical stability and the mismatch protocol.
+"""Studies beside the sweeps: theory, numerical stability and the mismatch protocol.
 
 Each part is measured into the sweeps' folder, with their scenes, camera and crop, and becomes
 sections of the page, a chart, a CSV file and figures for metrics.json.
@@ -109,9 +109,9 @@ def _mismatch(settings: StabilitySettings, folder: Path, new: Path, watcher: Wat
     ]
     write_text(new / "mismatch.csv", csv_text(rows))
     share = recovered_share(found, of_oracle=True)
-    line = "mismatch: next to nothing is lost"
+    line = "mismatch: too little is lost to measure a recovered share"
     if share is not None:
-        line = f"mismatch: blind mending gives back {share:.0%} of what knowing Psi gives back"
+        line = f"mismatch: blind correction recovers {share:.0%} of what the true Psi recovers"
     return Beside(mismatch_sections(found, new / DRAWN), {"mismatch": rows}, [line])
 
 

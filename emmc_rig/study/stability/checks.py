@@ -1,4 +1,4 @@
-"""What a numerical check is made of: a small capture, a method on it, and a verdict in words."""
+"""Parts of a numerical check: a small capture, a method's attempt on it, and a finding."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) 
 
 
 def solved(trial: Trial, method: str, settings: MethodSettings | None = None) -> Reconstruction:
-    """Return what a method makes of a trial; raises ReconstructionError as it does."""
+    """Return a method's reconstruction of a trial; raises ReconstructionError."""
     psi = trial.psi
     dictionary = None
     if METHODS[method].needs_dictionary:

@@ -1,4 +1,4 @@
-"""The camera's design taken to its ends: mask, shots, views, pixels; Psi is always the true one."""
+"""Extremes of the camera's design: mask, shots, views, pixels; Psi is always the true one."""
 
 from __future__ import annotations
 

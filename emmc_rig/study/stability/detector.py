@@ -1,9 +1,9 @@
-"""How well verdicts tell broken results from good ones: captures with every fault, each judged.
+"""How often verdicts flag broken results and pass good ones, on captures with every fault.
 
 A result is broken when it lost more than 3 dB against that of the same capture without the fault,
 good when it lost 1 dB or less. It is poor when it lost 3 dB or less but had little to lose: without
 the fault it was within 5 dB of a picture of one even colour, or another method of those measured
-was 2 dB better. What is poor or between may be flagged or not. Rows keep the evidence, from which
+was 2 dB better. These and those between may be flagged or not. Rows keep the evidence, from which
 verdicts are made anew: changed rules need no new measurement.
 """
 
@@ -47,7 +47,7 @@ KINDS = (SENSOR, MASK, SHOTS)
 
 
 class DetectorSettings(Settings):
-    """What to judge. faults: names; empty takes those that befall a capture."""
+    """What to measure. faults: names; empty takes those of a capture."""
 
     scenes: tuple[str, ...]
     cameras: tuple[str, ...] = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
@@ -90,7 +90,7 @@ def detector_settings(
 
 @dataclass(frozen=True)
 class Case:
-    """One result to judge. fault None: nothing is wrong."""
+    """One result to test. fault None: nothing is wrong."""
 
     scene: str
     camera: str
@@ -121,7 +121,7 @@ def _named(fault: Fault, strength: float) -> dict:
 
 
 def cases(settings: DetectorSettings) -> list[Case]:
-    """Return what to judge; those of one trial together."""
+    """Return the cases; those of one trial together."""
     names = settings.faults or tuple(f.name for f in FAULTS.values() if f.kind in KINDS)
     found = []
     for scene in settings.scenes:
@@ -173,7 +173,7 @@ class CaseResult:
 
 @dataclass
 class DetectorSweep(Sweep[Case]):
-    """The cases whose verdicts are judged; settings: DetectorSettings."""
+    """The cases whose verdicts are tested; settings: DetectorSettings."""
 
     journal = "verdicts.jsonl"
     noun = "cases"
@@ -225,7 +225,7 @@ def _row(method: str, given: Trial) -> dict:
 
 
 def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
-    """Return the rows judged by today's rules; those that a method refused are left out."""
+    """Return the rows with verdicts by the present rules; those without a result are left out."""
     best: dict[Case, float] = {}
     for case, row in rows.items():
         if "psnr_db" in row:
@@ -299,13 +299,13 @@ def wrong(results: Iterable[CaseResult]) -> list[CaseResult]:
 
 
 def case_words(one: CaseResult) -> str:
-    """Return a judged result in words."""
+    """Return a result in words."""
     reasons = "; ".join(reason.what for reason in one.verdict.reasons) or "nothing against it"
     return f"{one.case.label}: lost {one.lost_db:.1f} dB, {one.verdict.level} ({reasons})"
 
 
 def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[CaseResult]:
-    """Judge all cases; write verdicts.csv and metrics.json beside the rows.
+    """Measure all cases; write verdicts.csv and metrics.json beside the rows.
 
     Raises SweepStopped at Ctrl-C, AppError for a folder that cannot be written, and what the
     layers below do.
@@ -313,7 +313,7 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
     with sweep_folder(out, DetectorSweep.journal, "stability --verdicts") as folder:
         results = case_results(DetectorSweep(settings, folder).run(cases(settings), watcher))
         if not results:
-            raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
+            raise AppError("no case to measure: no fault applies to these scenes and cameras")
         rows = [_csv_row(one) for one in results]
         tallies = {
             f"{fault}, {method}": {

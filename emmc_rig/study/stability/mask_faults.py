@@ -1,4 +1,4 @@
-"""Faults of mask and lens that Psi does not know of: misplaced, soft edges, vignetting.
+"""Faults of mask and lens that Psi does not model: misplaced, soft edges, vignetting.
 
 The true Psi is that of the calibration's placement model; the method assumes the design's.
 """

@@ -49,7 +49,7 @@ class Numerics:
 
 
 def card_db(trial: Trial) -> float:
-    """Return the PSNR of a card of the scene's mean colour: of knowing next to nothing."""
+    """Return the PSNR of a card of the scene's mean colour, a lower bound for any method."""
     mean = trial.truth.mean(axis=(0, 1, 2, 3))
     return psnr_db(np.broadcast_to(mean, trial.truth.shape), trial.truth)
 

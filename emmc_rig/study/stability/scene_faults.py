@@ -1,4 +1,4 @@
-"""What makes a scene hard: depth, occlusions, mirrors, little contrast."""
+"""Difficult scenes: depth, occlusions, mirrors, little contrast."""
 
 from __future__ import annotations
 

@@ -66,12 +66,12 @@ def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
 
 
 def bad_pixels(setup: Setup, percent: float) -> Trial:
-    """So many percent of the pixels are dead or hot, half of each, and nobody is told."""
+    """So many percent of the pixels are dead or hot, half of each, and not marked as unusable."""
     return _bad(setup, percent, listed=False)
 
 
 def masked_pixels(setup: Setup, percent: float) -> Trial:
-    """The same pixels, and the method is told which."""
+    """The same pixels, marked as unusable."""
     return _bad(setup, percent, listed=True)
 
 
@@ -111,7 +111,7 @@ FAULTS = (
         SENSOR, saturation,
     ),
     Fault(
-        "bad-pixels", "Bad pixels, not told", "% of pixels",
+        "bad-pixels", "Bad pixels, not marked", "% of pixels",
         (0, 0.1, 0.3, 1, 3, 10, 30), (0, 0.3, 3, 20),
         SENSOR, bad_pixels, repairable=True, screened=True,
     ),

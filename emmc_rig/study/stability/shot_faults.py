@@ -1,4 +1,4 @@
-"""Faults between shots: a lamp that flickers, things that move, frames missing or doubled."""
+"""Faults between shots: flicker, motion, missing and repeated frames."""
 
 from __future__ import annotations
 

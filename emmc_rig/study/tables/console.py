@@ -1,4 +1,4 @@
-"""The tables and findings as a person reads them in a terminal."""
+"""The tables and findings as text for a terminal."""
 
 from __future__ import annotations
 

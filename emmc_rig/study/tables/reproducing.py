@@ -1,4 +1,4 @@
-"""`emmc-rig tables`: do the cells, judge the claims, and write tables.csv, page and metrics."""
+"""`emmc-rig tables`: measure the cells, test the claims, and write tables.csv, page and metrics."""
 
 from __future__ import annotations
 
