@@ -9,6 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from calibration.openings import CENTRED, views_open, window_place_um
 from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.capture.metering import BRACKET_STEP, MOST_STEPS
 from emmc_rig.capture.order import spread
@@ -36,13 +39,17 @@ def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...] | None]:
     ]
 
 
-def expand(plan: Plan, camera: Camera, window_um: float) -> tuple[PlannedFrame, ...]:
+def expand(
+    plan: Plan, camera: Camera, window_um: float, window_side_um: float | None = None
+) -> tuple[PlannedFrame, ...]:
     """Return every frame of a plan, in its order; camera: as planned.
 
-    window_um: what the stage's aperture_x adds to open the aperture. Raises AppError for views
-    that the camera does not have, and for a shot whose masks stand at several places.
+    window_um: what the stage's aperture_x adds to open the aperture. window_side_um: see
+    `emmc_rig.rig.hardware.Rig`; needed where the window opens a part of the aperture. Raises
+    AppError for views that the camera does not have, a window that uncovers none, and a shot whose
+    masks stand at several places.
     """
-    boards = [*_boards(plan, camera), *_open_boards(plan, camera, window_um)]
+    boards = [*_boards(plan, camera), *_open_boards(plan, camera, window_um, window_side_um)]
     lit = [
         *_references(plan, camera, window_um),
         *_response(plan, window_um),
@@ -191,14 +198,29 @@ def _boards(plan: Plan, camera: Camera) -> Iterator[PlannedFrame]:
                     )
 
 
-def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+def _open_boards(
+    plan: Plan, camera: Camera, window_um: float, window_side_um: float | None
+) -> Iterator[PlannedFrame]:
     boards = plan.whiteboards
     if boards is None or not boards.open:
         return
     own_um = mask_offsets_um(camera, 0)
-    window = {"aperture_x": window_um, "aperture_y": 0.0}
-    metered = boards.exposure_s is None
+    cell_um = camera.lens.aperture_cell_um
     for place, board in enumerate(boards.open):
+        opened = int(views_open(camera.views, None, board.window).sum())
+        if opened == 0:
+            raise AppError(
+                f"whiteboards.open.{place}.window: {list(board.window)} uncovers none of the "
+                f"camera's {camera.views[0]}x{camera.views[1]} views: move it by fewer cells"
+            )
+        if board.window != CENTRED and window_side_um is None:
+            raise AppError(
+                f"whiteboards.open.{place}.window needs to know where the window's edges are: "
+                "write its side as window_side_um into the rig's file, or leave it out"
+            )
+        side_um = window_side_um or 0.0
+        there = window_place_um(board.window, camera.views, cell_um, side_um)
+        window = {"aperture_x": window_um + there[0], "aperture_y": there[1]}
         if any(board.mask_um) and not own_um:
             raise AppError(
                 f"whiteboards.open.{place}.mask_um: no mask of this camera moves: leave it out"
@@ -216,14 +238,14 @@ def _open_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[Plann
                 f"{kind}-{place}-r{repeat}",
                 kind,
                 bench,
-                boards.exposure_s,
                 repeat=repeat,
-                metered_by=_metering_id(0, OPEN_LAMP) if metered else None,
+                window=board.window,
+                **_white(plan, float(np.prod(camera.views)) / opened),
             )
 
 
 def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
-    """Return how a whiteboard of the first shot is exposed; light: how many times as long as metered."""
+    """Return how a whiteboard of the first shot is exposed, `light` times as long as metered."""
     boards = plan.whiteboards or Boards()
     if boards.exposure_s is not None:
         return {"exposure_s": boards.exposure_s * light, "light": light}

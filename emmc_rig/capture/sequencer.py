@@ -208,7 +208,7 @@ class Sequencer:
         )
         self._note("metered", **asked, wall=self._wall())
         self._writer.flush()
-        self._watcher.tell(metered_words(asked))
+        self._watcher.notify(metered_words(asked))
         if not asked["asked"]:
             return False
         self._watcher.more(len(session.needed))
