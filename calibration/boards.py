@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, photon_transfer
 from calibration.levels import Check, Levels
+from calibration.openings import CENTRED, Window, views_open
 from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
 from emmc_rig.model.sensing import PsiLayout
 
@@ -22,7 +23,8 @@ class BoardFrame:
     """One whiteboard setting as captured: its mean frame, and how the bench stood.
 
     stage_um: where the mask stage stood, x and y, from where the design centres the mask; with
-    the shot's own offset in it. pinhole: the one view (v, u) open, or None: the whole aperture.
+    the shot's own offset in it. pinhole: the one view (v, u) open, or None: those that the window
+    leaves open, moved by so many cells (x, y).
     """
 
     frame: MeanFrame
@@ -30,11 +32,14 @@ class BoardFrame:
     shot: int = 0
     pinhole: tuple[int, int] | None = None
     lamp: str = "white"
+    window: Window = CENTRED
 
     @property
     def name(self) -> str:
         """What the messages call it."""
         through = "open aperture" if self.pinhole is None else f"view {self.pinhole}"
+        if self.window != CENTRED:
+            through = f"window moved by {self.window} cells"
         x, y = self.stage_um
         return f"shot {self.shot}, {through}, {self.lamp} lamp, mask at ({x:g}, {y:g}) um"
 
@@ -219,16 +224,12 @@ def _board(
         channels = np.full(reading.shape, LAMP_COLOURS.index(one.lamp), dtype=np.uint8)
     else:
         channels = np.full(reading.shape, 3, dtype=np.uint8)
-    views_open = np.ones(layout.views, dtype=bool)
-    if one.pinhole is not None:
-        views_open[:] = False
-        views_open[one.pinhole] = True
     return Board(
         one.name,
         reading.astype(np.float32),
         variance.astype(np.float32),
         np.ascontiguousarray(channels),
-        views_open,
+        views_open(layout.views, one.pinhole, one.window),
         one.stage_um,
         one.shot,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -266,29 +267,40 @@ def _mixed(
 
 
 def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
-    """Return the model with its misfit, from what it leaves of every pinhole's whiteboard.
+    """Return the model with its misfit, from what it leaves of whiteboards of few views.
 
-    A view that none opens has the largest of the others. Many pixels tell few parameters, so that
-    a board the fit has seen is as good as held out.
+    A view has that of the whiteboards which open it alone; where none does, that of those which
+    open the fewest with it, whose views are taken to be missed independently. Many pixels tell few
+    parameters, so that a board the fit has seen is as good as held out.
     """
     shadow = one.shadow
-    found: dict[tuple[int, int], Misfit] = {}
+    found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
     for board in seen:
-        if board.views_open.sum() != 1:
+        count = int(board.views_open.sum())
+        if count == board.views_open.size:
             continue
         predicted = predicted_by_shadow(shadow, board)
         squares = (board.reading - predicted) ** 2
-        v, u = (int(place) for place in np.argwhere(board.views_open)[0])
-        found[v, u] = measured_misfit(squares, board.variance, predicted, board.usable)
+        misfit = measured_misfit(squares, board.variance, predicted, board.usable)
+        for v, u in np.argwhere(board.views_open).tolist():
+            found[v, u].append((count, Misfit(misfit.level / count, misfit.per_slope)))
     if not found:
         return one
-    worst_of = max(found.values(), key=lambda misfit: misfit.level)
-    every = {view: found.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
-    return replace(one, misfit=every)
+    every = {}
+    for view, several in found.items():
+        fewest = min(count for count, _ in several)
+        every[view] = max(
+            (misfit for count, misfit in several if count == fewest), key=lambda one: one.level
+        )
+    # A view that none opens has the largest of the others.
+    worst_of = max(every.values(), key=lambda misfit: misfit.level)
+    return replace(
+        one, misfit={view: every.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
+    )
 
 
 def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
-    """Return the worst of the held-out whiteboards and of the views opened one by one."""
+    """Return the worst of the held-out whiteboards and of those that open single views or parts."""
     groups = {
         ("open aperture" if i == 0 else "mask moved"): judge(
             name, board, predicted_by_shadow(shadow, board)
@@ -296,9 +308,12 @@ def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[B
         for i, board in enumerate(judges)
     }
     for board in seen:
-        if board.views_open.sum() == 1:
-            v, u = np.argwhere(board.views_open)[0]
-            groups[f"view ({v}, {u})"] = judge(name, board, predicted_by_shadow(shadow, board))
+        if not board.views_open.all():
+            v, u = np.argwhere(board.views_open)[[0, -1]].T
+            through = f"view ({v[0]}, {u[0]})"
+            if board.views_open.sum() > 1:
+                through = f"views ({v[0]}, {u[0]}) to ({v[1]}, {u[1]})"
+            groups[through] = judge(name, board, predicted_by_shadow(shadow, board))
     return worst(groups)
 
 

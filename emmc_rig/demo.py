@@ -20,6 +20,7 @@ from calibration.whiteboard import (
 )
 from emmc_rig.capture.direct import capture_shots, capture_whiteboards, whiteboard_exposures
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
@@ -38,6 +39,7 @@ from emmc_rig.progress import Silent, Watcher
 from emmc_rig.rig.hardware import simulated_rig
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.verdict.missed import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
@@ -197,11 +199,22 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             usable=usable,
         )
         calibration.psi.save(folder / "psi.h5")
+        missed = missed_readings(calibration.psi, estimate, readings, sigma, usable)
+        maps = {**result.maps, "misfit": missed}
+        save_maps(folder, maps)
         metrics["seconds"] = dict(stages.seconds)
         write_report(
             folder / "report.html",
             _report(
-                settings, metrics, truth, result, readings, calibration, boards.pinholes, focus
+                settings,
+                metrics,
+                truth,
+                result,
+                readings,
+                calibration,
+                boards.pinholes,
+                focus,
+                maps,
             ),
         )
     metrics["seconds"] = dict(stages.seconds)
@@ -224,6 +237,7 @@ def _report(
     calibration: Calibration,
     pinholes: Mapping[tuple[int, int, int, str], MeanFrame],
     focus: tuple[float, float, float],
+    maps: Mapping[str, NDArray],
 ) -> ReportContent:
     camera = settings.camera
     weights, deviation = (
@@ -259,4 +273,5 @@ def _report(
         disparity_range_px=(focus[0], focus[2]),
         warnings=metrics["warnings"],
         command=metrics["command"],
+        maps=maps,
     )

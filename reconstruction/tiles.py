@@ -28,8 +28,9 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.reading import StoredArrays, stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
 from reconstruction.adaptive.edges import SIDES, dark_edges
-from reconstruction.adaptive.method import TINY, AdaptiveSettings
 from reconstruction.adaptive.parsimony import may_be_grey
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import TINY
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -202,6 +203,11 @@ class Grid:
             along.append([0, *(np.rint(inner).astype(int) * self.multiple).tolist(), length])
         return along[0], along[1]
 
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """The blocks, row by row."""
+        return tuple(self.block(row, column) for row, column in np.ndindex(self.shape))
+
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of blocks."""
@@ -211,8 +217,7 @@ class Grid:
         return self.shape[0] * self.shape[1]
 
     def __iter__(self) -> Iterator[Block]:
-        for row, column in np.ndindex(self.shape):
-            yield self.block(row, column)
+        return iter(self.blocks)
 
     def block(self, row: int, column: int) -> Block:
         """Return a block by its row and column in the grid."""
@@ -240,43 +245,48 @@ class Grid:
             weight *= 1 - np.clip((centre - (edges[at + 1] - blend)) / (2 * blend), 0, 1)
         return weight.astype(np.float32)
 
-    def overlapping(self, block: Block) -> Iterator[tuple[Block, Place, NDArray[np.float32]]]:
-        """Yield the blocks whose parts reach into a block's inner one, in a fixed order.
+    def overlapping(
+        self, place: Place, blended: bool = True
+    ) -> Iterator[tuple[Block, Place, NDArray[np.float32]]]:
+        """Yield the blocks whose parts reach into a place, their inner ones unless blended.
 
-        Each with the place they share, in the light field, and its weights there (y, x).
+        Each with the place they share, in the light field, and its weights there (y, x); in the
+        order of the grid.
         """
-        around = [
-            [at + more for more in (-1, 0, 1) if 0 <= at + more < count]
-            for at, count in zip((block.row, block.column), self.shape, strict=True)
-        ]
-        for row, column in product(*around):
-            other = self.block(row, column)
+        for block in self.blocks:
+            reach = block.part if blended else block.inner
             rows, columns = (
                 slice(max(a.start, b.start), min(a.stop, b.stop))
-                for a, b in zip(block.inner, other.part, strict=True)
+                for a, b in zip(place, reach, strict=True)
             )
-            weight = np.outer(self._weight(0, row, rows), self._weight(1, column, columns))
-            yield other, (rows, columns), weight
+            if rows.start < rows.stop and columns.start < columns.stop:
+                down = self._weight(0, block.row, rows)
+                yield block, (rows, columns), np.outer(down, self._weight(1, block.column, columns))
 
 
-Parts = Callable[[Block, str, tuple], Array]
-"""Returns what a block's part has of an array by name, at an index into it."""
+Part = Callable[[Block, tuple], Array]
+"""Returns what a block's part has of an array, at an index into it."""
 
 
-def assembled(grid: Grid, block: Block, name: str, axes: int, parts: Parts) -> Array:
-    """Return an array's inner part of a block, the weighted mean of the parts that overlap there.
+def assembled(grid: Grid, place: Place, axes: int, dtype: np.dtype, part: Part) -> Array:
+    """Return an array's values at a place: the weighted mean of the parts that overlap there.
 
-    axes: of the array before (y, x). Arrays of whole numbers are those of the block itself.
+    axes: of the array before (y, x). dtype: arrays of whole numbers are those of the nearest block.
     """
-    lead = (slice(None),) * axes
-    own = parts(block, name, (*lead, *within(block.inner, block.part)))
-    if len(grid) == 1 or own.dtype.kind != "f":
-        return own
-    total = np.zeros_like(own)
-    for other, place, weight in grid.overlapping(block):
-        values = parts(other, name, (*lead, *within(place, other.part)))
-        spread = weight.reshape(*weight.shape, *(1,) * (own.ndim - axes - 2))
-        total[(*lead, *within(place, block.inner))] += spread * values
+    lead, blended = (slice(None),) * axes, np.dtype(dtype).kind == "f" and len(grid) > 1
+    total = None
+    for block, shared, weight in grid.overlapping(place, blended):
+        values = part(block, (*lead, *within(shared, block.part)))
+        if total is None:
+            size = (one.stop - one.start for one in place)
+            shape = (*values.shape[:axes], *size, *values.shape[axes + 2 :])
+            total = np.zeros(shape, dtype)
+        at = (*lead, *within(shared, place))
+        if blended:
+            total[at] += weight.reshape(*weight.shape, *(1,) * (values.ndim - axes - 2)) * values
+        else:
+            total[at] = values
+    assert total is not None
     return total
 
 
@@ -651,10 +661,10 @@ def _whole(grid: Grid, parts: Mapping[str, Mapping[str, Array]]) -> dict[str, Ar
     out: dict[str, Array] = {}
     for name in (key for key in first if all(key in one for one in parts.values())):
         axes, like = AXES.get(name, 0), first[name]
-        shape = (*like.shape[:axes], *grid.size, *like.shape[axes + 2 :])
-        out[name] = np.empty(shape, dtype=like.dtype)
-        for block in grid:
-            out[name][(slice(None),) * axes + block.inner] = assembled(
-                grid, block, name, axes, lambda one, key, at: parts[one.name][key][at]
-            )
+
+        def part(block: Block, at: tuple, name: str = name) -> Array:
+            return parts[block.name][name][at]
+
+        everywhere = slice(0, grid.size[0]), slice(0, grid.size[1])
+        out[name] = assembled(grid, everywhere, axes, like.dtype, part)
     return out

@@ -124,7 +124,7 @@ def reconstruct_tv(
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
     begin = first_light_field(psi, guess, patch_term) if start is None else start
     light_field[:] = rows_of_colours(begin)
-    sweep, bands = _sweep(problem, dtype(gamma), dtype(settings.relaxation), light_field)
+    sweep, bands = sweeping(problem, dtype(gamma), dtype(settings.relaxation), light_field)
     moved = np.zeros((psi.frames_shape[1], 2))
     history: list[tuple[int, float]] = []
     change, step = np.inf, 0
@@ -160,7 +160,7 @@ def reconstruct_tv(
     )
 
 
-def _sweep(
+def sweeping(
     problem: Problem, gamma: np.floating, relaxation: np.floating, light_field: Array
 ) -> tuple[Callable[..., None], NDArray[np.int64]]:
     """Return a step of the solver on light_field (v, u, y, c, x), in place, and its bands of rows.

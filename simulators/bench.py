@@ -238,6 +238,11 @@ def trace(
             readings[y, x] = seen[x] / (count * views_v * views_u)
 
 
+def window_side_um(views: tuple[int, int], cell_um: float) -> float:
+    """Return the side of the plate's window: a little larger than the aperture."""
+    return max(views) * cell_um * (1 + WINDOW_MARGIN)
+
+
 class Bench:
     """Scene or whiteboard, lamp, masks, pinhole plate and sensor of a camera, as they really are.
 
@@ -466,10 +471,10 @@ class Bench:
     def _openings(self, x_um: float, y_um: float) -> Array:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
         cell_um = self.camera.lens.aperture_cell_um
-        window_half_um = max(self.camera.views) * cell_um / 2
+        window_half_um = window_side_um(self.camera.views, cell_um) / 2
         return np.array(
             [
                 (x_um, y_um, cell_um / 2),
-                (x_um - self._window_um, y_um, window_half_um * (1 + WINDOW_MARGIN)),
+                (x_um - self._window_um, y_um, window_half_um),
             ]
         )

@@ -28,6 +28,16 @@ OPTIONS = (
 )
 
 
+HARMLESS = ("software WebGL", "GPU stall due to ReadPixels", "WebGL contexts")
+"""What Chromium says of drawing without a graphics card, and of a test reading pictures back."""
+
+
+def complaints(driver):
+    """Return what the browser's console complained of since it was last asked."""
+    told = [entry["message"] for entry in driver.get_log("browser")]
+    return [one for one in told if not any(words in one for words in HARMLESS)]
+
+
 @contextmanager
 def open_browser(profile):
     """Yield a driver of a browser whose profile lies in that folder."""

@@ -43,7 +43,7 @@ class Countdown(Unwatched):
         if self.count == self.number:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def phase(self, name, frame):
+    def step(self, name, frame):
         self.event()
 
 
@@ -53,14 +53,14 @@ class Steps(Countdown):
     def taken(self, planned, frame, found):
         self.event()
 
-    def step(self, detail):
+    def stored(self, frame):
         self.event()
 
 
 class Lines(Countdown):
     """Counts lines of the code that stores."""
 
-    def phase(self, name, frame):
+    def step(self, name, frame):
         pass
 
     def watch(self):

@@ -29,6 +29,7 @@ shots:
   - {mask_um: [48, 24], exposure_s: auto}
 whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
 darks: {repeats: 2}
+metering: {bracket: false}
 settle_s: 0.1
 """
 

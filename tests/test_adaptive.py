@@ -13,12 +13,13 @@ from reconstruction.adaptive import assembly
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.search import Volume, per_pixel
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
@@ -44,8 +45,8 @@ def plane_scene(psi, disparity, seed=0):
     margin = int(np.ceil(abs(disparity) * (max(views) // 2))) + 4
     rays = np.full((*views, *psi.size), disparity, dtype=np.float32)
     surfaces = Surfaces(psi, rays, np.zeros(rays.shape, np.uint8), margin)
-    picture = textured(surfaces.textures_shape[2:], seed)
-    return np.clip(surfaces.light_field(np.stack([picture, picture])), 0, 1), surfaces
+    picture = textured(surfaces.texture_shape[1:], seed)
+    return np.clip(surfaces.light_field(picture), 0, 1), surfaces
 
 
 @pytest.mark.parametrize(
@@ -112,14 +113,14 @@ def test_psi_of_surfaces_is_psi_of_their_light_field(random_psi, monkeypatch):
         centre = rng.uniform(-1, 1, (20, 22)).astype(np.float32)
         disparity, hidden = carried(centre, 5, 1, psi.light_field_shape[:4])
         assert hidden.any()
-        texture = rng.random((2, 3, 20, 22)).astype(np.float32)
+        texture = rng.random((3, 20, 22)).astype(np.float32)
         frames = rng.normal(size=psi.frames_shape).astype(np.float32)
         change = rng.normal(size=(20, 22)).astype(np.float32)
         results = []
         for most in (assembly.MOST_CELLS, 0):
             monkeypatch.setattr(assembly, "MOST_CELLS", most)
             surfaces = Surfaces(psi, disparity, hidden, 5)
-            forward, adjoint = surfaces.derivative(slopes(texture[0]))
+            forward, adjoint = surfaces.derivative(slopes(texture))
             results.append(
                 (
                     surfaces.forward(texture),
@@ -144,14 +145,15 @@ def test_the_derivative_is_what_frames_change_by_when_the_disparity_grows(coded_
     # Waves longer than the taps' support: slopes by differences hold to a few per cent.
     y, x = np.indices((28, 28)) / 9
     picture = np.stack([0.5 + 0.3 * np.sin(y + k) * np.cos(x) for k in range(3)]).astype(np.float32)
-    both = np.stack([picture, picture])
 
     def surfaces(d):
         rays = np.full((3, 3, 16, 16), d, np.float32)
         return Surfaces(psi, rays, np.zeros(rays.shape, np.uint8), margin)
 
     step = 0.02
-    change = (surfaces(0.5 + step).forward(both) - surfaces(0.5 - step).forward(both)) / (2 * step)
+    change = (surfaces(0.5 + step).forward(picture) - surfaces(0.5 - step).forward(picture)) / (
+        2 * step
+    )
     forward, _ = surfaces(0.5).derivative(slopes(picture))
     got = forward(np.ones((28, 28), np.float32))
     assert np.linalg.norm(got - change) < 0.03 * np.linalg.norm(change)
@@ -161,7 +163,7 @@ def test_the_fit_is_the_posterior_mean_of_dense_algebra(random_psi):
     psi = random_psi(2, (3, 3), (5, 6))
     disparity = np.full((3, 3, 5, 6), 0.4, np.float32)
     surfaces = Surfaces(psi, disparity, np.zeros(disparity.shape, np.uint8), 3)
-    shape = surfaces.textures_shape
+    shape = surfaces.texture_shape
     rng = np.random.default_rng(2)
     prior = rng.random(shape).astype(np.float32)
     frames = rng.random(psi.frames_shape).astype(np.float32)
@@ -357,16 +359,16 @@ def test_frames_of_a_plane_are_psi_of_its_surface(random_psi, binning):
     psi = random_psi(2, (3, 3), (10, 12), 1, binning)
     texture = np.random.default_rng(1).random((3, 24, 26)).astype(np.float32)
     rays = np.full((3, 3, *psi.size), -0.7, np.float32)
-    surfaces = Surfaces(psi, rays, np.zeros(rays.shape, np.uint8), 7, layers=1)
+    surfaces = Surfaces(psi, rays, np.zeros(rays.shape, np.uint8), 7)
     np.testing.assert_allclose(
-        plane_frames(psi, texture, -0.7, 7), surfaces.forward(texture[None]), rtol=1e-4, atol=1e-5
+        plane_frames(psi, texture, -0.7, 7), surfaces.forward(texture), rtol=1e-4, atol=1e-5
     )
 
 
 def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     truth, surfaces = plane_scene(bayer, 0.75)
     frames = bayer.forward(truth.astype(np.float32))
-    texture = textured(surfaces.textures_shape[2:])
+    texture = textured(surfaces.texture_shape[1:])
     missed = frames - plane_frames(bayer, texture, 0.0, surfaces.margin)
     labels = np.arange(-1, 1.1, 0.25)
     # All patches but one in the even part believe in 0, though not firmly.

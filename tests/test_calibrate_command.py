@@ -76,7 +76,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     run, camera_file, tmp_path
 ):
     frames = []
-    for target in ("0.005", "0.0025"):
+    for target in ("0.005", "0.0019"):
         out = tmp_path / target
         code, said, _ = run(
             "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
@@ -88,8 +88,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
         opened = {tuple(one["pinhole"]) for one in plan["whiteboards"] if one["pinhole"]}
         assert opened == set(np.ndindex(3, 3))
         written = yaml.safe_load((out / "plan.yaml").read_text())
-        longest_s = max(written["darks"]["exposure_s"])
-        assert longest_s >= plan["exposures"]["pinhole_s"]
+        assert written["darks"]["of_boards"] > 0
         frames.append(plan["frames"])
     assert frames[1] > frames[0]
 
@@ -98,7 +97,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     ("arguments", "message"),
     [
         (["--target", "0.00001"], "cannot be reached: the best is"),
-        (["--target", "0.0015", "--frames", "45"], "cannot be reached with 45 frames: the best is"),
+        (["--target", "0.0015", "--frames", "70"], "cannot be reached with 70 frames: the best is"),
         (["--frames", "12"], "a plan opens each of the 9 views at least once"),
     ],
 )

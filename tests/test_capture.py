@@ -239,7 +239,7 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
     session, plan = started(rig)
 
     class Impatient(Unwatched):
-        def phase(self, name, frame):
+        def step(self, name, frame):
             if name == "expose" and frame.id == "reference-s1-white-r0":
                 raise KeyboardInterrupt
 
@@ -301,7 +301,7 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
     pushed = []
 
     class Clumsy(Unwatched):
-        def phase(self, name, frame):
+        def step(self, name, frame):
             if name == "read back" and frame.kind == "whiteboard" and not pushed:
                 rig.chain.displace(1, 1, 30.0)
                 pushed.append(frame.id)
@@ -438,7 +438,7 @@ def test_the_stage_moves_on_while_a_frame_is_written():
     last = boards[-1]
 
     class Holding(Unwatched):
-        def phase(self, name, frame):
+        def step(self, name, frame):
             if name == "hand over" and frame.kind == "whiteboard":
                 moved.clear()
             if name == "write" and frame.kind == "whiteboard" and frame.id != last:
@@ -548,7 +548,7 @@ retries: {per_frame: 8, per_session: 2000}
     class Saboteur(Unwatched):
         count = 0
 
-        def phase(self, name, frame):
+        def step(self, name, frame):
             where = {
                 "move": (rig.chain.faults, STAGE_FAULTS),
                 "read back": (rig.chain.faults, ("drop_reply", "garble_reply", "unplug")),
@@ -559,7 +559,7 @@ retries: {per_frame: 8, per_session: 2000}
                 where[0].inject(fault)
                 injected.append(fault)
 
-        def step(self, detail):
+        def stored(self, frame):
             self.count += 1
             if self.count in (200, 1000):
                 memory.append(resident_bytes())

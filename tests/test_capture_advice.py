@@ -56,6 +56,7 @@ GUARDS = (
     "is damaged, its SHA-256 is not the journal's",
     "); resume it",
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
+    " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
     "another program",  # a program that holds the lock and never says its name
 )
 """What other commands print, and what earlier checks keep a capture from."""
@@ -198,6 +199,20 @@ def views_that_are_none(bench):
     bench.boards(views=[[7, 2]])
     yield bench.refused()
     bench.boards(views=[[4, 2]])
+
+
+@walk(" uncovers none of the camera's ")
+def a_window_beside_the_aperture(bench):
+    bench.boards(open=[{"window": [0, 5]}])
+    yield bench.refused()
+    bench.boards(open=[{"window": [0, 0]}])
+
+
+@walk("needs to know where the window's edges are")
+def a_window_of_unknown_size(bench):
+    bench.boards(open=[{"window": [0, 2]}])
+    yield bench.refused()
+    bench.boards(open=[{"window": [0, 0]}])
 
 
 @walk(" shots, from 0")

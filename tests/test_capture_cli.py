@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -430,3 +431,48 @@ def test_an_interrupted_capture_says_how_to_go_on(tmp_path, signals, line):
     session = Session(tmp_path / "plan-session")
     assert 2 < len(session.stored) < 300
     assert next(sessions_in(tmp_path)).name == "plan-session"
+
+
+def test_sessions_are_found_by_camera_date_verdict_and_psnr_below_a_folder(captured, run, tmp_path):
+    folder = captured
+    shutil.copytree(folder / "plan-session", tmp_path / "a/one")
+    shutil.copytree(folder / "plan-session", tmp_path / "b/two")
+    results = tmp_path / "a/one/reconstruction"
+    results.mkdir()
+    told = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
+    (results / "metrics.json").write_text(json.dumps(told))
+
+    def listed(*wanted):
+        code, out, err = run("session", "list", tmp_path, "--json", *wanted)
+        if code:
+            assert "none of its 2 session(s) is such" in one_line(err)
+            return []
+        return [json.loads(line)["name"] for line in out.splitlines()]
+
+    assert listed() == listed("--camera", PLAN["camera"][:6].upper()) == ["one", "two"]
+    assert listed("--verdict", "doubt") == listed("--psnr", "27dB") == ["one"]
+    assert listed("--psnr", "28dB") == listed("--before", "2026-01-01") == []
+    assert listed("--since", "2026-01-01") == ["one", "two"]
+    assert listed("--camera", "no such") == []
+    _, out, _ = run("session", "list", tmp_path)
+    assert "a/one" in out
+    assert "27.5" in out
+    _, out, _ = run("session", "compare", tmp_path / "a/one", tmp_path / "b/two")
+    assert "27.50" in out
+    assert "not reconstructed" in out
+    assert "plan." not in out  # they are of one plan
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["list", "--since", "yesterday"], "write a day as 2026-11-22"),
+        (["list", "--verdict", "fine"], "one of trust, doubt, do not use"),
+        (["list", "--psnr", "lots"], "PSNR"),
+        (["compare", "one"], "name two sessions"),
+    ],
+)
+def test_a_wrong_search_exits_with_2(run, arguments, said):
+    code, _, err = run("session", *arguments)
+    assert code == 2
+    assert said in " ".join(err.replace("│", "").split())

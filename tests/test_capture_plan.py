@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.capture.estimate import estimate
+from emmc_rig.capture.estimate import Pace
 from emmc_rig.capture.expand import expand, exposures_s, fittings
 from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
@@ -141,8 +141,10 @@ def test_frames_survive_the_way_through_json():
 def test_an_estimate_counts_exposures_moves_and_bytes():
     bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0)]
     frames = [PlannedFrame(f"f{i}", "shot", one, 2.0) for i, one in enumerate(bench)]
-    told = estimate(frames, 1_000_000, {"mask_x": 1000.0}, settle_s=1.0, metered_s=0.1)
+    pace = Pace({"mask_x": 1000.0}, settle_s=1.0, frame_bytes=1_000_000)
+    told = pace.estimate(frames, lambda frame: frame.exposure_s)
     assert told.exposing_s == 4.0
+    assert told.guessed == 0
     # Two moves settle for 1 s each and the second goes 4 mm at 1 mm/s.
     assert 6.0 <= told.moving_s <= 7.0
     assert 2e6 <= told.bytes <= 2.1e6

@@ -1,20 +1,16 @@
-"""The parts of a chart: fronts, scores, growth, the timing lock, and advice."""
+"""The parts of a chart: fronts, scores, growth, and the timing lock."""
 
-import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from emmc_rig.advice import recommend
-from emmc_rig.advice.recommend import Problem, Row, advised, parse_budget, parse_wanted, read_rows
-from emmc_rig.errors import AppError
 from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
-from emmc_rig.study.chart.front import POOLED, Mark, advice_rows, charts, pareto_front
+from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
 from emmc_rig.study.chart.lock import timing_lock
 from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import (
@@ -195,100 +191,6 @@ def test_a_capture_is_made_once_and_its_truth_kept_apart(tmp_path):
     np.testing.assert_array_equal(disparity, rendered.disparity_px[10:30, 12:36])
     kept = frames.readings[frames.usable] - psi.forward(truth)[frames.usable]
     assert kept.std() == pytest.approx(frames.noise_sigma, rel=0.2)
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("30s", 30), ("2min", 120), ("1.5 h", 5400), ("0.5", 0.5), ("3M", 180)]
-)
-def test_budgets_are_read(text, seconds):
-    assert parse_budget(text) == seconds
-
-
-def test_nonsense_is_one_line():
-    for call, text in ((parse_budget, "soon"), (parse_budget, "0s"), (parse_budget, "-3s"),
-                       (parse_wanted, "good"), (parse_wanted, "28 lux")):  # fmt: skip
-        with pytest.raises(AppError, match="write a"):
-            call(text)
-    assert parse_wanted("28 dB") == 28
-
-
-def row(method, psnr, work, shots=1, filtered=True, preparing=0.0):
-    return Row(
-        f"cam-{shots}-{filtered}", shots, filtered, method, "default", {}, psnr, psnr - 20,
-        preparing, 0.0, 1000 * work,
-    )  # fmt: skip
-
-
-ROWS = [
-    row("tv", 20, 1), row("dict-omp", 19, 5), row("dict-admm", 23, 30), row("tv-dict", 24, 40),
-    row("tv", 29, 1, 3), row("tv", 18, 1, 1, False),
-]  # fmt: skip
-ONE_SHOT = Problem(10_000, 1, True)
-
-
-def test_a_budget_takes_the_most_accurate_within_it():
-    # Ten times the chart's values, a yardstick of 0.1 s: as many seconds as the chart's work.
-    assert advised(ROWS, ONE_SHOT, 0.1, 35).method == "dict-admm"
-    assert advised(ROWS, ONE_SHOT, 0.1, 40).method == "tv-dict"
-    assert advised(ROWS, ONE_SHOT, 0.05, 20).method == "tv-dict"
-    poor = advised(ROWS, ONE_SHOT, 0.1, 0.5)
-    assert poor.method == "tv"
-    assert "nothing keeps to 0.5 s" in poor.why
-    assert advised(ROWS, ONE_SHOT, 0.1, 35).seconds == pytest.approx(30)
-    assert "tv-dict gave 24.0 dB, 40 s" in advised(ROWS, ONE_SHOT, 0.1, 35).why
-
-
-def test_a_wanted_psnr_takes_the_quickest_that_reaches_it():
-    assert advised(ROWS, ONE_SHOT, 0.1, wanted_db=19).method == "tv"
-    assert advised(ROWS, ONE_SHOT, 0.1, wanted_db=22).method == "dict-admm"
-    best = advised(ROWS, ONE_SHOT, 0.1, wanted_db=30)
-    assert best.method == "tv-dict"
-    assert "nothing reaches 30 dB" in best.why
-    assert advised(ROWS, ONE_SHOT, 0.1, 10, 22).method == "tv"
-
-
-def test_the_work_of_a_chart_is_a_line_in_the_size_of_the_light_field():
-    # A window of a tenth: 2 of the yardstick's that stay, 3 for what grows.
-    whole = figures(0.5, 25.0, window_cpu_s=0.23, window_values=38_400)
-    points = {Point(Capture("dark", "cam"), Configuration("tv")): whole}
-    (found,) = advice_rows(points)
-    assert (found.fixed, found.per_million) == (pytest.approx(2), pytest.approx(3e6 / 384_000))
-    assert found.seconds(768_000, 0.2) == pytest.approx(0.2 * (2 + 6))
-    assert found.gain_db == 7
-
-
-def test_advice_is_of_the_camera_most_like_yours():
-    assert advised(ROWS, Problem(1000, 4, True), 0.1, 10).psnr_db == 29
-    assert advised(ROWS, Problem(1000, 1, False), 0.1, 10).psnr_db == 18
-
-
-def test_advice_outlives_its_file_and_a_method_that_is_gone(tmp_path):
-    rows = [*ROWS, row("no-such-method", 99, 1)]
-    (tmp_path / recommend.ADVICE).write_text(recommend.saved(rows, {"load": "none"}))
-    assert read_rows(tmp_path) == ROWS
-
-
-@pytest.mark.parametrize("content", [None, "", "{}", '{"format": "emmc-rig chart 1", "rows": [1]}',
-    '{"format": "emmc-rig chart 0", "rows": []}', b"\xff\xfe"])  # fmt: skip
-def test_a_folder_without_advice_is_one_line(tmp_path, content):
-    path = tmp_path / recommend.ADVICE
-    if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(AppError) as told:
-        read_rows(tmp_path)
-    assert "chart" in str(told.value)
-    assert "\n" not in str(told.value)
-
-
-def test_the_shipped_chart_knows_this_versions_methods_and_says_how_it_was_measured():
-    rows = read_rows(None)
-    assert {"tv", "tv-dict"} <= {one.method for one in rows} <= set(METHODS)
-    assert {one.shots for one in rows} >= {1, 3}
-    for one in rows:
-        MethodSettings.model_validate(one.settings)
-        assert one.per_million > 0
-    path = recommend.resources.files("emmc_rig.advice").joinpath(recommend.SHIPPED)
-    assert {"Machine", "Load", "Command line"} <= set(json.loads(path.read_text())["measured"])
 
 
 def given(size=(20, 24)):

@@ -1,4 +1,4 @@
-"""`emmc-rig chart` end to end, and `emmc-rig reconstruct` choosing by it."""
+"""`emmc-rig chart` end to end."""
 
 import csv
 import json
@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from pages import Page
 
-from emmc_rig.advice.recommend import ADVICE, read_rows
-from emmc_rig.advice.reference import Reference
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
@@ -26,6 +24,7 @@ from emmc_rig.study.chart.lock import timing_lock
 from emmc_rig.study.chart.measure import measured
 from emmc_rig.study.chart.peers import Peer
 from emmc_rig.study.chart.points import chart_settings
+from emmc_rig.study.chart.reference import Reference
 from emmc_rig.study.chart.worker import working
 from emmc_rig.study.sweep import SweepStopped, digest_of
 from simulators.scenes import render
@@ -113,7 +112,6 @@ def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
             assert (folder / "charts" / f"chart-{chart.key}.{ending}").stat().st_size > 5000
     front = json.loads((folder / METRICS).read_text())["fronts"]["rgbw-bayer-1shot, all scenes"]
     assert front
-    assert {row.level for row in read_rows(folder)} == {"2 steps", "default"}
 
 
 def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
@@ -258,33 +256,6 @@ def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, told, 
     assert code == expected
     assert told in err
     assert "Traceback" not in err
-
-
-def test_reconstruct_chooses_by_a_budget_or_a_wanted_psnr(quick, command, tmp_path):
-    scene = ["--scene", "dark", "--camera", "rgbw-bayer-1shot", "--size", "24x32"]
-    assert command("chart", "--fast", *scene, "--method", "tv", "--no-scaling")[0] == 0
-    assert (tmp_path / "emmc-chart" / ADVICE).is_file()
-    assert command("simulate", *scene)[0] == 0
-    code, _, err = command("reconstruct", "emmc-frames", "--budget", "1h", "--chart", "emmc-chart")
-    assert code == 0
-    assert "the most accurate within 3600 s" in err
-    metrics = json.loads((tmp_path / "emmc-reconstruction" / METRICS).read_text())
-    assert metrics["method"] == "tv"
-    assert metrics["steps"] in (2, 9)
-    assert "dB on average" in metrics["chosen"]
-    code, _, err = command("reconstruct", "emmc-frames", "--want", "90dB", "--chart", "emmc-chart")
-    assert code == 0
-    assert "nothing reaches 90 dB" in err
-    for wrong, told, expected in (
-        (["--budget", "soon"], "write a time", 2),
-        (["--want", "good"], "write a PSNR", 2),
-        (["--budget", "9s", "--chart", "emmc-frames"], "emmc-rig chart", 1),
-    ):
-        code, _, err = command("reconstruct", "emmc-frames", *wrong)
-        assert code == expected
-        assert told in err
-    for wrong in (["--budget", "9s", "--method", "tv"], ["--chart", "emmc-chart"]):
-        assert command("reconstruct", "emmc-frames", *wrong)[0] == 2
 
 
 @pytest.mark.real_data

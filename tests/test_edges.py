@@ -8,7 +8,8 @@ from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive import method
 from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from reconstruction.adaptive.joint import TextureSettings
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.flat import flat_psi
 
 SIGMA = 2e-3
@@ -45,7 +46,7 @@ def test_dark_edges_are_found_on_their_sides(coded_psi, binning, shots):
     edges = found_edges(psi, noisy(psi, darkened(light_field, binning)))
     assert edges is not None
     assert edges.widths == (0, 1, 2, 0)
-    assert edges.told == "edges that views do not reach: bottom 1, left 2 px"
+    assert edges.description == "edges that views do not reach: bottom 1, left 2 px"
     expected = np.zeros((64, 72), dtype=bool)
     expected[-1] = expected[:, :2] = True
     np.testing.assert_array_equal(edges.within, expected)
@@ -55,6 +56,12 @@ def test_an_object_across_the_border_is_no_edge(camera_psi):
     light_field, _ = plane_scene(camera_psi, 1.5)
     light_field[:, :, :20, :30] *= 0.1
     light_field[:, :, :, -20:] *= 0.1
+    assert found_edges(camera_psi, noisy(camera_psi, light_field)) is None
+
+
+def test_a_dark_line_inside_a_brighter_one_is_no_edge(camera_psi):
+    light_field, _ = plane_scene(camera_psi, 1.5)
+    light_field[:, :, -3] *= 0.1
     assert found_edges(camera_psi, noisy(camera_psi, light_field)) is None
 
 
@@ -83,13 +90,13 @@ def test_edges_do_not_spoil_what_is_beside_them(camera_psi, monkeypatch):
     dark = darkened(light_field)
     frames = noisy(camera_psi, dark)
     settings = AdaptiveSettings(texture=TextureSettings(steps=6), free=False, parsimony=False)
-    told = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
-    assert told.left_out == ("edges that views do not reach: bottom 1, left 2 px",)
+    aware = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
+    assert aware.left_out == ("edges that views do not reach: bottom 1, left 2 px",)
     monkeypatch.setattr(method, "dark_edges", lambda *_: None)
-    untold = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
-    assert not untold.left_out
-    assert psnr_db(told.light_field, dark) > psnr_db(untold.light_field, dark) + 2
+    unaware = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
+    assert not unaware.left_out
+    assert psnr_db(aware.light_field, dark) > psnr_db(unaware.light_field, dark) + 2
     beside = np.s_[:, :, :-4, 4:12]
-    assert psnr_db(told.light_field[beside], dark[beside]) > psnr_db(
-        untold.light_field[beside], dark[beside]
+    assert psnr_db(aware.light_field[beside], dark[beside]) > psnr_db(
+        unaware.light_field[beside], dark[beside]
     )

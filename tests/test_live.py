@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -18,13 +19,13 @@ import uvicorn
 from programs import exit_code
 
 from drivers.camera import CameraIdentity
-from drivers.errors import RawFrameError
+from drivers.errors import PositionMismatchError, RawFrameError, TransportTimeoutError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.live import server as server_module
 from emmc_rig.live import watch as watch_module
-from emmc_rig.live.alignment import grid_direction, measure
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
 from emmc_rig.live.server import application
 from emmc_rig.live.watch import Watch
@@ -45,47 +46,6 @@ def frame_of(mosaic, cfa="rggb"):
         original=b"",
         sha256="",
     )
-
-
-def cells(angle_deg, shape=(300, 400), side=9.0, shift=(0.0, 0.0), seed=0):
-    """A random binary mask of square cells, turned counterclockwise, each pixel 4x4 samples."""
-    y, x = np.mgrid[: shape[0] * 4, : shape[1] * 4] / 4.0
-    x, y = x - shift[0] - shape[1] / 2, y - shift[1] - shape[0] / 2
-    angle = np.radians(angle_deg)
-    across = np.cos(angle) * x - np.sin(angle) * y
-    down = np.sin(angle) * x + np.cos(angle) * y
-    pattern = np.random.default_rng(seed).integers(0, 2, (256, 256))
-    seen = pattern[
-        np.floor(down / side).astype(int) % 256, np.floor(across / side).astype(int) % 256
-    ]
-    return cv2.resize(seen.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-
-
-@pytest.mark.parametrize("angle_deg", [-20.0, -1.0, -0.2, 0.0, 0.5, 3.0, 30.0])
-def test_the_rotation_of_mask_cells_is_measured_to_a_tenth_of_a_degree(angle_deg):
-    noise = np.random.default_rng(1).normal(0, 0.03, (300, 400))
-    turned, straightness = grid_direction((cells(angle_deg) + noise).astype(np.float32))
-    assert turned == pytest.approx(angle_deg, abs=0.1)
-    assert straightness > 0.5
-
-
-def test_edges_in_all_directions_have_no_straightness():
-    noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
-    assert grid_direction(noise)[1] < 0.1
-    assert grid_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
-
-
-def test_the_shift_since_the_reference_is_measured_in_sensor_pixels():
-    def bayer(shift):
-        return frame_of(BLACK + 3000 * cells(0.0, side=24.0, shift=shift))
-
-    found = measure(bayer((6.0, -3.0)), bayer((0.0, 0.0)))
-    assert found.shift_px == pytest.approx((6.0, -3.0), abs=0.1)
-    assert found.match
-    assert found.match > 0.5
-    assert measure(bayer((0, 0))).shift_px is None
-    other = frame_of(np.zeros((8, 8)))
-    assert measure(bayer((0, 0)), other).shift_px is None
 
 
 @pytest.mark.parametrize("cfa", ["rggb", "bggr", "grbg", "gbrg"])
@@ -155,6 +115,7 @@ class FakeCamera:
 
     def __init__(self):
         self.exposure_s, self.gain, self.taken = 0.01, 1.0, 0
+        self.light = 1.0
         self.fault: RawFrameError | None = None
 
     def set_exposure_s(self, exposure_s):
@@ -169,7 +130,9 @@ class FakeCamera:
         if self.fault is not None:
             raise self.fault
         self.taken += 1
-        return frame_of(np.full((16, 16), 1000.0 * min(4, 100 * self.exposure_s)))
+        signal = (WHITE - BLACK) * self.light * self.exposure_s * 30
+        mosaic = np.full((16, 16), min(BLACK + signal, WHITE))
+        return replace(frame_of(mosaic), exposure_s=self.exposure_s)
 
     def close(self):
         pass
@@ -198,7 +161,7 @@ def until(watch, holds):
 
 def test_frames_follow_each_other_and_wishes_are_carried_out_between_them():
     with watching(FakeCamera()) as watch:
-        first = until(watch, lambda state: state["frame"] >= 2)
+        first = until(watch, lambda state: state["frame"] >= 2 and state["figures"])
         assert first["figures"]["histogram"].keys() == {"red", "green", "blue"}
         watch.set_exposure_s(0.02)
         until(watch, lambda state: state["settings"]["exposure_s"] == 0.02)
@@ -283,29 +246,35 @@ def mosaic_of(watch):
 
 
 class SlowStage:
-    """A stage of one axis whose moves end only when it is stopped."""
+    """A stage of one axis whose legs end only when it is stopped, with an error as drivers do."""
 
     axes = ("mask_x",)
 
-    def __init__(self):
+    def __init__(self, legs=1):
+        self.legs, self.begun = legs, 0
         self.moving, self.stopped = threading.Event(), threading.Event()
+        self.place_um, self.stops = 0.5, 0
 
     def move_by_um(self, steps_um):
-        self.moving.set()
-        assert self.stopped.wait(PATIENCE_S)
-        return steps_um
+        for _ in range(self.legs):
+            self.begun += 1
+            self.moving.set()
+            assert self.stopped.wait(PATIENCE_S)
+            self.stopped.clear()
+        raise PositionMismatchError("mask_x", 1.0, self.place_um, 0.5)
 
     def stop(self, axes=None):
+        self.stops += 1
         self.stopped.set()
 
     def limits_um(self, axis):
         return 0.0, 1.0
 
     def position_um(self, axis):
-        return 0.5
+        return self.place_um
 
 
-def test_stop_works_in_the_middle_of_a_move_and_a_second_move_is_refused():
+def test_a_stop_by_hand_is_reported_as_one_and_a_second_move_is_refused():
     stage = SlowStage()
     with watching(FakeCamera(), stage) as watch:
         watch.jog("mask_x", 1.0)
@@ -313,7 +282,59 @@ def test_stop_works_in_the_middle_of_a_move_and_a_second_move_is_refused():
         with pytest.raises(AppError, match="busy"):
             watch.jog("mask_x", 1.0)
         watch.stop()
+        ended = until(watch, lambda state: not state["busy"] and state["stopped"])
+        assert ended["trouble"]["stage"] == ""
+
+
+def test_a_move_that_ends_short_by_itself_is_trouble_and_no_stop():
+    stage = SlowStage()
+    with watching(FakeCamera(), stage) as watch:
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        stage.stopped.set()
+        ended = until(watch, lambda state: state["trouble"]["stage"])
+        assert "mask_x" in ended["trouble"]["stage"]
+        assert not ended["stopped"]
+
+
+def test_stopping_is_repeated_until_a_move_of_several_legs_has_ended():
+    stage = SlowStage(legs=3)
+    with watching(FakeCamera(), stage) as watch:
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        watch.stop()
         until(watch, lambda state: not state["busy"])
+    assert stage.stops >= 3
+
+
+def test_positions_are_shown_while_an_axis_moves():
+    stage = SlowStage()
+    with watching(FakeCamera(), stage) as watch:
+        until(watch, lambda state: state["axes"])
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        for stage.place_um in (0.6, 0.7):
+            shown = until(
+                watch, lambda state: state["axes"]["mask_x"]["position_um"] == stage.place_um
+            )
+            assert shown["busy"]
+        watch.stop()
+        until(watch, lambda state: not state["busy"])
+
+
+def test_a_stop_that_the_stage_refuses_is_trouble():
+    class Deaf(SlowStage):
+        def stop(self, axes=None):
+            raise TransportTimeoutError("ttyUSB0", 0.5)
+
+    stage = Deaf()
+    with watching(FakeCamera(), stage) as watch:
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        watch.stop()
+        told = until(watch, lambda state: state["trouble"]["stage"])
+        assert told["trouble"]["stage"].startswith("not stopped")
+        stage.stopped.set()
 
 
 def test_the_end_stops_a_moving_stage():
@@ -321,7 +342,49 @@ def test_the_end_stops_a_moving_stage():
     with watching(FakeCamera(), stage) as watch:
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
-    assert stage.stopped.is_set()
+    assert stage.stops
+
+
+def test_a_dark_picture_with_the_mask_away_offers_to_centre_it():
+    camera = FakeCamera()
+    camera.light = 0.0
+    stage = SlowStage()
+    with watching(camera, stage, None, (), {"mask_x": 100.0}) as watch:
+        told = until(watch, lambda state: state["hint"] and state["axes"])
+        assert told["hint"]["action"] == "centre"
+        assert "mask_x" in told["hint"]["text"]
+        stage.place_um = 100.0
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        watch.stop()
+        lamp = until(watch, lambda state: state["hint"] and not state["hint"]["action"])
+        assert "lamp" in lamp["hint"]["text"]
+
+
+@pytest.mark.parametrize("light", [0.03, 1.0, 20.0])
+def test_automatic_exposure_brings_the_brightest_near_white_but_not_to_it(light):
+    camera = FakeCamera()
+    camera.light = light
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.auto_expose()
+        until(
+            watch,
+            lambda state: (
+                0.7 <= max(state["figures"]["brightest"].values()) <= 0.9
+                and state["figures"]["saturated"] == 0
+            ),
+        )
+
+
+def test_an_exposure_beyond_the_camera_is_said_to_be():
+    camera = FakeCamera()
+    camera.light = 1e-4
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.auto_expose()
+        told = until(watch, lambda state: state["trouble"]["setting"])
+        assert "no better exposure" in told["trouble"]["setting"]
 
 
 @contextmanager
@@ -429,6 +492,52 @@ def test_read_only_shows_and_does_nothing():
     assert camera.exposure_s == 0.01
 
 
+def test_a_stop_is_carried_out_while_a_hundred_requests_wait_for_news():
+    stage, camera = SlowStage(), FakeCamera()
+    with watching(camera, stage) as watch, served(watch) as ask:
+        until(watch, lambda state: state["frame"])
+        camera.fault = RawFrameError("no news")
+        until(watch, lambda state: "no news" in state["trouble"]["camera"])
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        waiting = [
+            threading.Thread(target=ask, args=("GET", f"/{TOKEN}/state?after={10**9}"), daemon=True)
+            for _ in range(100)
+        ]
+        for one in waiting:
+            one.start()
+        assert ask("POST", f"/{TOKEN}/do/stop", "{}")[0] == 200
+        assert stage.stops
+        assert sum(one.is_alive() for one in waiting) == 100
+        for one in waiting:
+            one.join(PATIENCE_S)
+
+
+def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
+    made = []
+
+    def counted(frame, view):
+        made.append(view)
+        return picture(frame, view)
+
+    monkeypatch.setattr(server_module, "picture", counted)
+    camera = FakeCamera()
+    with watching(camera) as watch, served(watch) as ask:
+        until(watch, lambda state: state["frame"])
+        camera.fault = RawFrameError("no newer frame")
+        until(watch, lambda state: state["trouble"]["camera"])
+        for _ in range(5):
+            assert ask("GET", f"/{TOKEN}/picture.jpg?px=64")[0] == 200
+        assert ask("GET", f"/{TOKEN}/picture.jpg?px=32")[0] == 200
+    assert [view.longest_px for view in made] == [64, 32]
+
+
+def test_there_are_no_views_without_a_light_field():
+    with watching(FakeCamera()) as watch, served(watch) as ask:
+        assert ask("GET", f"/{TOKEN}/views.jpg")[0] == 503
+        assert ask("GET", f"/{TOKEN}/disparity.png")[0] == 503
+
+
 def program(*arguments):
     code = "from emmc_rig.cli import main; main()"
     return [sys.executable, "-c", code, "live", *arguments]
@@ -462,6 +571,8 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
         (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
         (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),
+        (("--rig", "simulated", "--method", "tv"), 2, "needs --psi"),
+        (("--rig", "simulated", "--size", "32x48", "--psi", "nowhere"), 1, "no Psi"),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(arguments, code, told, capsys):

@@ -10,13 +10,18 @@ from browsers import MARKS, open_browser
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.live.light_field import LiveLightField
+from emmc_rig.live.scale import designed_scale
 from emmc_rig.live.server import application
 from emmc_rig.live.watch import Watch
 from emmc_rig.rig.hardware import simulated_rig
+from simulators.bench import MountingErrors
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
@@ -35,7 +40,8 @@ def browser(tmp_path_factory):
 def rig():
     camera, size = find_camera("rgbw-bayer-1shot"), (48, 64)
     fine = fine_scene("near-planar", 2, 2, size=size, views=camera.views)
-    made, _ = simulated_rig(camera, fine.samples, size, 0)
+    made, bench = simulated_rig(camera, fine.samples, size, 0)
+    bench._errors = MountingErrors(rotation_deg=0.5, stretch=1.002)
     made.attendant.set_lamp("white")
     return made
 
@@ -43,7 +49,10 @@ def rig():
 @pytest.fixture(scope="module")
 def address(rig):
     centre_um = {**rig.zero_um, "aperture_x": rig.zero_um["aperture_x"] + rig.window_um}
-    watch = Watch(rig.camera, rig.stage, rig.attendant.place, ("scene", "whiteboard"), centre_um)
+    design = find_camera("rgbw-bayer-1shot")
+    field = LiveLightField(designed_scale(design.psi((48, 64))), "tv")
+    targets = ("scene", "whiteboard")
+    watch = Watch(rig.camera, rig.stage, rig.attendant.place, targets, centre_um, design, field)
     listening = socket.create_server(("127.0.0.1", 0))
     config = uvicorn.Config(application(watch, TOKEN), log_level="warning", lifespan="off")
     server = uvicorn.Server(config)
@@ -91,7 +100,7 @@ def place_um(driver, axis):
     found = re.search(
         r"-?[\d.]+(?= um)", driver.find_element(By.CSS_SELECTOR, f"tr[data-axis={axis}]").text
     )
-    return float(found.group()) if found else None
+    return float(found.group()) if found else float("nan")
 
 
 def test_the_page_opens_and_its_frame_updates_without_a_complaint(page):
@@ -103,6 +112,83 @@ def test_the_page_opens_and_its_frame_updates_without_a_complaint(page):
     wait(page, lambda: int(picture.get_attribute("data-frame")) > shown)
     assert "48x64 rggb" in text(page, "camera")
     assert page.get_log("browser") == []
+
+
+def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
+    """Click by click: centre, expose, read the mask off a board, look at the scene's views."""
+    wait(page, lambda: "away from the centre" in text(page, "hint"))
+    assert text(page, "hint-do") == "centre the mask"
+    click(page, "#hint-do")
+    wait(page, lambda: place_um(page, "mask_x") == pytest.approx(rig.zero_um["mask_x"], abs=0.5))
+    click(page, "#targets button:nth-child(2)")
+    wait(page, lambda: text(page, "hint-do") == "expose automatically")
+    click(page, "#hint-do")
+    wait(page, lambda: text(page, "hint") == "")
+    wait(page, lambda: "\u00b0" in text(page, "rotation"))
+    shown = [float(one) for one in re.findall(r"-?[\d.]+", text(page, "rotation"))]
+    assert shown[0] == pytest.approx(-0.5, abs=0.1)
+    stretched = float(re.findall(r"-?[\d.]+", text(page, "scale"))[0])
+    assert stretched == pytest.approx(0.2, abs=0.1)
+    click(page, "#targets button:nth-child(1)")
+    click(page, "[data-show=views]")
+    field = page.find_element(By.ID, "field")
+    wait(page, lambda: int(field.get_attribute("data-number") or 0) > 0)
+    wait(page, lambda: "as `reconstruct`" in text(page, "field-stage"))
+    assert re.search("trust|doubt|do not use", text(page, "field-stage"))
+    before = text(page, "focused")
+    ActionChains(page).move_to_element_with_offset(field, 60, 40).perform()
+    wait(page, lambda: text(page, "focused") != before)
+    field.send_keys("+")
+    wait(page, lambda: text(page, "focused").startswith("focus at"))
+    click(page, "[data-show=depth]")
+    wait(page, lambda: "px per view" in text(page, "focused") or "decided" in text(page, "focused"))
+    assert page.get_log("browser") == []
+
+
+def test_keys_stop_jog_and_expose_and_a_button_keeps_the_focus(page, rig):
+    click(page, "#centre")
+    wait(page, lambda: text(page, "busy") == "")
+    wait(page, lambda: place_um(page, "mask_x") > 0)
+    start = place_um(page, "mask_x")
+    page.find_element(By.ID, "home").send_keys(Keys.ARROW_RIGHT)
+    wait(page, lambda: place_um(page, "mask_x") == pytest.approx(start + 10, abs=0.5))
+    wait(page, lambda: text(page, "busy") == "")
+    assert page.switch_to.active_element.get_attribute("id") == "home"
+    body = page.find_element(By.TAG_NAME, "body")
+    page.execute_script("document.activeElement.blur()")
+    body.send_keys(Keys.ARROW_RIGHT)
+    exposure_s = rig.camera.exposure_s
+    body.send_keys("]")
+    wait(page, lambda: rig.camera.exposure_s == pytest.approx(exposure_s * 2 ** (1 / 3), rel=0.01))
+    assert place_um(page, "mask_x") == pytest.approx(start + 10, abs=0.5)
+    stops = []
+    original, rig.stage.stop = rig.stage.stop, lambda *_: stops.append(1)
+    try:
+        body.send_keys(Keys.ESCAPE)
+        wait(page, lambda: stops)
+    finally:
+        rig.stage.stop = original
+
+
+@pytest.mark.parametrize("width", [1600, 800, 390])
+def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page, width):
+    page.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
+    )
+    try:
+        wait(page, lambda: frame_number(page) > 0)
+        script = "return [document.documentElement.scrollWidth, window.innerWidth]"
+        needed, there = page.execute_script(script)
+        assert needed <= there
+        nameless = page.execute_script(
+            "return [...document.querySelectorAll('button, input, canvas, [tabindex]')]"
+            ".filter((one) => one.offsetParent && !(one.textContent.trim()"
+            " || one.getAttribute('aria-label') || one.labels?.length)).map((one) => one.outerHTML)"
+        )
+        assert nameless == []
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_centring_lights_the_picture_and_jogging_moves_the_simulated_stage(page, rig):
@@ -124,9 +210,9 @@ def test_zoom_view_and_exposure_answer(page, rig):
     assert text(page, "zoom") == "2x"
     click(page, "#whole")
     assert text(page, "zoom") == "1x"
-    click(page, "[data-kind=mosaic]")
+    click(page, "[data-show=mosaic]")
     assert (
-        page.find_element(By.CSS_SELECTOR, "[data-kind=mosaic]").get_attribute("aria-pressed")
+        page.find_element(By.CSS_SELECTOR, "[data-show=mosaic]").get_attribute("aria-pressed")
         == "true"
     )
     exposure = page.find_element(By.ID, "exposure")

@@ -1,9 +1,9 @@
-"""The mean of models by what they miss of held-out readings: weights, light field, deviation."""
+"""The mean of models by their residuals of held-out readings: weights, light field, spread."""
 
 import numpy as np
 import pytest
 
-from reconstruction.adaptive.mixture import mean_deviation, mean_light_field, weighted
+from reconstruction.adaptive.mixture import mean_light_field, shares_of, spread
 
 SHAPE, NOISE = (2, 60, 80), 1e-6
 
@@ -23,7 +23,7 @@ def noise():
 
 
 def test_a_model_of_half_the_error_weighs_sixteen_times_as_much(held):
-    share = weighted(misses(0.01, 0.02), noise(), held).shares
+    share = shares_of(misses(0.01, 0.02), noise(), held)
     np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-5)
     assert np.median(share[0] / share[1]) == pytest.approx(16, rel=0.4)
 
@@ -32,12 +32,12 @@ def test_the_better_model_may_differ_from_place_to_place(held):
     left = np.arange(SHAPE[2]) < SHAPE[2] // 2
     first, second = misses(1.0, 1.0)
     missed = [first * np.where(left, 0.01, 0.1), second * np.where(left, 0.1, 0.01)]
-    share = weighted(missed, noise(), held).shares
+    share = shares_of(missed, noise(), held)
     assert share[0, :, :10].min() > 0.9 > 0.1 > share[0, :, -10:].max()
 
 
 def test_models_that_miss_no_more_than_the_noise_weigh_alike(held):
-    share = weighted(misses(0.0, 0.0), noise(), held).shares
+    share = shares_of(misses(0.0, 0.0), noise(), held)
     assert np.abs(share - 0.5).max() < 0.45
     assert np.abs(share.mean(axis=(1, 2)) - 0.5).max() < 0.2
 
@@ -48,10 +48,10 @@ def test_the_mean_of_light_fields_follows_the_shares_of_pixels():
     np.testing.assert_allclose(mean_light_field(fields, shares, 2), 0.7, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("alike", "expected"), [(True, 1.0), (False, 0.5**0.5)])
-def test_independent_errors_make_the_mean_surer_and_equal_ones_do_not(held, alike, expected):
-    first, second = misses(0.02, 0.02)
-    missed = [first, first if alike else second]
-    share = weighted(missed, noise(), held)
-    sigma = mean_deviation([0.1, 0.1], share, missed, 1)
-    np.testing.assert_allclose(sigma, 0.1 * expected, rtol=0.12)
+def test_the_spread_is_the_weighted_variance_of_light_fields():
+    fields = np.random.default_rng(3).random((2, 3, 3, 4, 6, 3)).astype(np.float32)
+    shares = np.stack([np.full((2, 3), 0.25), np.full((2, 3), 0.75)]).astype(np.float32)
+    mean = mean_light_field(list(fields), shares, 2)
+    apart = 0.25 * 0.75 * np.square(fields[0] - fields[1]).mean(axis=-1)
+    found = spread(list(fields), mean, shares, 2)
+    np.testing.assert_allclose(found, apart, rtol=1e-4, atol=1e-6)

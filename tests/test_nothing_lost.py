@@ -38,12 +38,16 @@ WRITERS = {
     "chart --next-shot": (*SIZE,),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
+    "chart --stated": (*SIZE,),
     "demo": (*SIZE,),
+    "design": (),
+    "design --check": (),
     "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
+    "export": ("scene.h5", "--format", "png8"),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "reconstruct --tile": (8, "frames"),
@@ -54,13 +58,14 @@ WRITERS = {
     "stability": ("--fast",),
     "stability --theory": ("--fast",),
     "stability --verdicts": ("--fast",),
+    "stability --worst": ("--fast",),
     "tables": ("--fast",),
     "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
               "--sparsity", 2, "--iterations", 1),
 }  # fmt: skip
 READERS = {
     "devices camera", "devices conform", "devices home", "devices info", "devices jog",
-    "devices list", "devices probe", "devices udev-rule", "live", "session list",
+    "devices list", "devices probe", "devices udev-rule", "live", "session compare", "session list",
     "session prune", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
@@ -68,9 +73,12 @@ JOURNALS = {
     "chart --ablation": "ablation.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
+    "design": "simulations.jsonl",
+    "design --check": "simulations.jsonl",
     "stability": "points.jsonl",
     "stability --theory": "points.jsonl",
     "stability --verdicts": "verdicts.jsonl",
+    "stability --worst": "worst.jsonl",
     "tables": "cells.jsonl",
 }
 """What lies in a folder that a study goes on with."""

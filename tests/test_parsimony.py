@@ -6,10 +6,11 @@ from test_adaptive import plane_scene, quick
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.parsimony import Plane, colour_is_needed, grey_psi, one_plane
 from reconstruction.adaptive.search import Volume
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.tv import reconstruct_tv

@@ -15,7 +15,7 @@ from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.solve import reconstruct_folder
 from reconstruction.adaptive.joint import TextureSettings
-from reconstruction.adaptive.method import AdaptiveSettings
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError, ReconstructionError
 
@@ -119,6 +119,7 @@ def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames,
         "disparity": SIZE,
         "disparity_sigma": SIZE,
         "hidden": SIZE,
+        "misfit": SIZE,
         "model": SIZE,
         "texture": SIZE,
         "sigma": (5, 5, *SIZE),

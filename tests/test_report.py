@@ -145,8 +145,9 @@ def test_names_from_outside_are_shown_not_run(content):
     )
     page = render(hostile)
     assert "<script>alert" not in page
-    assert page.count("<script") == render(content).count("<script") == 2
-    assert page.count("</script") == 2
+    # Data and a script, of the report and of the viewer.
+    assert page.count("<script") == render(content).count("<script") == 4
+    assert page.count("</script") == 4
     assert page_data(page)["whiteboards"][0]["label"] == attack
 
 
@@ -180,7 +181,19 @@ def test_headline_figures_are_written_with_their_units(content):
     page = render(content)
     values = re.findall(r'<p class="value">(.*?)</p>', page)
     figures = ["20.00 dB", "+2.50 dB", "0.9312", "2.13 %", "0.40 dB", "4.0 s"]
-    assert values == [*figures, "not judged", "converged"]
+    assert values == [*figures, "converged"]
+
+
+def test_the_verdict_comes_first_with_what_to_do_next(content):
+    assert 'aria-label="Verdict"' not in render(content)
+    reasons = [{"level": "doubt", "what": "shots differ", "remedy": "capture shot 2 again"}]
+    verdict = {"level": "doubt", "reasons": reasons}
+    page = render(replace(content, metrics={**content.metrics, "verdict": verdict}))
+    places = [
+        page.index(words)
+        for words in ('aria-label="Verdict"', "shots differ", "capture shot 2 again", "20.00 dB")
+    ]
+    assert places == sorted(places)
 
 
 def test_values_that_are_not_finite_in_the_estimate_are_counted(content):

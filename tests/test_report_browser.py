@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, open_browser
+from browsers import MARKS, complaints, open_browser
 
 from emmc_rig.pages.display import DisplayCurve
 from emmc_rig.pages.report import ReportContent, write_report
@@ -65,8 +65,7 @@ def page(browser, report):
         lambda driver: driver.execute_script("return document.documentElement.dataset.ready")
     )
     yield browser
-    complaints = [entry["message"] for entry in browser.get_log("browser")]
-    assert complaints == []
+    assert complaints(browser) == []
 
 
 def settled(page) -> None:
@@ -186,7 +185,8 @@ def test_shots_can_be_switched_and_tinted(page):
 def test_every_picture_says_what_it_is_and_every_slider_has_a_label(page):
     unnamed = page.execute_script(
         "return [...document.querySelectorAll('img, canvas, svg')].filter("
-        "e => !e.getAttribute('alt') && !e.getAttribute('aria-label')).map(e => e.outerHTML)"
+        "e => !e.ariaHidden && !e.getAttribute('alt') && !e.getAttribute('aria-label'))"
+        ".map(e => e.outerHTML)"
     )
     unlabelled = page.execute_script(
         "return [...document.querySelectorAll('input')].filter(e => !e.labels.length).length"

@@ -7,6 +7,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from reconstruction.adaptive.rest import misfit_of, rest
 from reconstruction.adaptive.uncertainty import held_out
+from reconstruction.choices import choose_mu
 
 SIGMA = 0.001
 
@@ -22,7 +23,8 @@ def asked(psi, missing, seed=0):
     missed = (psi.forward(missing) + noise).astype(np.float32)
     held = held_out(np.ones(missed.shape, bool), 0.06)
     frames = missed + psi.forward(np.full(psi.light_field_shape, 0.3, np.float32))
-    return rest(psi, frames, missed, SIGMA, ~held, held, 60)
+    mu = choose_mu(psi, frames[~held], SIGMA)
+    return rest(psi, missed, mu, SIGMA, ~held, held, 60)
 
 
 def test_what_is_missed_in_one_view_is_put_back(psi):

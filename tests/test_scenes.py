@@ -352,9 +352,9 @@ def test_a_scene_nobody_knows_lists_the_built_in_ones():
 
 
 def test_a_file_of_another_kind_says_what_a_scene_is(tmp_path):
-    (tmp_path / "lf.mat").write_text("")
-    with pytest.raises(SceneError, match=r"ends in \.h5 or \.hdf5"):
-        open_scene(str(tmp_path / "lf.mat"))
+    (tmp_path / "lf.txt").write_text("")
+    with pytest.raises(SceneError, match=r"ends in \.h5, \.hdf5 or \.mat"):
+        open_scene(str(tmp_path / "lf.txt"))
 
 
 def test_the_truth_of_a_fine_built_in_scene_is_its_box_average():

@@ -33,8 +33,8 @@ class Promised(Unwatched):
     def __init__(self):
         self.frames = []
 
-    def step(self, detail):
-        self.frames.append(detail)
+    def stored(self, frame):
+        self.frames.append(frame.id)
 
 
 def run_on(disk, folder=ROOT, watcher=None):
@@ -73,7 +73,7 @@ def assert_whole(disk, expected):
 def test_a_frame_is_the_bytes_that_the_camera_gave(undisturbed):
     _, frames = undisturbed
     assert frames["shot-0-e1-r0"] == frame_bytes("shot-0-e1-r0", 0.04)
-    assert len(frames) == 2 + 2 * 2 + 2 * 1 + 3
+    assert len(frames) == 2 + 2 * 2 + 2 * 1 + 1 + 3
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -352,7 +352,8 @@ def amended(disk):
     """Let the second shot be taken once more, and be exposed otherwise from now on."""
     session = Session(ROOT / "s", disk)
     text = PLAN_YAML.replace(
-        "mask_um: [48, 24]", "mask_um: [48, 24]\n    exposure_s: 0.03\n    repeats: 2"
+        "{mask_um: [48, 24], exposure_s: auto}",
+        "{mask_um: [48, 24], exposure_s: 0.03, repeats: 2}",
     )
     plan, camera = plan_and_camera(text)
     rig = {"kind": "x"}

@@ -219,7 +219,7 @@ def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_pa
     session = Session(copy)
 
     class Impatient(Unwatched):
-        def notify(self, message):
+        def tell(self, message):
             if "reconstructing" in message:
                 raise KeyboardInterrupt
 

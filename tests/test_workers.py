@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import pytest
 import yaml
+from pools import Here, StoppedHereError
 from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
@@ -29,30 +30,6 @@ from reconstruction.errors import ReconstructionError
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 BLOCKS = {"blocks": {"whole": 1000, "side": 32, "blend": 4}, "tv": {"max_steps": 20}}
 KILLS = int(os.environ.get("EMMC_KILLS", "2"))
-
-
-class StoppedHereError(Exception):
-    """Somebody stopped the tasks."""
-
-
-class Here:
-    """A pool that computes in this process, first things last if asked to, until it is stopped."""
-
-    size = 1
-
-    def __init__(self, backwards=False, stop_after=None):
-        self.backwards, self.stop_after, self.done = backwards, stop_after, []
-
-    def run(self, task, items):
-        numba.set_num_threads(1)
-        for item in reversed(items) if self.backwards else items:
-            if len(self.done) == self.stop_after:
-                raise StoppedHereError
-            self.done.append(item)
-            yield item, task(item)
-
-    def end(self):
-        pass
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,1 +1,1 @@
-"""Which method and settings to take, from a chart of earlier measurements."""
+"""Which method to take, by a trial on the frames at hand."""

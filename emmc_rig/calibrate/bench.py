@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from calibration.boards import BoardFrame, BoardSet, channels_of
 from calibration.frames import MeanFrame, average, before_and_after
 from calibration.levels import Check, check_of
+from calibration.openings import CENTRED, Window, views_open, window_place_um
 from calibration.sensor import Pair
 from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.sensing import ImagingMatrix
-from simulators.bench import Bench, MountingErrors
+from simulators.bench import Bench, MountingErrors, window_side_um
 from simulators.effects import ORDINARY, Flaws, flawed
 from simulators.flaws import OpticsFlaws, SensorFlaws
 
@@ -49,7 +50,8 @@ class Setting:
     """One whiteboard to take: how the bench stands, and how many frames.
 
     stage_um: beyond the shot's own offset of the mask. came_from: the side, +1 where an axis moved
-    up to its place. board_turn_deg: how the white board is turned.
+    up to its place. board_turn_deg: how the white board is turned. window: by how many cells the
+    plate's window is moved.
     """
 
     shot: int = 0
@@ -59,6 +61,11 @@ class Setting:
     repeats: int = 2
     came_from: tuple[int, int] = (1, 1)
     board_turn_deg: float = 0.0
+    window: Window = CENTRED
+
+    def views_open(self, views: tuple[int, int]) -> NDArray[np.bool_]:
+        """Return which views (v, u) it opens."""
+        return views_open(views, self.pinhole, self.window)
 
 
 @dataclass(frozen=True)
@@ -143,7 +150,13 @@ class WhiteboardBench:
         real = self.truth.stage.real_um(self.sent_um(setting), setting.came_from)
         self._at_um["mask_x"], self._at_um["mask_y"] = real
         if setting.pinhole is None:
-            self._at_um["aperture_x"], self._at_um["aperture_y"] = self._window_um, 0.0
+            lens = self.camera.lens
+            side_um = window_side_um(self.camera.views, lens.aperture_cell_um)
+            x_um, y_um = window_place_um(
+                setting.window, self.camera.views, lens.aperture_cell_um, side_um
+            )
+            self._at_um["aperture_x"] = self._window_um + x_um
+            self._at_um["aperture_y"] = y_um
         else:
             cell_um = self.camera.lens.aperture_cell_um
             v, u = setting.pinhole
@@ -194,8 +207,12 @@ class WhiteboardBench:
         at several exposures before and at one after: the checks. leave_out: of WATCHES.
         """
         board_s = self.board_exposure_s()
-        views = self.camera.views[0] * self.camera.views[1]
-        exposures = {board_s if one.pinhole is None else board_s * views for one in settings}
+        views = self.camera.views
+
+        def exposed_s(setting: Setting) -> float:
+            return board_s * float(np.prod(views) / setting.views_open(views).sum())
+
+        exposures = {exposed_s(one) for one in settings}
         series = [board_s * share for share in SERIES_SHARES]
         darks = {t: self._dark(t) for t in sorted({board_s, *exposures, *series})}
         checks: list[Check] = []
@@ -218,12 +235,14 @@ class WhiteboardBench:
         for place, setting in enumerate(settings):
             if watched and place % CHECK_EVERY == 0:
                 seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
-            exposure_s = board_s if setting.pinhole is None else board_s * views
+            exposure_s = exposed_s(setting)
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
             frame = self._frames(setting, exposure_s, True, setting.repeats, label)
             on_frame(label)
             sent = self.sent_um(setting)
-            frames.append(BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp))
+            frames.append(
+                BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp, setting.window)
+            )
         if watched:
             seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
             seen_again(False, self._frames(plain, board_s, False, 2, "reference"))

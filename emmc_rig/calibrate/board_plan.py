@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from calibration.openings import parts
 from calibration.placement import Placement, designed_placement
 from calibration.planning import (
     MODEL_ERROR,
@@ -50,7 +51,7 @@ def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
     return Light(
         bench.camera.sensor.noise,
         bench.board_exposure_s(),
-        views[0] * views[1],
+        views,
         light,
         rows * columns,
     )
@@ -72,7 +73,7 @@ def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: floa
 def few_settings(planned: PlannedFrames, lamp: str = "white") -> list[Setting]:
     """Return a plan as settings of the bench, in shot 0."""
     return [
-        Setting(0, kind.pinhole, lamp, kind.stage_um, count)
+        Setting(0, kind.pinhole, lamp, kind.stage_um, count, window=kind.window)
         for kind, count in planned.counts.items()
     ]
 
@@ -94,9 +95,11 @@ def held_out_settings(camera: Camera) -> list[Setting]:
 
 def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
-    repeats = max(1, *(count for kind, count in planned.counts.items() if kind.pinhole))
+    through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
+    repeats = max(through.values(), default=1)
+    every = len(through) == np.prod(settings.camera.views)
     fitted = [
-        OpenBoard(mask_um=kind.stage_um, repeats=count)
+        OpenBoard(mask_um=kind.stage_um, window=kind.window, repeats=count)
         for kind, count in planned.counts.items()
         if kind.pinhole is None
     ]
@@ -110,7 +113,7 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
         camera=settings.camera_name,
         shots=tuple(PlannedShot() for _ in settings.camera.shots),
         whiteboards=Boards(
-            views="all",
+            views="all" if every else tuple(sorted(through)),
             shots=(0,),
             repeats=repeats,
             references=max(2, planned.reference_frames),
@@ -133,7 +136,7 @@ def camera_colours(camera: Camera) -> bool:
 
 def frames_by_kind(settings: CalibrateSettings, planned: PlannedFrames) -> Counter[str]:
     """Return how many frames of each kind a capture takes before the shots of the scene."""
-    frames = expand(capture_plan(settings, planned), settings.camera, 0.0)
+    frames = expand(capture_plan(settings, planned), settings.camera, 0.0, 0.0)
     return Counter(frame.kind for frame in frames if frame.kind != "shot")
 
 
@@ -167,6 +170,30 @@ def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -
     return replace(planned, counts={**opened, **planned.counts})
 
 
+def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
+    """Return the fewest whiteboards for the parametric routes: open ones and parts of the aperture.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with the
+    frames that the settings allow (default: MOST_FRAMES whiteboards).
+    """
+    camera, target = settings.camera, settings.target
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    kinds = [Kind(None, stage) for stage in stages]
+    kinds += [Kind(None, window=window) for window in parts(camera.views)]
+    others = frames_by_kind(settings, PlannedFrames(dict.fromkeys(kinds, 1), 0.0)).total()
+    others -= len(kinds)
+    most = MOST_FRAMES if settings.most_frames is None else settings.most_frames - others
+    planned = plan_parametric(mask, soft_design(camera, mask), kinds, light, target, most=most)
+    taken = sum(planned.counts.values())
+    if taken > max(most, 0) or planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached by few whiteboards: the "
+            f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise --target "
+            "or --frames, or leave --few out"
+        )
+    return planned
+
+
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
     kind reach the target. Raises AppError where none do.
@@ -175,7 +202,7 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
     light = plan_light(bench, mask)
-    planned = combined_plan(settings, mask, light)
+    planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
     counts = frames_by_kind(settings, planned)
     metrics = {
         "camera": settings.camera_name,
@@ -184,12 +211,13 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
         "model_error": MODEL_ERROR,
         "exposures": {
             "open_s": light.exposure_s,
-            "pinhole_s": light.exposure_s * light.pinhole_times,
+            "pinhole_s": light.exposure_s * float(np.prod(camera.views)),
         },
         "whiteboards": [
             {
                 "pinhole": None if kind.pinhole is None else list(kind.pinhole),
                 "stage_um": list(kind.stage_um),
+                "window": list(kind.window),
                 "frames": count,
             }
             for kind, count in planned.counts.items()

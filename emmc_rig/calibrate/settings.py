@@ -30,7 +30,8 @@ class CalibrateSettings:
     """What to calibrate: camera, size, route (a key of ROUTES); what to plan for.
 
     target: relative error of Psi. most_frames: of the plan, None: as many as it takes. leave_out:
-    names of WATCHES that the rig cannot take.
+    names of WATCHES that the rig cannot take. few: plan for the fitted mask alone, without the
+    pinhole before every view.
     """
 
     camera_name: str
@@ -44,6 +45,7 @@ class CalibrateSettings:
     map_stage: bool = False
     most_frames: int | None = None
     leave_out: frozenset[str] = frozenset()
+    few: bool = False
 
     def __post_init__(self) -> None:
         for name in sorted(self.leave_out):

@@ -19,6 +19,7 @@ from calibration.stage_map import StageMap, locate, stage_map
 from calibration.whiteboard import lamps_needed
 from emmc_rig.calibrate.bench import Setting, WhiteboardBench
 from emmc_rig.calibrate.board_plan import (
+    few_plan,
     few_settings,
     free_settings,
     held_out_settings,
@@ -60,7 +61,9 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     watcher = watcher or Silent()
     if settings.route not in ROUTES:
         raise AppError(f"--route {settings.route}: use one of {', '.join(ROUTES)}")
-    routes = ROUTES[settings.route]
+    # Few whiteboards do not open every view.
+    few_alone = settings.few and settings.route == "auto"
+    routes = ROUTES["mixed" if few_alone else settings.route]
     camera = settings.camera
     watcher.begin("design", None)
     design = build_imaging_matrix(camera, settings.size)
@@ -71,7 +74,11 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
     fitted: list[Setting] = []
     if "parametric" in routes:
         mask = shadow_mask(camera, settings.size)
-        planned = parametric_plan(camera, mask, plan_light(bench, mask), settings.target)
+        light = plan_light(bench, mask)
+        if settings.few:
+            planned = few_plan(settings, mask, light)
+        else:
+            planned = parametric_plan(camera, mask, light, settings.target)
         fitted = few_settings(planned)
     through: list[Setting] = []
     if "free" in routes:

@@ -15,18 +15,22 @@ from typing import Any
 
 from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.estimate import Estimate, estimate
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.order import ordered
-from emmc_rig.capture.plan import (
-    METERING_EXPOSURE_S,
-    Plan,
-    load_plan,
-    planned_camera,
+from emmc_rig.capture.estimate import (
+    Estimate,
+    Exposures,
+    known_exposures,
+    last_session,
+    pace_of,
 )
+from emmc_rig.capture.events import EventWatcher, OnEvent
+from emmc_rig.capture.expand import expand
+from emmc_rig.capture.metering import first_meterings
+from emmc_rig.capture.order import ordered
+from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import RunEnd, Sequencer
+from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
 from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.errors import AppError, StoppedError
@@ -98,7 +102,9 @@ def wish_from_session(
 
 def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
     """Return every frame of a wish in the order of the capture."""
-    return ordered(expand(wish.plan, wish.camera, rig.window_um), wish.plan.order)
+    return ordered(
+        expand(wish.plan, wish.camera, rig.window_um, rig.window_side_um), wish.plan.order
+    )
 
 
 def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
@@ -148,11 +154,18 @@ def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
     return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
 
 
-def estimated(frames: tuple[PlannedFrame, ...], plan: Plan, rig: Rig) -> Estimate:
-    """Return what frames will take."""
-    rows, columns = rig.camera.shape
-    speeds = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
-    return estimate(frames, 2 * rows * columns, speeds, plan.settle_s, METERING_EXPOSURE_S)
+def estimated(
+    frames: tuple[PlannedFrame, ...],
+    plan: Plan,
+    rig: Rig,
+    session: Session | None = None,
+    earlier: Session | None = None,
+) -> Estimate:
+    """Return what frames will take; earlier: another session of the same stage and camera."""
+    meterings = {} if session is None else first_meterings(session)
+    entries = [] if session is None else session.journal.entries
+    known = known_exposures(Exposures(plan, earlier), meterings, entries)
+    return pace_of(rig, plan).estimate(frames, known)
 
 
 def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
@@ -231,6 +244,7 @@ def run_capture(
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
+    suspend: Suspend | None = None,
 ) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
@@ -248,7 +262,7 @@ def run_capture(
         if session is None:
             frames = tuple(frame for frame in planned if not frame.is_optional)
         elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
-            watcher.notify(edit.words(len(session.stored)))
+            watcher.tell(edit.words(len(session.stored)))
             frames = tuple(
                 frame
                 for frame in edit.frames
@@ -257,23 +271,35 @@ def run_capture(
         else:
             frames = still_possible(wish, session)
         refuse_impossible(rig, frames)
+        details = getattr(rig.camera, "details", dict)
+        suspended = suspended_by(wish.plan.suspend, details, suspend)
         if session is not None:
             refuse_other_camera(session, rig)
-        expected = estimated(frames, wish.plan, rig)
+        earlier = last_session(wish.out, wish.rig)
+        expected = estimated(frames, wish.plan, rig, session, earlier)
         refuse_small_disk(wish.out, expected)
         if not agreed(expected):
             return None
         if session is None:
             session = new_session(wish, planned)
             open_things.enter_context(held(session.folder))
-        with interruptible(control, watcher.notify), disk_faults_told(session):
+        with interruptible(control, watcher.tell), disk_faults_told(session):
             if edit is not None:
                 session = session.amend(_frozen(wish, edit.frames), edit.changes)
             with way_on_told(wish, session):
                 if wish.until_db not in (None, session.target_db):
                     session.note("until", target_db=wish.until_db, wall=wall_time())
                 choose = None if session.target_db is None else Until(session, watcher)
-                run = Sequencer(session, wish.plan, rig, watcher, control, choose)
+                run = Sequencer(
+                    session,
+                    wish.plan,
+                    rig,
+                    watcher,
+                    control,
+                    choose,
+                    exposures=Exposures(wish.plan, earlier),
+                    suspended=suspended,
+                )
                 return session, run.run()
 
 
@@ -303,6 +329,7 @@ def capture_session(
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
+    suspend: Suspend | None = None,
 ) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
@@ -316,7 +343,7 @@ def capture_session(
     with held(folder):
         wish = asked_for(plan, folder, rig, until_db)
         try:
-            captured = run_capture(wish, watcher, ask, agreed, control)
+            captured = run_capture(wish, watcher, ask, agreed, control, suspend)
         except KeyboardInterrupt as stop:
             begun = is_session(folder)
             kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
@@ -327,7 +354,8 @@ def capture_session(
         try:
             write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
-            watcher.notify(f"no report: {fault}")
+            watcher.tell(f"no report: {fault}")
+    watcher.ended(session, outcome)
     if not outcome.complete:
         raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
@@ -348,6 +376,8 @@ def capture(
     out: str | Path | None = None,
     until_db: float | None = None,
     watcher: CaptureWatcher | None = None,
+    on_event: OnEvent | None = None,
+    suspend: Suspend | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
     """Run a plan on a rig and return its session; run again, it goes on where it stopped.
@@ -358,6 +388,9 @@ def capture(
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         watcher: is told what is captured.
+        on_event: is called with each `emmc_rig.capture.events.Event`, as `frame.written` or
+            `shot.done`; one that raises is not called again.
+        suspend: is asked before each frame, returns why the capture has to wait, "" to go on.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
     Raises:
@@ -366,8 +399,11 @@ def capture(
     """
     description = None if rig is None else rig.description
     folder = None if out is None else Path(out)
+    told = watcher or Unwatched()
+    if on_event is not None:
+        told = EventWatcher(on_event, told)
     captured = capture_session(
-        Path(plan), description, folder, until_db, watcher or Unwatched(), ask
+        Path(plan), description, folder, until_db, told, ask, suspend=suspend
     )
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]

@@ -37,11 +37,9 @@ class Control:
         """End after the present frame, paused or not."""
         self.stopping = True
 
-    def may_go_on(self) -> bool:
-        """Wait while paused; return False when the capture is to end."""
-        while self.paused and not self.stopping:
-            time.sleep(PAUSE_POLL_S)
-        return not self.stopping
+    def wait(self) -> None:
+        """Let a moment pass in which nothing is to be done."""
+        time.sleep(PAUSE_POLL_S)
 
 
 @contextmanager

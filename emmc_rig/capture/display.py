@@ -20,7 +20,6 @@ from rich.progress import (
     TaskID,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.text import Text
 
@@ -28,6 +27,8 @@ from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
 
@@ -35,8 +36,8 @@ KEY_POLL_S = 0.1
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
-class CaptureDisplay:
-    """A `CaptureWatcher` on a terminal."""
+class CaptureDisplay(Unwatched):
+    """A `CaptureWatcher` of the sequencer."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
@@ -44,8 +45,7 @@ class CaptureDisplay:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             TextColumn("{task.description}"),
             console=console,
         )
@@ -53,9 +53,9 @@ class CaptureDisplay:
         self._histogram = Text()
         self._line = Text()
         self._live: Live | None = None
-        self._done = 0
-        self._planned: int | None = None
+        self._done = self._planned = 0
         self._asking = False
+        self._left = ""
 
     @contextmanager
     def shown(self) -> Iterator[None]:
@@ -92,12 +92,12 @@ class CaptureDisplay:
                 live.start()
             self._asking = False
 
-    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
+    def begin(self, done: int, planned: int) -> None:
         """Start the bar."""
-        self._done, self._planned = done, steps
-        self._task = self._progress.add_task(stage, total=steps, completed=done)
+        self._done, self._planned = done, planned
+        self._task = self._progress.add_task("frames", total=planned, completed=done, left="")
         if not self._console.is_terminal and done:
-            self.notify(f"{done} of {steps} frames are there already")
+            self.tell(f"{done} of {planned} frames are there already")
 
     def more(self, planned: int) -> None:
         """Lengthen the bar."""
@@ -105,8 +105,8 @@ class CaptureDisplay:
         if self._task is not None:
             self._progress.update(self._task, total=planned)
 
-    def phase(self, name: str, frame: PlannedFrame) -> None:
-        """Show the phase under way."""
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """Say what is under way."""
         if self._live is not None and self._task is not None and name != "write":
             paused = "paused, p goes on: " if self._control.paused else ""
             self._progress.update(self._task, description=f"{paused}{frame.id}: {name}")
@@ -124,18 +124,34 @@ class CaptureDisplay:
             self._line = Text(line)
         elif not self._console.is_terminal:
             self._console.print(
-                f"{time.strftime('%H:%M:%S')} {self._done + 1}/{self._planned} {line}",
+                f"{time.strftime('%H:%M:%S')} {self._done + 1}/{self._planned} {line}"
+                + (f"; {self._left}" if self._left else ""),
                 highlight=False,
                 soft_wrap=True,
             )
             self._done += 1
 
-    def step(self, detail: str) -> None:
+    def stored(self, frame: PlannedFrame) -> None:
         """Advance the bar."""
         if self._task is not None:
             self._progress.update(self._task, advance=1)
 
-    def notify(self, message: str) -> None:
+    def left(self, seconds: float, guessed: int) -> None:
+        """Show how long the rest will take."""
+        unknown = f", and the exposures of {guessed} not metered yet" if guessed else ""
+        self._left = f"about {shown_seconds(seconds)} left{unknown}"
+        if self._task is not None:
+            self._progress.update(self._task, left=self._left)
+
+    def paused(self, reason: str) -> None:
+        """Say why nothing happens."""
+        self.tell(f"waiting: {reason}")
+
+    def resumed(self, seconds: float) -> None:
+        """Say that it goes on."""
+        self.tell(f"going on after {shown_seconds(seconds)}")
+
+    def tell(self, message: str) -> None:
         """Print a line."""
         self._console.print(f"emmc-rig capture: {message}", highlight=False, soft_wrap=True)
 
@@ -150,7 +166,7 @@ class CaptureDisplay:
                     self._control.resume()
                 else:
                     self._control.pause()
-                    self.notify("pausing after this frame; p goes on")
+                    self.tell("pausing after this frame; p goes on")
             elif key == STOP_KEY:
                 self._control.stop()
-                self.notify("stopping after this frame")
+                self.tell("stopping after this frame")

@@ -82,12 +82,17 @@ class PlannedShot(Settings):
 
 
 class OpenBoard(Settings):
-    """A whiteboard through the masks with the whole aperture open: what a fit of the mask needs.
+    """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
 
     mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
     """
 
     mask_um: tuple[float, float] = (0.0, 0.0)
+    window: tuple[int, int] = Field(
+        default=(0, 0),
+        description="x, y: by how many aperture cells the plate's window is moved, so that a part "
+        "of the aperture is open",
+    )
     repeats: Repeats = 2
     held_out: bool = False
 
@@ -178,6 +183,28 @@ class Checks(Settings):
     )
 
 
+class Suspender(Settings):
+    """A figure that makes a capture wait while it is outside its range.
+
+    name: for people. file: a text file that begins with the figure, as a lab's own program or the
+    system keeps it. camera: or what the camera tells under this name. low, high: the range.
+    """
+
+    name: str
+    file: str | None = None
+    camera: str | None = None
+    low: float | None = None
+    high: float | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Suspender:
+        if (self.file is None) == (self.camera is None):
+            raise ValueError("give file or camera, one of them")
+        if self.low is None and self.high is None:
+            raise ValueError("give low, high or both")
+        return self
+
+
 class Plan(Settings):
     """What to capture; see `new_plan` for a commented one."""
 
@@ -193,6 +220,9 @@ class Plan(Settings):
     )
     retries: Retries = Retries()
     checks: Checks = Checks()
+    suspend: tuple[Suspender, ...] = Field(
+        default=(), description="the capture waits while one of these is out of its range"
+    )
 
 
 def load_plan(path: Path) -> Plan:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import Camera as CameraDevice
+from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import (
@@ -29,6 +30,7 @@ from emmc_rig.capture.checks import (
     figures,
 )
 from emmc_rig.capture.control import Control, uninterrupted
+from emmc_rig.capture.estimate import Exposures, known_exposures, pace_of
 from emmc_rig.capture.metering import (
     METERING_TRIES,
     asked_of_scene,
@@ -39,6 +41,7 @@ from emmc_rig.capture.metering import (
 from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
+from emmc_rig.capture.suspend import Suspend
 from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
@@ -55,6 +58,8 @@ from emmc_rig.session.verify import verify_frames
 
 TOLD_BYTES = 1_000_000_000
 """Hashing more takes long enough to be told."""
+TELL_LEFT_S = 1.0
+"""Between two times that the time left is said."""
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
 
@@ -88,8 +93,9 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. timer: seconds that never run backwards, for the
-    timeline; wall: the time of day, for people.
+    choose: by default all that is missing. exposures: what is known of those that will be metered,
+    for the time that is left. suspended: why it has to wait. timer: seconds that never run
+    backwards, for the timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -102,12 +108,18 @@ class Sequencer:
         choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
+        exposures: Exposures | None = None,
+        suspended: Suspend = lambda: "",
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
         self._watcher = watcher or Unwatched()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
+        self._suspended = suspended
+        self._exposures = exposures or Exposures(plan)
+        self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
+        self._left_told_s = -TELL_LEFT_S
         self._camera: CameraDevice = rig.camera
         self._applied = _Applied()
         self._budget = Budget(plan.retries)
@@ -115,6 +127,7 @@ class Sequencer:
         self._before: NDArray[np.uint16] | None = None
         self._metered: dict[str, Entry] = {}
         self._triggered = False
+        self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
         self._taken = self._run = 0
         # How long the frame before took to hand over: its own line is written by then.
@@ -137,8 +150,9 @@ class Sequencer:
             self._discard_damaged(whole)
             self._metered = first_meterings(session)
             missing, needed = session.missing(), len(session.needed)
-            self._watcher.begin("frames", needed, done=needed - len(missing))
+            self._watcher.begin(needed - len(missing), needed)
             refuse_impossible(self._rig, missing)
+            self._left_of_shot = self._missing_of_shots()
             frames = self._choose(self._now_s)
             if frames:
                 self._retrying("home", self._home)
@@ -148,7 +162,7 @@ class Sequencer:
                 taken = {frame.id for frame in frames}
                 for name, fault in self._discard_damaged(taken).items():
                     self._budget.spend(name, DriverError(fault), 1)
-                frames = self._choose(self._now_s) if self._control.may_go_on() else ()
+                frames = self._choose(self._now_s) if self._may_go_on() else ()
             self._writer.flush()
             left = len(session.missing())
             if not left and not session.is_complete:
@@ -156,6 +170,14 @@ class Sequencer:
         return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
+
+    def _missing_of_shots(self) -> dict[int, set[str]]:
+        """Return by shot which frames of it are still to be taken."""
+        found: dict[int, set[str]] = {}
+        for frame in self._session.missing():
+            if frame.kind == "shot":
+                found.setdefault(frame.bench.shot, set()).add(frame.id)
+        return found
 
     def _facts(self) -> dict[str, Any]:
         rig, camera = self._rig, self._camera
@@ -191,12 +213,30 @@ class Sequencer:
         Ends early where metering the scene asked for more frames than were known of.
         """
         for frame in frames:
-            if not self._control.may_go_on():
+            if not self._may_go_on():
                 return False
             if frame.is_metered_shot and self._decide_exposures():
                 return True
             self._take(frame)
         return True
+
+    def _may_go_on(self) -> bool:
+        """Wait while somebody or a condition wants it; returns False when the run is to end."""
+        reason = self._why_wait()
+        if reason and not self._control.stopping:
+            began_s = self._now_s()
+            self._note("paused", reason=reason, wall=self._wall())
+            self._watcher.paused(reason)
+            while reason and not self._control.stopping:
+                self._control.wait()
+                reason = self._why_wait()
+            seconds = self._now_s() - began_s
+            self._note("resumed", seconds=seconds, wall=self._wall())
+            self._watcher.resumed(seconds)
+        return not self._control.stopping
+
+    def _why_wait(self) -> str:
+        return "somebody asked for it" if self._control.paused else self._suspended()
 
     def _decide_exposures(self) -> bool:
         """Decide once by what metered shots are exposed; returns whether frames were added."""
@@ -208,9 +248,11 @@ class Sequencer:
         )
         self._note("metered", **asked, wall=self._wall())
         self._writer.flush()
-        self._watcher.notify(metered_words(asked))
+        self._watcher.tell(metered_words(asked))
+        self._left_told_s = -TELL_LEFT_S
         if not asked["asked"]:
             return False
+        self._left_of_shot = self._missing_of_shots()
         self._watcher.more(len(session.needed))
         return True
 
@@ -230,8 +272,28 @@ class Sequencer:
                 self._hand_over(planned, frame, found, read_um, spans, attempts)
             self._before = frame.mosaic
 
+        began_s, before_um = self._now_s(), dict(self._applied.offsets_um)
         self._retrying(planned.id, attempt)
         self._taken += 1
+        if attempts == 1:
+            by_hand_s = spans["attend"][1] - spans["attend"][0]
+            self._pace.learn(
+                self._now_s() - began_s - by_hand_s,
+                self._applied.exposure_s or 0.0,
+                self._pace.moving_s(planned, before_um),
+            )
+        self._tell_left(planned)
+
+    def _tell_left(self, taken: PlannedFrame) -> None:
+        """Say from time to time how long the rest will take."""
+        now_s = self._now_s()
+        if now_s - self._left_told_s < TELL_LEFT_S:
+            return
+        self._left_told_s = now_s
+        left = [frame for frame in self._session.missing() if frame.id != taken.id]
+        known = known_exposures(self._exposures, self._metered, self._session.journal.entries)
+        rest = self._pace.estimate(left, known, self._applied.offsets_um)
+        self._watcher.left(rest.seconds, rest.guessed)
 
     def _retrying(self, name: str, attempt: Callable[[], None]) -> None:
         """Try until it works or the budget is spent."""
@@ -247,7 +309,7 @@ class Sequencer:
                 faults += 1
                 self._note("retry", id=name, fault=str(error), attempt=faults, at_s=self._now_s())
                 self._budget.spend(name, error, faults)
-                self._watcher.notify(f"{name}, try {faults}: {error}")
+                self._watcher.tell(f"{name}, try {faults}: {error}")
                 todo = partial(self._mend, error, faults)
 
     def _mend(self, error: DriverError, faults: int) -> None:
@@ -460,14 +522,20 @@ class Sequencer:
         spans: dict[str, list[float]],
     ) -> None:
         """Write a frame and its journal line; runs in the writer's thread."""
-        self._watcher.phase("write", planned)
+        self._watcher.step("write", planned)
         began_s = self._now_s()
 
         def facts() -> Entry:
             return {**entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
 
-        self._session.store(planned, suffix, data, sha256, facts)
-        self._watcher.step(planned.id)
+        session, shot = self._session, planned.bench.shot
+        session.store(planned, suffix, data, sha256, facts)
+        self._watcher.stored(planned)
+        left = self._left_of_shot.get(shot, set())
+        if planned.id in left:
+            left.remove(planned.id)
+            if not left:
+                self._watcher.shot_done(shot)
 
     def _discard_damaged(self, ids: set[str]) -> dict[str, str]:
         """Read files again; returns, by id, what is wrong with those that no longer count."""
@@ -476,11 +544,11 @@ class Sequencer:
         entries = [entry for name, entry in session.stored.items() if name in planned]
         size = sum(entry["bytes"] for entry in entries)
         if size > TOLD_BYTES:
-            self._watcher.notify(f"hashing {len(entries)} frames, {shown_bytes(size)}")
+            self._watcher.tell(f"hashing {len(entries)} frames, {shown_bytes(size)}")
         damaged = verify_frames(session, entries)
         for name, fault in damaged.items():
             session.discard(name, fault)
-            self._watcher.notify(f"{fault}; it is taken again")
+            self._watcher.tell(f"{fault}; it is taken again")
         return damaged
 
     def _compare_with_last_good(self) -> None:
@@ -533,7 +601,7 @@ class Sequencer:
     def _span(
         self, name: str, planned: PlannedFrame, spans: dict[str, list[float]]
     ) -> Iterator[None]:
-        self._watcher.phase(name, planned)
+        self._watcher.step(name, planned)
         began_s = self._now_s()
         yield
         spans[name] = [began_s, self._now_s()]

@@ -105,7 +105,7 @@ class Until:
         session, target_db = self._session, self._session.target_db
         assert target_db is not None
         began_s = now_s()
-        self._watcher.notify(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
+        self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
         found = self._judged(shots, target_db)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         spared = [] if found.next is not None else sorted(planned - set(shots))
@@ -127,7 +127,7 @@ class Until:
             "wall": wall_time(),
         }
         session.note("decided", **entry)
-        self._watcher.notify(decided_words(entry))
+        self._watcher.tell(decided_words(entry))
 
     def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
         self._scale = self._scale or session_scale(self._session)

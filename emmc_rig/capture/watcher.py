@@ -1,59 +1,100 @@
-"""What shows the progress of a capture: the interface that the sequencer calls, and a silent one.
-
-Its stages and steps are those of every `emmc_rig.progress.Watcher`: a step is a frame on the disk.
-"""
+"""What shows a capture: the interface that the sequencer calls, and one that shows nothing."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
-from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.planned import PlannedFrame
 
-PHASES = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
-"""Of one frame, in order."""
+if TYPE_CHECKING:
+    from emmc_rig.capture.sequencer import RunEnd
+    from emmc_rig.session.session import Session
+
+STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
 
 
-class CaptureWatcher(Watcher, Protocol):
-    """Shows a capture; `step` and `phase` may be called from the writer's thread."""
+class CaptureWatcher(Protocol):
+    """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
 
-    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
-        """Begin a stage; `done` of its steps were done by an earlier run."""
+    def begin(self, done: int, planned: int) -> None:
+        """So many frames are there already."""
         ...
 
     def more(self, planned: int) -> None:
-        """Raise the number of steps: more frames are needed than were known."""
+        """So many frames are to be taken in all, more than were known of."""
         ...
 
-    def phase(self, name: str, frame: PlannedFrame) -> None:
-        """Show that a phase of a frame begins: one of PHASES."""
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """A step of a frame begins: one of `STEPS`."""
         ...
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Show a frame that passed its checks."""
+        """A frame passed its checks."""
         ...
 
-    def notify(self, message: str) -> None:
-        """Show a message."""
+    def stored(self, frame: PlannedFrame) -> None:
+        """A frame is on the disk."""
+        ...
+
+    def left(self, seconds: float, guessed: int) -> None:
+        """So long the rest will take; guessed: frames of which the exposure is not known yet."""
+        ...
+
+    def shot_done(self, shot: int) -> None:
+        """Every frame of a shot is on the disk."""
+        ...
+
+    def paused(self, reason: str) -> None:
+        """The capture waits."""
+        ...
+
+    def resumed(self, seconds: float) -> None:
+        """It goes on after so long."""
+        ...
+
+    def tell(self, message: str) -> None:
+        """Something that people should know."""
+        ...
+
+    def ended(self, session: Session, outcome: RunEnd) -> None:
+        """A run is over, complete or not."""
         ...
 
 
-class Unwatched(Silent):
-    """A watcher of a capture that shows nothing."""
+class Unwatched:
+    """A watcher that shows nothing."""
 
-    def begin(self, stage: str, steps: int | None, done: int = 0) -> None:
+    def begin(self, done: int, planned: int) -> None:
         """Ignore it."""
 
     def more(self, planned: int) -> None:
         """Ignore it."""
 
-    def phase(self, name: str, frame: PlannedFrame) -> None:
+    def step(self, name: str, frame: PlannedFrame) -> None:
         """Ignore it."""
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
         """Ignore it."""
 
-    def notify(self, message: str) -> None:
+    def stored(self, frame: PlannedFrame) -> None:
+        """Ignore it."""
+
+    def left(self, seconds: float, guessed: int) -> None:
+        """Ignore it."""
+
+    def shot_done(self, shot: int) -> None:
+        """Ignore it."""
+
+    def paused(self, reason: str) -> None:
+        """Ignore it."""
+
+    def resumed(self, seconds: float) -> None:
+        """Ignore it."""
+
+    def tell(self, message: str) -> None:
+        """Ignore it."""
+
+    def ended(self, session: Session, outcome: RunEnd) -> None:
         """Ignore it."""

@@ -34,7 +34,7 @@ def calibrate(
         str | None,
         typer.Option(
             "--check",
-            help="measure what calibration reaches on the simulated bench: psi, bound, plan, "
+            help="measure what calibration reaches on the simulated bench: psi, few, bound, plan, "
             "sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, lamp, ...); "
             "commas between, or all; exit code 1 where a target is missed",
         ),
@@ -55,6 +55,14 @@ def calibrate(
     frames: Annotated[
         int | None, typer.Option("--frames", min=1, help="with --plan: at most so many")
     ] = None,
+    few: Annotated[
+        bool,
+        typer.Option(
+            "--few",
+            help="with --plan: about ten whiteboards, parts of the aperture instead of every view; "
+            "for masks that are as designed",
+        ),
+    ] = False,
     leave_out: Annotated[
         str | None,
         typer.Option(
@@ -113,6 +121,7 @@ def calibrate(
         BenchTruth(rays_per_view=rays),
         map_stage=stage,
         most_frames=frames,
+        few=few,
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
     if check is not None:

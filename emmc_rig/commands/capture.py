@@ -15,6 +15,7 @@ from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.capture.events import Event
     from emmc_rig.rig.rig_config import ImagedRig
 
 OptionalPath = Path | None
@@ -54,7 +55,10 @@ def capture(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="only check the plan, and estimate time and space")
+        bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
+    ] = False,
+    json_lines: Annotated[
+        bool, typer.Option("--json", help="print what happens as lines of JSON, and nothing else")
     ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
@@ -81,7 +85,7 @@ def capture(
     settings = {"scene": scene, "size": parse_size(size), "seed": seed, "real_time": real_time}
     imaged = validated(ImagedRig, settings | given, "the simulated rig", AppError)
     until_db = None if until is None else parse_psnr(until, "--until")
-    _run(plan, rig, imaged, until_db, dry_run, out)
+    _run(plan, rig, imaged, until_db, dry_run, json_lines, out)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -99,12 +103,14 @@ def _run(
     imaged: ImagedRig,
     until_db: float | None,
     dry_run: bool,
+    json_lines: bool,
     out: Path | None,
 ) -> None:
     from emmc_rig.capture.command import capture_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
+    from emmc_rig.capture.events import EventWatcher
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.rig.rig_config import rig_description
     from emmc_rig.session.decisions import decided_words, ended
@@ -112,13 +118,14 @@ def _run(
     from emmc_rig.session.session import REPORT
 
     chosen = None if rig is None else rig_description(rig, imaged)
-    console, control = Console(stderr=True), Control()
+    console, control = Console(stderr=True, quiet=json_lines), Control()
     display = CaptureDisplay(console, control)
+    watcher = EventWatcher(_print_line) if json_lines else display
 
     def ask(what: str) -> None:
         if not sys.stdin.isatty():
             raise AppError(
-                f"a person has to {what}: run this on a terminal, or automate the lamp and masks"
+                f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
             )
         with display.aside():
             input(f"please {what}, then press Enter ")
@@ -127,15 +134,20 @@ def _run(
         if expected.frames:
             most = "" if until_db is None else "at most "
             hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
-            display.notify(
+            yet = (
+                f"; the exposures of {expected.guessed} are not metered yet and come on top"
+                if expected.guessed
+                else ""
+            )
+            watcher.tell(
                 f"{most}{expected.frames} frames to take, about "
-                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}"
+                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{yet}"
             )
         return not dry_run
 
     with display.shown():
-        captured = capture_session(plan, chosen, out, until_db, display, ask, agreed, control)
-    if captured is None:
+        captured = capture_session(plan, chosen, out, until_db, watcher, ask, agreed, control)
+    if captured is None or json_lines:
         return
     session, outcome = captured
     retried = f", {outcome.retries} retries" if outcome.retries else ""
@@ -149,3 +161,7 @@ def _run(
     for reason in exposure_reasons(shot_exposures(session)):
         show_reason(**asdict(reason))
     typer.echo(f"open {session.folder / REPORT}")
+
+
+def _print_line(event: Event) -> None:
+    print(event.line(), flush=True)

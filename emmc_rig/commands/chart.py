@@ -10,9 +10,11 @@ import typer
 from emmc_rig.commands.chart_ablation import chart_ablation
 from emmc_rig.commands.chart_guard import chart_guard
 from emmc_rig.commands.chart_kernels import chart_kernels
+from emmc_rig.commands.chart_live import chart_live
 from emmc_rig.commands.chart_next_shot import chart_next_shot
 from emmc_rig.commands.chart_peers import chart_peers
 from emmc_rig.commands.chart_solvers import chart_solvers
+from emmc_rig.commands.chart_stated import chart_stated
 from emmc_rig.commands.options import (
     DEFAULT_SCENE,
     DictionaryOption,
@@ -61,6 +63,12 @@ def chart(
     guard: Annotated[
         bool, typer.Option("--guard", help="instead: PSNR of the default method, against figures")
     ] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="instead: the live page: stop, pictures, light field")
+    ] = False,
+    stated: Annotated[
+        bool, typer.Option("--stated", help="instead: PSNR and deviation as stated, and as true")
+    ] = False,
     until: Annotated[
         list[float] | None,
         typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
@@ -89,6 +97,10 @@ def chart(
         chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
     elif guard:
         chart_guard(scene or [], camera, shape, out or Path("emmc-guard"))
+    elif live:
+        chart_live(one_camera, (scene or [DEFAULT_SCENE])[0], shape, out or Path("emmc-live"))
+    elif stated:
+        chart_stated(scene or [], camera, shape, out or Path("emmc-stated"))
     elif ablation:
         seen, cut = (scene or [DEFAULT_SCENE])[0], shape or STUDIED_SIZE
         chart_ablation(seen, one_camera, cut, seed, out or Path("emmc-ablation"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,8 +14,12 @@ from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
+    from emmc_rig.model.camera import Camera
+    from emmc_rig.session.readings import Scale
 
+DESIGN = "design"
 EVERYWHERE = ("0.0.0.0", "::")
 
 
@@ -31,6 +36,16 @@ def live(
     ] = "rgbw-bayer-1shot",
     scene: RigSceneOption = "deep-occlusions",
     size: RigSizeOption = None,
+    psi: Annotated[
+        str | None,
+        typer.Option(
+            "--psi",
+            help="show the light field too: a session, a calibration's folder, psi.h5, or `design`",
+        ),
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", help="of the light field when nothing moves")
+    ] = None,
     host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     read_only: Annotated[
@@ -38,13 +53,15 @@ def live(
     ] = False,
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
-    """Show the camera on a local page: histogram, focus, mask alignment, jog. Ctrl-C ends."""
+    """Show the camera on a local page: levels, focus, mask, jog, light field. Ctrl-C ends."""
     from emmc_rig.live.server import LOCAL_HOSTS, application, new_token
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
+    if method is not None and psi is None:
+        raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
     listening = _listen(host, port)
-    with closing(listening), _watch(rig, camera, stage, design, scene, size) as watch:
+    with closing(listening), _watch(rig, camera, stage, design, scene, size, psi, method) as watch:
         token = new_token()
         number = listening.getsockname()[1]
         shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
@@ -84,20 +101,23 @@ def _watch(
     design: str,
     scene: str,
     size: str | None,
+    psi: str | None,
+    method: str | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
+    from emmc_rig.files.cameras import find_camera
     from emmc_rig.live.watch import Watch
     from emmc_rig.rig.hardware import SimulatedRig, open_camera, open_stage
 
+    described, scale = find_camera(design), _scale(psi)
     with ExitStack() as stack:
         if rig is not None:
-            from emmc_rig.files.cameras import find_camera
             from emmc_rig.files.results import parse_size
             from emmc_rig.rig.rig_config import ImagedRig, opened_rig, rig_description
 
             imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
             opened = stack.enter_context(
-                opened_rig(rig_description(rig, imaged), find_camera(design), _nobody)
+                opened_rig(rig_description(rig, imaged), described, _nobody)
             )
             look, targets = None, ()
             if isinstance(opened, SimulatedRig):
@@ -106,13 +126,53 @@ def _watch(
             centre_um = dict(opened.zero_um)
             if "aperture_x" in centre_um:
                 centre_um["aperture_x"] += opened.window_um
-            watch = Watch(opened.camera, opened.stage, look, targets, centre_um)
+            field = _light_field(psi, scale, method, described, opened.camera.shape)
+            watch = Watch(opened.camera, opened.stage, look, targets, centre_um, described, field)
         else:
             device = stack.enter_context(closing(open_camera(camera or "ptp:")))
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
-            watch = Watch(device, driven)
+            field = _light_field(psi, scale, method, described, device.shape)
+            watch = Watch(device, driven, design=described, light_field=field)
         stack.callback(watch.close)
         yield watch
+
+
+def _scale(psi: str | None) -> Scale | None:
+    """Return what --psi names; None where nothing, or the design, which needs the camera's size."""
+    if psi is None or psi == DESIGN:
+        return None
+    from emmc_rig.live.scale import open_scale
+
+    return open_scale(Path(psi))
+
+
+def _light_field(
+    psi: str | None,
+    scale: Scale | None,
+    method: str | None,
+    design: Camera,
+    pixels: tuple[int, int],
+) -> LiveLightField | None:
+    """Return what reconstructs while the camera watches; None without a Psi."""
+    if psi is None:
+        return None
+    from emmc_rig.live.light_field import LiveLightField
+    from emmc_rig.live.scale import designed_scale
+    from reconstruction.methods import DEFAULT_METHOD, find_method
+
+    chosen = method or DEFAULT_METHOD
+    if find_method(chosen).needs_dictionary:
+        raise AppError(f"--method {chosen} needs a dictionary: choose one that needs none")
+    if scale is None:
+        k = design.sensor.binning
+        scale = designed_scale(design.psi((pixels[0] * k, pixels[1] * k)))
+    expected = scale.psi.frames_shape[1:]
+    if expected != tuple(pixels):
+        raise AppError(
+            f"--psi {psi}: for frames of {expected[0]}x{expected[1]} pixels, the camera sends "
+            f"{pixels[0]}x{pixels[1]}"
+        )
+    return LiveLightField(scale, chosen)
 
 
 def _nobody(what: str) -> None:

@@ -52,6 +52,9 @@ def reconstruct(
         str | None,
         typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of them"),
     ] = None,
+    as_zarr: Annotated[
+        bool, typer.Option("--zarr", help="light field and maps as result.zarr, by all workers")
+    ] = False,
     memory: Annotated[
         str | None,
         typer.Option("--memory", help="of all processes together, as 2GiB: fewer at a time"),
@@ -61,10 +64,6 @@ def reconstruct(
     ] = None,
     want: Annotated[
         str | None, typer.Option("--want", help="choose the quickest method for a PSNR, as 28dB")
-    ] = None,
-    chart_folder: Annotated[
-        Path | None,
-        typer.Option("--chart", help="of `emmc-rig chart`, to choose by (default: the shipped)"),
     ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
@@ -98,18 +97,14 @@ def reconstruct(
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget and --want choose the method and its settings")
         from emmc_rig.advice.recommend import advice_for
-        from emmc_rig.files.frames import PSI
-        from emmc_rig.model.sensing import ImagingMatrix
+        from emmc_rig.reconstruct.inputs import open_frames
 
-        measured = ImagingMatrix.load(psi or frames[0] / PSI)
-        advice = advice_for(measured, budget, want, chart_folder)
-        method, chosen, why = advice.method, advice.settings, advice.why
+        advice = advice_for(*open_frames(frames[0], psi), budget, want)
+        method, why = advice.method, advice.why
         console.print(why, highlight=False, soft_wrap=True)
-    elif chart_folder is not None:
-        raise typer.BadParameter("--chart serves --budget and --want")
     method = method or DEFAULT_METHOD
     requests = [
-        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile)
+        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
         for folder, place in _places(frames, out)
     ]
     limit = None if memory is None else parse_memory(memory)
@@ -181,8 +176,9 @@ def _say_result(metrics: dict, request: Request) -> None:
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    pictures = request.out / "pictures"
-    typer.echo(f"open {pictures if pictures.is_dir() else request.out / 'light_field.h5'}")
+    written = ("pictures", "light_field.h5", "result.zarr")
+    shown = next(request.out / name for name in written if (request.out / name).exists())
+    typer.echo(f"open {shown}")
 
 
 def _list_methods() -> None:

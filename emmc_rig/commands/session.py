@@ -1,10 +1,14 @@
-"""The commands `emmc-rig session`: list, show, verify, export, prune, sheet, bench."""
+"""The commands `emmc-rig session`: list, compare, show, verify, export, prune, sheet, bench."""
 
 from __future__ import annotations
 
+import json
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import asdict
+from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -18,26 +22,91 @@ Folder = Annotated[Path, typer.Argument(help="a session folder")]
 @app.command("list")
 def list_sessions(
     folder: Annotated[Path, typer.Argument(help="the folder that holds sessions")] = Path(),
+    camera: Annotated[str, typer.Option("--camera", help="only those of it; part of a name")] = "",
+    since: Annotated[str, typer.Option("--since", help="begun then or later, 2026-11-22")] = "",
+    before: Annotated[str, typer.Option("--before", help="begun before, 2026-11-22")] = "",
+    verdict: Annotated[
+        str, typer.Option("--verdict", help="of the light field: trust, doubt or do not use")
+    ] = "",
+    psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
+    json_lines: Annotated[bool, typer.Option("--json", help="as lines of JSON")] = False,
 ) -> None:
-    """List the sessions in a folder: state, frames, size."""
+    """List the sessions in a folder and below it: state, frames, camera, verdict, PSNR stated."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
+    from emmc_rig.commands.verdict import VERDICT_COLOURS
     from emmc_rig.errors import AppError
-    from emmc_rig.files.results import shown_bytes
-    from emmc_rig.session.listing import sessions_in
+    from emmc_rig.files.results import parse_psnr, shown_bytes
+    from emmc_rig.session.listing import Wanted, sessions_in
 
-    table = Table("session", "state", "frames", "size", "begun", "title", box=SIMPLE)
-    count = 0
+    if verdict and verdict not in VERDICT_COLOURS:
+        raise typer.BadParameter(f"--verdict {verdict}: one of {', '.join(VERDICT_COLOURS)}")
+    for option, day in (("--since", since), ("--before", before)):
+        if day and not _is_day(day):
+            raise typer.BadParameter(f"{option} {day}: write a day as 2026-11-22")
+    least_db = None if psnr is None else parse_psnr(psnr, "--psnr")
+    wanted = Wanted(camera, since, before, verdict, least_db)
+    heads = ("session", "state", "frames", "size", "begun", "camera", "verdict", "dB", "title")
+    table = Table(box=SIMPLE)
+    for head in heads:
+        table.add_column(head, overflow="fold")
+    there = found = 0
     for one in sessions_in(folder):
-        count += 1
-        size = shown_bytes(one.bytes)
+        there += 1
+        if not wanted.fits(one):
+            continue
+        found += 1
+        if json_lines:
+            print(json.dumps({**asdict(one), "folder": str(one.folder)}, allow_nan=False))
+        # Its path from here tells sessions of one name in several folders apart.
+        inside = os.path.relpath(one.folder, folder)
         table.add_row(
-            one.name, one.state, f"{one.stored}/{one.planned}", size, one.created, one.title
+            one.name if inside == "." else inside,
+            one.state,
+            f"{one.stored}/{one.planned}",
+            shown_bytes(one.bytes),
+            one.created[:16],
+            one.camera,
+            one.verdict,
+            "" if one.stated_db is None else f"{one.stated_db:.1f}",
+            one.title,
         )
-    if not count:
+    if not there:
         raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
+    if not found:
+        raise AppError(f"{folder}: none of its {there} session(s) is such; ask for less")
+    if not json_lines:
+        Console().print(table)
+
+
+def _is_day(text: str) -> bool:
+    try:
+        date.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
+
+
+@app.command()
+def compare(
+    sessions: Annotated[list[Path], typer.Argument(help="two session folders, or more")],
+) -> None:
+    """Show in what sessions differ: plan, rig, exposures, verdict, PSNR stated."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    from emmc_rig.session.listing import compared
+    from emmc_rig.session.session import Session
+
+    if len(sessions) < 2:
+        raise typer.BadParameter("name two sessions, or more")
+    opened = [Session(one) for one in sessions]
+    table = Table("", *(one.folder.name for one in opened), box=SIMPLE)
+    for name, values in compared(opened):
+        table.add_row(name, *values)
     Console().print(table)
 
 

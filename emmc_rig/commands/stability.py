@@ -15,6 +15,7 @@ from emmc_rig.commands.options import (
     SizeOption,
 )
 from emmc_rig.commands.stability_verdicts import stability_verdicts
+from emmc_rig.commands.stability_worst import stability_worst
 
 
 def stability(
@@ -52,13 +53,19 @@ def stability(
     verdicts: Annotated[
         bool, typer.Option("--verdicts", help="instead: how often verdicts flag broken results")
     ] = False,
+    worst: Annotated[
+        bool,
+        typer.Option(
+            "--worst", help="instead: the worst perturbation of the noise's size, details"
+        ),
+    ] = False,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="folder to write (default: emmc-stability or emmc-verdicts)"),
+        typer.Option("--out", help="folder to write (default: emmc-stability, -verdicts, -worst)"),
     ] = None,
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
@@ -79,6 +86,12 @@ def stability(
     if verdicts:
         place = out or Path("emmc-verdicts")
         stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, place)
+        return
+    if worst:
+        stability_worst(
+            fast, scene or [], camera, method or [], parse_size(size), seed,
+            out or Path("emmc-worst"),
+        )  # fmt: skip
         return
     out = out or Path("emmc-stability")
     settings = stability_settings(

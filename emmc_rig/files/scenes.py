@@ -12,8 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from emmc_rig.files import shards
+from emmc_rig.files.formats import FORMATS
 from emmc_rig.model.errors import SceneError
-from emmc_rig.model.lightfield import load_hdf5, load_views, shifted
+from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
 from simulators.raycaster import World
 from simulators.scenes import SCENES, render
 
@@ -77,7 +79,9 @@ def open_scene(
     """Open a scene.
 
     Args:
-        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, or a built-in name.
+        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
+            `light_field`, a built-in name, or what another of `emmc_rig.files.formats` that can
+            be read holds.
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 unless
             told), the middle that is cut from a measured one (all of it unless told).
         views: rows and columns of views, likewise (5x5 unless told).
@@ -209,12 +213,21 @@ def _described(name: str, views: tuple[int, int], size: tuple[int, int], seed: i
 def _measured(spec: str) -> tuple[np.ndarray, str]:
     """The light field in a folder or file, and a sentence about it."""
     path = Path(spec)
-    if path.is_dir():
+    held = next((one for one in FORMATS.values() if one.holds and one.holds(path)), None)
+    if held is not None and held.read is not None:
+        light_field = check_light_field(held.read(path), spec)
+        kind = f"{held.name} {'folder' if path.is_dir() else 'file'}"
+    elif path.is_dir() and path.suffix == shards.ENDING:
+        light_field, kind = shards.load_light_field(path), "file"
+    elif path.is_dir():
         light_field, kind = load_views(path), "folder"
     elif path.suffix.lower() in _HDF5_ENDINGS:
         light_field, kind = load_hdf5(path), "file"
     elif path.exists():
-        raise SceneError(f"{spec}: a scene file ends in .h5 or .hdf5, pictures come as a folder")
+        raise SceneError(
+            f"{spec}: a scene file ends in .h5, .hdf5 or .mat, or is an ESLF picture named "
+            "NAME_VxU_eslf.png; other pictures come as a folder"
+        )
     else:
         near = difflib.get_close_matches(spec, SCENES, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'? " if near else ""

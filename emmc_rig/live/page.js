@@ -3,9 +3,12 @@
 const $ = (id) => document.getElementById(id);
 const COLOURS = { red: "#ff6b6b", green: "#63c98c", blue: "#6d9bf2", grey: "#d0d4d9" };
 const PARTS = [1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64];
-const view = { kind: "colour", x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
+const WIDTHS = [400, 800, 1200, 1600]; // few sizes, so that pages share what is encoded
+const THIRD_STOP = 2 ** (1 / 3);
+const ACTIONS = { centre: "centre the mask", autoexpose: "expose automatically" };
+const view = { show: "colour", x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
 let state = { version: 0 };
-let loading = false, wanted = false, best = 0, times = [];
+let loading = false, wanted = false, times = [];
 
 async function ask(path, options) {
   const answer = await fetch(path, { cache: "no-store", ...options });
@@ -17,6 +20,7 @@ async function act(name, values = {}) {
   try {
     await ask("do/" + name, {
       method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(values),
+      priority: name === "stop" ? "high" : "auto",
     });
     complain("");
   } catch (fault) { complain(fault.message); }
@@ -25,10 +29,13 @@ async function act(name, values = {}) {
 let complaint = "";
 function complain(text) { complaint = text; drawTrouble(); }
 
+// What is announced is written only when it changes: a screen reader reads it again otherwise.
+function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
+
 function drawTrouble() {
   const lines = [complaint, ...Object.values(state.trouble || {})].filter(Boolean);
   $("trouble").hidden = lines.length === 0;
-  $("trouble").textContent = lines.join("; ");
+  write("trouble", lines.join("; "));
 }
 
 async function follow() {
@@ -40,6 +47,7 @@ async function follow() {
       state = told;
       draw();
       if (fresh) show();
+      showField();
     } catch (fault) {
       $("lost").hidden = false;
       await new Promise((done) => setTimeout(done, 1000));
@@ -48,13 +56,14 @@ async function follow() {
 }
 
 async function show() {
+  if (onField()) return;
   if (loading) { wanted = true; return; }
   loading = true;
   const box = $("stage").getBoundingClientRect();
-  const scale = window.devicePixelRatio || 1;
-  const px = Math.max(16, Math.min(1600, Math.round(Math.max(box.width, box.height) * scale)));
+  const wide = Math.max(box.width, box.height) * (window.devicePixelRatio || 1);
+  const px = WIDTHS.find((one) => one >= wide) || WIDTHS.at(-1);
   const query = new URLSearchParams({
-    kind: view.kind, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
+    kind: view.show, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
   });
   try {
     const blob = await (await ask("picture.jpg?" + query)).blob();
@@ -70,34 +79,59 @@ async function show() {
 function draw() {
   const { figures, settings } = state;
   drawTrouble();
-  $("camera").textContent = `${settings.camera}, ${settings.shape[0]}x${settings.shape[1]} ${settings.cfa}`;
+  drawHint();
+  write("camera", `${settings.camera}, ${settings.shape[0]}x${settings.shape[1]} ${settings.cfa}`);
   $("read-only").hidden = !state.read_only;
   for (const one of document.querySelectorAll(".acts")) one.disabled = state.read_only;
-  $("frame").textContent = state.frame ? `frame ${state.frame}` : "waiting for the first frame";
+  write("frame", state.frame ? `frame ${state.frame}` : "waiting for the first frame");
   drawSetting("exposure", 1e3 * settings.exposure_s, settings.exposure_limits_s.map((s) => 1e3 * s), "ms");
   drawSetting("gain", settings.gain, settings.gain_limits, "");
   drawTargets();
   drawAxes();
-  $("zoom").textContent = `${Math.round(1 / PARTS[view.level])}x`;
+  drawField();
+  write("zoom", `${Math.round(1 / PARTS[view.level])}x`);
+  drawMask();
   if (!figures) return;
   const now = performance.now();
   if (times.at(-1)?.frame !== state.frame) times.push({ frame: state.frame, now });
   times = times.filter((one) => now - one.now < 3000);
   const rate = times.length > 1
     ? (times.at(-1).frame - times[0].frame) * 1000 / (times.at(-1).now - times[0].now) : 0;
-  $("rate").textContent = rate ? `${rate.toFixed(1)} frames/s` : "";
-  drawHistogram(figures.histogram);
+  write("rate", rate ? `${rate.toFixed(1)} frames/s` : "");
+  drawHistogram(figures);
   drawLevels(figures);
-  best = Math.max(best, figures.focus);
-  $("focus").textContent = figures.focus.toPrecision(3);
-  $("focus-best").textContent = `${Math.round(100 * figures.focus / best)} % of the best`;
-  const mask = figures.alignment;
-  $("rotation").textContent = `${mask.rotation_deg.toFixed(3)}\u00b0`;
-  $("straightness").textContent = `straight edges ${Math.round(100 * mask.straightness)} %`;
-  $("shift").textContent = mask.shift_px
-    ? `x ${mask.shift_px[0].toFixed(2)}, y ${mask.shift_px[1].toFixed(2)} px` : "no reference";
-  $("match").textContent = mask.shift_px ? `match ${Math.round(100 * mask.match)} %` : "";
-  $("take").textContent = state.reference ? "forget the reference" : "measure shifts from here";
+  const focus = figures.focus;
+  write("focus", !focus ? (figures.dark ? "nothing to see" : "no edge above the noise")
+    : focus.share >= 1 ? "the sharpest of the last minute"
+    : `${percent(focus.share, focus.deviation)} of the sharpest of the last minute`);
+  const shift = figures.shift;
+  write("shift", shift ? `x ${shift.x_px.toFixed(2)}, y ${shift.y_px.toFixed(2)} px, likeness ${Math.round(100 * shift.likeness)} %`
+    : state.reference ? "the frame is not like the reference" : "no reference");
+  write("take", state.reference ? "forget the reference" : "measure shifts from here");
+}
+
+function percent(value, deviation) {
+  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(Math.max(100 * deviation, 1e-3)))));
+  return `${(100 * value).toFixed(digits)} \u00b1 ${(100 * deviation).toFixed(digits)} %`;
+}
+
+function drawMask() {
+  const place = state.mask?.place;
+  write("rotation", place ? `${place.rotation_deg.toFixed(3)} \u00b1 ${place.rotation_deviation_deg.toFixed(3)}\u00b0` : "not seen");
+  write("scale", place ? `${percent(place.scale - 1, place.scale_deviation)} off the design` : "not seen");
+  const offset = place?.offset_um;
+  write("offset", offset ? `x ${offset[0].toFixed(1)}, y ${offset[1].toFixed(1)} \u00b1 ${place.offset_deviation_um.toFixed(1)} \u00b5m`
+    : place ? "periodic: not told apart" : "not seen");
+  write("mask-why", state.mask?.why || "");
+}
+
+function drawHint() {
+  const hint = state.hint;
+  $("hint").hidden = !hint && !state.stopped;
+  write("hint-text", [state.stopped ? "Stopped by hand." : "", hint?.text || ""].filter(Boolean).join(" "));
+  $("hint-do").hidden = !hint?.action;
+  write("hint-do", ACTIONS[hint?.action] || "");
+  $("hint-do").disabled = state.read_only || state.busy !== "";
 }
 
 function drawSetting(id, value, limits, unit) {
@@ -109,15 +143,14 @@ function drawSetting(id, value, limits, unit) {
     ? `${Number((limit / 1000).toPrecision(3))} s` : `${Number(limit.toPrecision(3))} ${unit}`;
   field.disabled = fixed || state.read_only;
   field.form.querySelector("button").disabled = field.disabled;
-  $(id + "-limits").textContent = fixed ? "fixed"
-    : `${shown(limits[0])} to ${shown(limits[1])}`;
+  write(id + "-limits", fixed ? "fixed" : `${shown(limits[0])} to ${shown(limits[1])}`);
 }
 
-function drawHistogram(counts) {
+function drawHistogram(figures) {
   const canvas = $("histogram"), pen = canvas.getContext("2d");
   const { width, height } = canvas;
   pen.clearRect(0, 0, width, height);
-  for (const [name, row] of Object.entries(counts)) {
+  for (const [name, row] of Object.entries(figures.histogram)) {
     const top = Math.log1p(Math.max(...row, 1));
     pen.beginPath();
     pen.moveTo(0, height);
@@ -141,7 +174,7 @@ function drawLevels(figures) {
   rows.push(["saturated", `${(100 * figures.saturated).toFixed(2)} %`, "of the pixels", figures.saturated > 0]);
   fill($("levels"), rows.map(([name, value, note, bad]) => {
     const row = document.createElement("tr");
-    row.append(cell("th", name), cell("td", value, bad ? "bad" : ""), cell("td", note, "quiet"));
+    row.append(heading(name), cell("td", value, bad ? "bad" : ""), cell("td", note, "quiet"));
     return row;
   }));
 }
@@ -150,6 +183,12 @@ function cell(kind, text, style = "") {
   const made = document.createElement(kind);
   made.textContent = text;
   if (style) made.className = style;
+  return made;
+}
+
+function heading(text) {
+  const made = cell("th", text);
+  made.scope = "row";
   return made;
 }
 
@@ -172,27 +211,39 @@ function drawTargets() {
     button("look at the " + target, () => act("look", { target }), "", state.read_only)));
 }
 
+// Rows are made once and then written to: a button that has the focus keeps it.
 let drawnAxes = "";
 function drawAxes() {
   const axes = Object.entries(state.axes);
   $("axes-section").hidden = axes.length === 0;
-  $("busy").textContent = state.busy;
-  const key = JSON.stringify([state.axes, state.busy, state.read_only]);
-  if (key === drawnAxes) return;
-  drawnAxes = key;
+  write("busy", state.busy);
+  const key = JSON.stringify(Object.keys(state.axes));
+  if (key !== drawnAxes) {
+    drawnAxes = key;
+    fill($("axes"), axes.map(([axis]) => {
+      const row = document.createElement("tr"), last = document.createElement("td");
+      last.append(button("\u2212", () => jog(axis, -1), `${axis} down`), " ",
+        button("+", () => jog(axis, 1), `${axis} up`));
+      row.dataset.axis = axis;
+      row.append(heading(axis), cell("td", ""), last);
+      return row;
+    }));
+  }
   const off = state.read_only || state.busy !== "";
   $("home").disabled = $("centre").disabled = off;
   $("centre").hidden = Object.keys(state.centre_um).length === 0;
-  fill($("axes"), axes.map(([axis, told]) => {
-    const row = document.createElement("tr"), last = document.createElement("td");
+  for (const [axis, told] of axes) {
+    const row = $("axes").querySelector(`[data-axis="${CSS.escape(axis)}"]`);
     const known = told.position_um !== null;
-    const step = (sign) => () => act("jog", { axis, distance_um: sign * number($("step")) });
-    last.append(button("\u2212", step(-1), `${axis} down`, off || !known), " ",
-      button("+", step(1), `${axis} up`, off || !known));
-    row.dataset.axis = axis;
-    row.append(cell("th", axis), cell("td", known ? told.position_um.toFixed(2) + " um" : "not homed"), last);
-    return row;
-  }));
+    const text = known ? told.position_um.toFixed(2) + " um" : "not homed";
+    if (row.children[1].textContent !== text) row.children[1].textContent = text;
+    for (const one of row.querySelectorAll("button")) one.disabled = off || !known;
+  }
+}
+
+function jog(axis, sign) {
+  const step = number($("step"));
+  act("jog", { axis, distance_um: typeof step === "number" ? sign * step : step });
 }
 
 function number(field) {
@@ -200,12 +251,131 @@ function number(field) {
   return field.value.trim() === "" || Number.isNaN(value) ? field.value : value;
 }
 
+// The light field: all views in one picture; viewpoint and focus are worked out here.
+const field = { number: 0, sheet: null, depth: null, u: 0.5, v: 0.5, disparity: 0, loading: false };
+function onField() { return ["views", "focus", "depth"].includes(view.show); }
+
+async function showField() {
+  const shown = state.light_field?.pictures;
+  if (!shown || !onField() || field.loading || shown.number === field.number) return;
+  field.loading = true;
+  try {
+    const [sheet, depth] = await Promise.all(["views.jpg", "disparity.png"].map(async (name) =>
+      createImageBitmap(await (await ask(name)).blob())));
+    Object.assign(field, { sheet, depth, number: shown.number, shown });
+    paintField();
+  } catch (fault) { /* the next state tells why */ }
+  field.loading = false;
+}
+
+function drawField() {
+  const told = state.light_field;
+  for (const one of ["views", "focus", "depth"])
+    document.querySelector(`[data-show=${one}]`).hidden = !told;
+  if (!told) return;
+  const parts = [told.stage];
+  if (told.shots[1] > 1) parts.push(`${told.shots[0]} of ${told.shots[1]} shots`);
+  if (told.pictures && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
+  if (told.why) parts.push(told.why);
+  parts.push(told.verdict ? told.verdict.words : "no verdict yet");
+  write("field-stage", parts.join("; "));
+  $("field-stage").classList.toggle("bad", told.verdict?.level === "do not use");
+  $("field-stage").classList.toggle("good", told.verdict?.level === "trust");
+}
+
+function paintField() {
+  const canvas = $("field"), { sheet, shown } = field;
+  if (!sheet || !onField()) return;
+  const box = canvas.getBoundingClientRect(), dots = window.devicePixelRatio || 1;
+  canvas.width = Math.max(1, Math.round(box.width * dots));
+  canvas.height = Math.max(1, Math.round(box.height * dots));
+  const pen = canvas.getContext("2d");
+  const [rows, columns] = shown.views, [high, wide] = shown.size;
+  const scale = Math.min(canvas.width / wide, canvas.height / high);
+  const left = (canvas.width - wide * scale) / 2, top = (canvas.height - high * scale) / 2;
+  pen.save();
+  pen.beginPath();
+  pen.rect(left, top, wide * scale, high * scale);
+  pen.clip();
+  const put = (v, u, x = 0, y = 0) => pen.drawImage(sheet, u * wide, v * high, wide, high,
+    left + x * scale, top + y * scale, wide * scale, high * scale);
+  const middle = [Math.floor(rows / 2), Math.floor(columns / 2)];
+  if (view.show === "depth") {
+    put(...middle);
+    pen.fillStyle = "#000a";
+    pen.fillRect(left, top, wide * scale, high * scale);
+    pen.drawImage(field.depth, left, top, wide * scale, high * scale);
+  } else if (view.show === "focus") {
+    let count = 0;
+    for (let v = 0; v < rows; v++)
+      for (let u = 0; u < columns; u++) {
+        pen.globalAlpha = 1 / ++count;
+        put(v, u, -field.disparity * (u - middle[1]), -field.disparity * (v - middle[0]));
+      }
+  } else {
+    const v = field.v * (rows - 1), u = field.u * (columns - 1);
+    const v0 = Math.min(Math.floor(v), Math.max(0, rows - 2)), u0 = Math.min(Math.floor(u), Math.max(0, columns - 2));
+    let sum = 0;
+    for (const [i, j, weight] of [[0, 0, (1 - v + v0) * (1 - u + u0)], [0, 1, (1 - v + v0) * (u - u0)],
+      [1, 0, (v - v0) * (1 - u + u0)], [1, 1, (v - v0) * (u - u0)]]) {
+      if (weight <= 0) continue;
+      sum += weight;
+      pen.globalAlpha = weight / sum;
+      put(v0 + i, u0 + j);
+    }
+  }
+  pen.restore();
+  const range = shown.disparities;
+  write("focused", view.show === "focus" ? `focus at ${field.disparity.toFixed(2)} px per view`
+    : view.show === "depth" ? (range ? `${range[0].toFixed(2)} (dark) to ${range[1].toFixed(2)} (bright) px per view` : "no disparity is decided")
+    : `view ${(field.v * (rows - 1) + 1).toFixed(1)}, ${(field.u * (columns - 1) + 1).toFixed(1)}`);
+  canvas.setAttribute("aria-label", `light field, ${$("focused").textContent}`);
+  canvas.dataset.number = field.number;
+}
+
+function refocus(steps) {
+  const range = field.shown?.disparities;
+  const step = range ? Math.max((range[1] - range[0]) / 20, 0.01) : 0.02;
+  field.disparity += steps * step;
+  choose("focus");
+}
+
+function look(v, u) {
+  field.v = Math.max(0, Math.min(1, v));
+  field.u = Math.max(0, Math.min(1, u));
+  if (view.show === "focus") choose("views"); else paintField();
+}
+
+$("field").addEventListener("pointermove", (event) => {
+  if (view.show !== "views" && !event.buttons) return;
+  const box = $("field").getBoundingClientRect();
+  look((event.clientY - box.top) / box.height, (event.clientX - box.left) / box.width);
+});
+$("field").addEventListener("wheel", (event) => { event.preventDefault(); refocus(event.deltaY < 0 ? 1 : -1); }, { passive: false });
+$("field").addEventListener("keydown", (event) => {
+  const [rows, columns] = field.shown?.views || [1, 1];
+  const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
+  if (by) look(field.v + by[0] / Math.max(1, rows - 1), field.u + by[1] / Math.max(1, columns - 1));
+  else if (event.key === "+" || event.key === "-") refocus(event.key === "+" ? 1 : -1);
+  else return;
+  event.preventDefault();
+});
+
+function choose(what) {
+  view.show = what;
+  for (const one of document.querySelectorAll("[data-show]"))
+    one.setAttribute("aria-pressed", one.dataset.show === what);
+  for (const one of document.querySelectorAll(".of-frame")) one.hidden = onField();
+  for (const one of document.querySelectorAll(".of-field")) one.hidden = !onField();
+  if (onField()) { paintField(); showField(); } else show();
+}
+
 function zoom(by, x = view.x, y = view.y) {
   view.level = Math.max(0, Math.min(PARTS.length - 1, view.level + by));
   const half = PARTS[view.level] / 2;
   view.x = Math.max(half, Math.min(1 - half, x));
   view.y = Math.max(half, Math.min(1 - half, y));
-  $("zoom").textContent = `${Math.round(1 / PARTS[view.level])}x`;
+  write("zoom", `${Math.round(1 / PARTS[view.level])}x`);
   show();
 }
 
@@ -219,14 +389,8 @@ function place(event) {
   return [view.x + part * across, view.y + part * down];
 }
 
-for (const one of document.querySelectorAll("[data-kind]")) {
-  one.addEventListener("click", () => {
-    view.kind = one.dataset.kind;
-    for (const other of document.querySelectorAll("[data-kind]"))
-      other.setAttribute("aria-pressed", other === one);
-    show();
-  });
-}
+for (const one of document.querySelectorAll("[data-show]"))
+  one.addEventListener("click", () => choose(one.dataset.show));
 for (const name of ["marked", "bright"])
   $(name).addEventListener("change", () => { view[name] = $(name).checked; show(); });
 $("closer").addEventListener("click", () => zoom(1));
@@ -259,19 +423,36 @@ for (const [id, send] of [
   ["exposure", (ms) => act("exposure", { seconds: typeof ms === "number" ? ms / 1e3 : ms })],
   ["gain", (factor) => act("gain", { factor })],
 ]) {
-  const field = $(id);
+  const one = $(id);
   for (const change of ["input", "change"])
-    field.addEventListener(change, () => { field.dataset.typed = "yes"; });
-  field.form.addEventListener("submit", (event) => {
+    one.addEventListener(change, () => { one.dataset.typed = "yes"; });
+  one.form.addEventListener("submit", (event) => {
     event.preventDefault();
-    send(number(field));
-    delete field.dataset.typed;
-    field.blur();
+    send(number(one));
+    delete one.dataset.typed;
+    one.blur();
   });
 }
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
-$("home").addEventListener("click", () => act("home"));
-$("centre").addEventListener("click", () => act("centre"));
-$("stop").addEventListener("click", () => act("stop"));
-window.addEventListener("resize", show);
+$("hint-do").addEventListener("click", () => act(state.hint.action));
+for (const name of ["home", "centre", "stop", "autoexpose", "refocus"])
+  $(name).addEventListener("click", () => act(name));
+
+// Escape stops from anywhere; moves are by key only while the stage's panel has the focus.
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape") { act("stop"); event.preventDefault(); return; }
+  if (event.ctrlKey || event.altKey || event.metaKey || event.target.tagName === "INPUT") return;
+  const exposure_s = state.settings?.exposure_s;
+  if (event.key === "a") act("autoexpose");
+  else if (event.key === "[") act("exposure", { seconds: exposure_s / THIRD_STOP });
+  else if (event.key === "]") act("exposure", { seconds: exposure_s * THIRD_STOP });
+  else if ($("axes-section").contains(event.target)) {
+    const [axis, sign] = { ArrowLeft: ["x", -1], ArrowRight: ["x", 1], ArrowDown: ["y", -1], ArrowUp: ["y", 1] }[event.key] || [];
+    const name = `${event.shiftKey ? "aperture" : "mask"}_${axis}`;
+    if (!axis || !state.axes[name]) return;
+    jog(name, sign);
+  } else return;
+  event.preventDefault();
+});
+window.addEventListener("resize", () => { show(); paintField(); });
 follow();

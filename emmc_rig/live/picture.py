@@ -1,12 +1,18 @@
-"""A frame as a browser shows it: a part of it, as the mosaic or in colour, encoded."""
+"""A frame as a browser shows it: a part of it, as the mosaic or in colour, encoded.
+
+A large frame is averaged over whole colour tiles before anything else is done with it: each pixel
+shown is the mean of its tiles, so that nothing needs to be demosaiced.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, get_args
 
 import cv2
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
@@ -20,6 +26,9 @@ SMALLEST_PART = 1 / 256
 BRIGHTEST = 0.999
 SATURATED_BGR = (60, 60, 255)
 CLIPPED_BGR = (255, 90, 60)
+QUALITY = 88
+CODES = 1 << 14
+"""Steps of linear light in the table of sRGB codes: the darkest code is four of them wide."""
 FROM_BAYER = {cfa: getattr(cv2, f"COLOR_Bayer{cfa.upper()}2BGR") for cfa in BAYER}
 
 
@@ -67,31 +76,117 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     mosaic = frame.mosaic[rows, columns]
     black = float(frame.black_level_dn.mean())
     span = max(1.0, frame.white_level_dn - black)
+    step = -(-max(mosaic.shape) // (2 * view.longest_px))
+    if step > 1 or max(mosaic.shape) >= 2 * view.longest_px:
+        means, marks = _averaged(mosaic, step, frame.white_level_dn)
+        seen = means @ _mixing(frame.cfa if view.kind == "colour" else "")
+        return _shown(seen, black, span, view, (marks & 1) > 0, marks > 1)
     code = FROM_BAYER.get(frame.cfa) if view.kind == "colour" else None
     if code is not None and min(mosaic.shape) >= 4:
         seen = cv2.cvtColor(np.ascontiguousarray(mosaic), code)
     else:
         seen = np.repeat(mosaic[..., None], 3, axis=2)
-    linear = np.clip((seen.astype(np.float32) - black) / span, 0, 1)
+    return _shown(
+        seen.astype(np.float32),
+        black,
+        span,
+        view,
+        mosaic >= frame.white_level_dn,
+        mosaic == 0,
+    )
+
+
+def _shown(
+    seen: NDArray[np.float32],
+    black: float,
+    span: float,
+    view: View,
+    saturated: NDArray[np.bool_],
+    clipped: NDArray[np.bool_],
+) -> NDArray[np.uint8]:
+    """Return a picture (y, x, BGR) in DN as it is shown; marks are of the same or a finer grid."""
+    linear = np.clip((seen - np.float32(black)) / np.float32(span), 0, 1)
     if view.bright:
         linear = np.clip(linear / max(1 / span, float(np.quantile(linear, BRIGHTEST))), 0, 1)
-    scale = view.longest_px / max(mosaic.shape)
-    shown = srgb_codes(_resized(linear, scale))
+    resized = _resized(linear, view.longest_px / max(linear.shape[:2]))
+    shown = _srgb_table()[(resized * np.float32(CODES - 1)).astype(np.uint16)]
     if view.marked:
         # The most of each spot, not the mean: one saturated pixel in a large frame is seen.
-        for where, colour in (
-            (mosaic >= frame.white_level_dn, SATURATED_BGR),
-            (mosaic == 0, CLIPPED_BGR),
-        ):
-            shown[_any(where, shown.shape[:2])] = colour
+        for where, colour in ((saturated, SATURATED_BGR), (clipped, CLIPPED_BGR)):
+            if where.any():
+                shown[_any(where, shown.shape[:2])] = colour
     return shown
+
+
+@cache
+def _srgb_table() -> NDArray[np.uint8]:
+    return srgb_codes(np.linspace(0, 1, CODES, dtype=np.float32))
+
+
+def _mixing(cfa: str) -> NDArray[np.float32]:
+    """Return what turns the four means of a tile into BGR, (4, 3); grey for an unknown tile."""
+    if cfa not in BAYER:
+        return np.full((4, 3), 0.25, np.float32)
+    mixing = np.array([[letter == one for one in "bgr"] for letter in cfa], np.float32)
+    return mixing / mixing.sum(axis=0)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _averaged(mosaic, step, white):
+    """Return the means of step x step tiles, (y, x, 4 places in a tile), and marks (y, x).
+
+    Marks: 1 where any of the pixels reaches white, 2 where any is 0, or both.
+    """
+    rows, columns = mosaic.shape[0] // (2 * step), mosaic.shape[1] // (2 * step)
+    means = np.empty((rows, columns, 4), np.float32)
+    marks = np.zeros((rows, columns), np.uint8)
+    share = np.float32(1.0 / (step * step))
+    for row in prange(rows):
+        sums = np.empty((columns, 4), np.uint32)
+        sums[:] = 0
+        for part in range(2 * step):
+            line = mosaic[2 * step * row + part]
+            first = 2 * (part % 2)
+            for column in range(columns):
+                at = 2 * step * column
+                for pair in range(step):
+                    for second in range(2):
+                        value = line[at + 2 * pair + second]
+                        sums[column, first + second] += value
+                        if value >= white:
+                            marks[row, column] |= 1
+                        if value == 0:
+                            marks[row, column] |= 2
+        for column in range(columns):
+            for place in range(4):
+                means[row, column, place] = sums[column, place] * share
+    return means, marks
 
 
 def encoded(shown: NDArray[np.uint8]) -> bytes:
     """Return a picture as JPEG bytes."""
-    ok, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    ok, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
         raise AppError("the picture cannot be encoded")
+    return data.tobytes()
+
+
+def disparity_png(disparity: NDArray[np.float32]) -> bytes:
+    """Return a disparity map (y, x) in false colours as PNG; clear where it is not known.
+
+    The colours span the 5th to the 95th percentile, as `Pictures` states them.
+    """
+    known = np.isfinite(disparity)
+    picture = np.zeros((*disparity.shape, 4), np.uint8)
+    if known.any():
+        low, high = np.percentile(disparity[known], (5, 95))
+        share = np.clip((disparity - low) / max(high - low, 1e-6), 0, 1)
+        codes = np.where(known, 255 * share, 0).astype(np.uint8)
+        picture[..., :3] = cv2.applyColorMap(codes, cv2.COLORMAP_VIRIDIS)
+        picture[..., 3] = np.where(known, 255, 0)
+    ok, data = cv2.imencode(".png", picture)
+    if not ok:
+        raise AppError("the disparity map cannot be encoded")
     return data.tobytes()
 
 

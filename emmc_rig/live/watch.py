@@ -1,8 +1,8 @@
-"""The camera and the stage behind the set-up page: each in a thread of its own, never waited for.
+"""The camera behind the page, and all that is worked out of its frames: always of the newest.
 
 The camera's thread takes frame after frame while somebody looks; wishes (exposure, gain) are
-carried out between two frames. The stage's thread carries out one move at a time; stopping it
-goes past that thread, so that it works in the middle of a move.
+carried out between two frames. What is worked out has threads of its own, which take the newest
+frame and leave out those that came meanwhile, so that nothing slow holds up what is quick.
 """
 
 from __future__ import annotations
@@ -11,17 +11,26 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from queue import Empty, Queue
 from typing import Any
 
+import numpy as np
+
+from calibration.errors import CalibrationError
 from drivers.camera import Camera
-from drivers.errors import DriverError, NotHomedError
+from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.errors import AppError
-from emmc_rig.live.alignment import measure
-from emmc_rig.pages.frame_view import frame_figures, histogram
+from emmc_rig.live.alignment import MaskGauge, is_dark
+from emmc_rig.live.driving import Driving
+from emmc_rig.live.focus import FocusMeter
+from emmc_rig.live.light_field import LiveLightField
+from emmc_rig.model.camera import Camera as Design
+from emmc_rig.model.errors import CameraError
+from emmc_rig.pages.frame_view import frame_figures, histogram, thinned
+from emmc_rig.rig.registration import registered
 
 IDLE_S = 10.0
 """Without anybody who asks for this long, no frame is taken."""
@@ -31,15 +40,28 @@ FASTEST_S = 0.04
 POLL_S = 0.2
 PATIENCE_S = 10.0
 """For the threads to end. A move under way is stopped first."""
+LEVEL_PIXELS = 1 << 20
+"""Of a frame, evenly spread, for its histogram; saturated ones are counted in all."""
+SHIFT_PX = 1024
+LEAST_LIKENESS = 0.3
+"""Of a frame and the reference, below which their shift is not shown."""
+SEEK_S = 10.0
+"""Between two searches for a mask that is not seen while nothing changes: each takes seconds."""
+AWAY_UM = 5.0
+"""From where an axis centres the mask or opens the aperture, it is not there."""
+AT_SHOT_UM = 2.0
+"""From where a shot has the mask, it still stands there."""
+WANTED_LEVEL, LEVELS = 0.8, (0.7, 0.9)
+EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A frame with its number and figures."""
+    """A frame with its number, and when it came (monotonic clock)."""
 
     number: int
     frame: RawFrame
-    figures: Mapping[str, Any]
+    at_s: float
 
 
 class Watch:
@@ -47,7 +69,8 @@ class Watch:
 
     stage: None where there is none. look: changes what a simulated bench shows, None otherwise;
     targets: what it takes. centre_um: where each axis centres the mask and opens the aperture.
-    Raises nothing of the devices: their errors become `state`'s "trouble".
+    design: the camera whose mask is in, for what needs to know it. light_field: reconstructs what
+    the camera sees. Raises nothing of the devices: their errors become `state`'s "trouble".
     """
 
     def __init__(
@@ -57,77 +80,113 @@ class Watch:
         look: Callable[[str], None] | None = None,
         targets: tuple[str, ...] = (),
         centre_um: Mapping[str, float] | None = None,
+        design: Design | None = None,
+        light_field: LiveLightField | None = None,
     ) -> None:
-        self._camera, self._stage = camera, stage
-        self._look, self.targets = look, targets
+        self._camera, self._look, self.targets = camera, look, targets
         self._centre_um = dict(centre_um or {})
+        self._design = design
+        self.light_field = light_field
         self._news = threading.Condition()
+        self._listeners: list[Callable[[], None]] = []
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
-        self._settings = self._read_settings()
-        self._axes: dict[str, dict[str, Any]] = {}
-        self._busy = ""
-        self._trouble = {"camera": "", "setting": "", "stage": ""}
-        self._version = 0
+        self._focus = FocusMeter()
+        self._exposing = 0
+        self._seek_at_s = 0.0
+        self._gauge: MaskGauge | None = None
+        self._drawn, self._latency_s = 0, 0.0
+        self._state: dict[str, Any] = {
+            "version": 0,
+            "frame": 0,
+            "figures": None,
+            "mask": None,
+            "settings": self._read_settings(),
+            "axes": {},
+            "busy": "",
+            "stopped": False,
+            "trouble": {"camera": "", "setting": "", "stage": "", "light field": ""},
+            "reference": False,
+            "targets": list(targets),
+            "centre_um": self._centre_um,
+            "light_field": None,
+            "hint": None,
+        }
         self._asked_s = time.monotonic()
         self._ending = threading.Event()
         self._wishes: Queue[Callable[[], object]] = Queue()
-        self._moves: Queue[tuple[str, Callable[[Stage], object]]] = Queue()
-        self._threads = [threading.Thread(target=self._watch, name="live camera", daemon=True)]
-        if stage is not None:
-            self._threads.append(
-                threading.Thread(target=self._drive, args=(stage,), name="live stage", daemon=True)
-            )
+        self._driving = None if stage is None else Driving(stage, self._publish)
+        threads = {"live camera": self._take, "live levels": self._each(self._show_levels)}
+        if design is not None:
+            threads["live mask"] = self._each(self._show_mask)
+        if light_field is not None:
+            threads["live light field"] = self._each(self._show_light_field)
+        self._threads = [
+            threading.Thread(target=call, name=name, daemon=True) for name, call in threads.items()
+        ]
 
     def start(self) -> None:
         """Begin to take frames."""
         for thread in self._threads:
             thread.start()
+        if self._driving is not None:
+            self._driving.start()
 
     def close(self) -> None:
-        """Stop the stage, and end both threads; the devices stay open."""
+        """Stop the stage, and end the threads; the devices stay open."""
         self._ending.set()
-        self.stop()
+        with self._news:
+            self._news.notify_all()
+        if self._driving is not None:
+            self._driving.close()
+        if self.light_field is not None:
+            self.light_field.close()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(PATIENCE_S)
+        self._publish()
+
+    def newest(self) -> Shown | None:
+        """Return the newest frame and its number; None before the first."""
         with self._news:
-            self._news.notify_all()
+            self._asked_s = time.monotonic()
+            return self._shown
 
     def frame(self) -> RawFrame | None:
         """Return the newest frame; None before the first."""
-        with self._news:
-            self._asked_s = time.monotonic()
-            return self._shown.frame if self._shown is not None else None
+        newest = self.newest()
+        return None if newest is None else newest.frame
 
     def state(self, after: int = 0, patience_s: float = 0.0) -> dict[str, Any]:
         """Return what is known, when it is newer than version `after` or patience ends."""
         with self._news:
             self._asked_s = time.monotonic()
             self._news.wait_for(
-                lambda: self._version > after or self._ending.is_set(), timeout=patience_s
+                lambda: self._state["version"] > after or self._ending.is_set(), patience_s
             )
-            shown = self._shown
-            return {
-                "version": self._version,
-                "frame": shown.number if shown is not None else 0,
-                "figures": shown.figures if shown is not None else None,
-                "settings": self._settings,
-                "axes": self._axes,
-                "busy": self._busy,
-                "trouble": dict(self._trouble),
-                "reference": self._reference is not None,
-                "targets": list(self.targets),
-                "centre_um": self._centre_um,
-            }
+            return {**self._state, "trouble": dict(self._state["trouble"])}
+
+    @property
+    def version(self) -> int:
+        """Grows with every change of the state."""
+        return self._state["version"]
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Let `listener` be called after every change, by whichever thread made it."""
+        self._listeners.append(listener)
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Let the frames that follow be exposed for so long."""
+        self._exposing = 0
         self._wishes.put(lambda: self._camera.set_exposure_s(exposure_s))
 
     def set_gain(self, gain: float) -> None:
         """Let the frames that follow have this gain."""
         self._wishes.put(lambda: self._camera.set_gain(gain))
+
+    def auto_expose(self) -> None:
+        """Let exposures follow until the brightest thousandth lies at WANTED_LEVEL of white."""
+        self._exposing = EXPOSURE_TRIES
 
     def look_at(self, target: str) -> None:
         """Let a simulated bench show the scene or the whiteboard; raises AppError."""
@@ -135,12 +194,17 @@ class Watch:
             raise AppError(f"cannot look at {target!r} here")
         look = self._look
         self._wishes.put(lambda: look(target))
+        self._start_anew()
+
+    def forget_focus(self) -> None:
+        """Compare the sharpness with nothing seen so far."""
+        self._focus.forget()
 
     def take_reference(self, taken: bool = True) -> None:
         """Measure shifts from the present frame on; or no more."""
         with self._news:
             self._reference = self._shown.frame if taken and self._shown is not None else None
-        self._tell()
+        self._publish(reference=self._reference is not None)
 
     def home(self, axes: list[str] | None = None) -> None:
         """Home axes, all by default; raises AppError as `jog`."""
@@ -166,42 +230,75 @@ class Watch:
         if not self._centre_um:
             raise AppError("it is not known where the masks are centred: name zero_um in the rig")
 
-        def call(stage: Stage) -> None:
+        def home(stage: Stage) -> None:
             unknown = [axis for axis in self._centre_um if not stage.is_homed(axis)]
             if unknown:
                 stage.home(unknown)
-            stage.move_to_um(self._centre_um)
 
-        self._move("centring", call)
+        self._move("centring", home, lambda stage: stage.move_to_um(self._centre_um))
 
     def stop(self) -> None:
         """Stop all axes now, in the middle of a move too."""
-        if self._stage is None:
-            return
-        try:
-            self._stage.stop()
-        except DriverError as fault:
-            self._tell(stage=str(fault))
+        if self._driving is not None:
+            self._driving.stop()
 
     def _require_axis(self, axis: str) -> None:
-        if self._stage is not None and axis not in self._stage.axes:
-            raise AppError(f"no axis {axis!r}: the stage has {', '.join(self._stage.axes)}")
+        if self._driving is not None and axis not in self._driving.stage.axes:
+            names = ", ".join(self._driving.stage.axes)
+            raise AppError(f"no axis {axis!r}: the stage has {names}")
 
-    def _move(self, what: str, call: Callable[[Stage], object]) -> None:
-        if self._stage is None:
+    def _move(self, what: str, *steps: Callable[[Stage], object]) -> None:
+        if self._driving is None:
             raise AppError("no stage here: name one with --stage or --rig")
-        with self._news:
-            if self._busy:
-                raise AppError(f"the stage is busy ({self._busy}): wait, or stop it")
-            self._busy = what
-        self._moves.put((what, call))
-        self._tell()
+        self._driving.ask(what, *steps)
+        self._start_anew()
 
-    def _tell(self, **trouble: str) -> None:
+    def _start_anew(self) -> None:
+        """Something else will be seen: look for the mask again, compare with no older picture."""
+        self._focus.forget()
+        self._seek_at_s = 0.0
+
+    def _publish(self, **parts: Any) -> None:
+        """Replace parts of the state, by name, and wake who waits for it."""
         with self._news:
-            self._trouble.update(trouble)
-            self._version += 1
+            for name, value in parts.items():
+                if name in self._state["trouble"]:
+                    self._state["trouble"][name] = value
+                else:
+                    self._state[name] = value
+            self._state["hint"] = self._hint()
+            self._state["version"] += 1
             self._news.notify_all()
+        for listener in self._listeners:
+            listener()
+
+    def _hint(self) -> dict[str, str] | None:
+        """Return what to do next, in words, and the action that does it ("": a person's)."""
+        figures = self._state["figures"]
+        if figures is None:
+            return None
+        away = [
+            axis
+            for axis, place_um in self._centre_um.items()
+            if self._driving is not None
+            and abs((self._driving.position_um(axis) or np.inf) - place_um) > AWAY_UM
+        ]
+        level = max(figures["brightest"].values())
+        if figures["dark"] and away:
+            return {
+                "text": f"The picture is dark: {', '.join(away)} away from the centre.",
+                "action": "centre",
+            }
+        if figures["dark"]:
+            return {"text": "The picture is dark: light the lamp, open the aperture.", "action": ""}
+        if figures["saturated"] > 0.001:
+            return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
+        if level < LEVELS[0] / 4:
+            return {
+                "text": f"The brightest reading is {100 * level:.1f} % of white.",
+                "action": "autoexpose",
+            }
+        return None
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera
@@ -215,7 +312,7 @@ class Watch:
             "gain_limits": list(camera.gain_limits),
         }
 
-    def _watch(self) -> None:
+    def _take(self) -> None:
         stream = None
         while not self._ending.is_set():
             started_s = time.monotonic()
@@ -232,12 +329,14 @@ class Watch:
                 if stream is None and hasattr(self._camera, "stream"):
                     stream = self._camera.stream()  # pyright: ignore[reportAttributeAccessIssue]
                 frame = next(stream) if stream is not None else self._camera.snap()
-                self._show(frame)
+                with self._news:
+                    number = self._shown.number + 1 if self._shown is not None else 1
+                    self._shown = Shown(number, frame, time.monotonic())
+                self._publish(frame=number, camera="")
                 self._ending.wait(max(0.0, FASTEST_S - (time.monotonic() - started_s)))
             except (DriverError, StopIteration, ValueError) as fault:
                 stream = None
-                told = str(fault) or "the camera sends no more frames"
-                self._tell(camera=told)
+                self._publish(camera=str(fault) or "the camera sends no more frames")
                 self._ending.wait(RETRY_S)
         if stream is not None:
             with suppress(DriverError):
@@ -254,54 +353,148 @@ class Watch:
                 wish()
                 done = True
             except (ValueError, DriverError) as fault:
-                self._tell(setting=str(fault))
+                self._publish(setting=str(fault))
         if done:
-            self._settings = self._read_settings()
-            self._tell(setting="")
+            self._seek_at_s = 0.0
+            self._publish(settings=self._read_settings(), setting="")
 
-    def _show(self, frame: RawFrame) -> None:
+    def _each(self, work: Callable[[Shown], None]) -> Callable[[], None]:
+        """Return a thread's work: `work` on the newest frame, again when there is a newer one."""
+
+        def go_on() -> None:
+            newest = self._after(0)
+            while newest is not None:
+                work(newest)
+                newest = self._after(newest.number)
+
+        return go_on
+
+    def _after(self, number: int) -> Shown | None:
+        """Return the newest frame when it is a later one than `number`; None at the end."""
+        with self._news:
+            self._news.wait_for(
+                lambda: (
+                    self._ending.is_set()
+                    or (self._shown is not None and self._shown.number > number)
+                )
+            )
+            return None if self._ending.is_set() else self._shown
+
+    def _show_levels(self, newest: Shown) -> None:
+        frame = newest.frame
+        some = replace(frame, mosaic=thinned(frame.mosaic, LEVEL_PIXELS))
+        figures = frame_figures(some)
+        saturated = np.count_nonzero(frame.mosaic >= frame.white_level_dn) / frame.mosaic.size
         with self._news:
             reference = self._reference
-            number = self._shown.number + 1 if self._shown is not None else 1
-        figures = frame_figures(frame)
-        told = {
-            **asdict(figures),
-            "histogram": {name: row.tolist() for name, row in histogram(frame).items()},
-            "alignment": asdict(measure(frame, reference)),
-            "exposure_s": frame.exposure_s,
-        }
-        with self._news:
-            self._shown = Shown(number, frame, told)
-        self._tell(camera="")
+        self._publish(
+            figures={
+                "frame": newest.number,
+                "brightest": figures.brightest,
+                "saturated": float(saturated),
+                "dark": is_dark(frame),
+                "histogram": {name: row.tolist() for name, row in histogram(some).items()},
+                "focus": self._focus.add(frame, time.monotonic()),
+                "shift": _shift(frame, reference),
+                "exposure_s": frame.exposure_s,
+            }
+        )
+        if self._exposing:
+            self._expose_better(frame, max(figures.brightest.values()), float(saturated))
 
-    def _drive(self, stage: Stage) -> None:
-        self._read_axes(stage)
-        while not self._ending.is_set():
-            try:
-                _, call = self._moves.get(timeout=POLL_S)
-            except Empty:
-                continue
-            told = ""
-            try:
-                call(stage)
-            except (DriverError, ValueError) as fault:
-                told = str(fault)
-            with self._news:
-                self._busy = ""
-            self._read_axes(stage, told)
+    def _expose_better(self, frame: RawFrame, level: float, saturated: float) -> None:
+        """Choose the next exposure by a frame that was taken at the present one."""
+        settings = self._state["settings"]
+        exposure_s = settings["exposure_s"]
+        if frame.exposure_s and abs(frame.exposure_s / exposure_s - 1) > 0.05:
+            return
+        low, high = LEVELS
+        self._exposing -= 1
+        if low <= level <= high and not saturated:
+            self._exposing = 0
+            return
+        factor = 1 / LARGEST_STEP if level >= 1 else WANTED_LEVEL / max(level, 1e-6)
+        factor = min(max(factor, 1 / LARGEST_STEP), LARGEST_STEP)
+        shortest_s, longest_s = settings["exposure_limits_s"]
+        chosen_s = min(max(exposure_s * factor, shortest_s), longest_s)
+        if chosen_s == exposure_s:
+            self._exposing = 0
+            self._publish(setting=f"no better exposure within {shortest_s:g} to {longest_s:g} s")
+            return
+        self._wishes.put(lambda: self._camera.set_exposure_s(chosen_s))
 
-    def _read_axes(self, stage: Stage, told: str = "") -> None:
-        axes: dict[str, dict[str, Any]] = {}
-        for axis in stage.axes:
-            position = None
-            try:
-                limits_um = stage.limits_um(axis)
-                with suppress(NotHomedError):
-                    position = stage.position_um(axis)
-                axes[axis] = {"position_um": position, "limits_um": list(limits_um)}
-            except DriverError as fault:
-                axes[axis] = {"position_um": None, "limits_um": None}
-                told = told or str(fault)
-        with self._news:
-            self._axes = axes
-        self._tell(stage=told)
+    def _show_mask(self, newest: Shown) -> None:
+        assert self._design is not None
+        if time.monotonic() < self._seek_at_s or (
+            self._driving is not None and self._driving.moves
+        ):
+            self._ending.wait(POLL_S)
+            return
+        if is_dark(newest.frame):
+            self._publish(mask={"place": None, "why": "the picture is dark"})
+            return
+        try:
+            if self._gauge is None:
+                self._gauge = MaskGauge(self._design, newest.frame.mosaic.shape)
+            place = self._gauge.measure(newest.frame, self._mask_stands_um())
+            mask = {"place": asdict(place), "why": ""}
+        except (CalibrationError, CameraError) as fault:
+            mask = {"place": None, "why": str(fault)}
+            self._seek_at_s = time.monotonic() + SEEK_S
+        self._publish(mask=mask)
+
+    def _mask_stands_um(self) -> tuple[float, float]:
+        """Return where the mask stage stands from its centre, x and y; 0 where it is not known."""
+        assert self._design is not None
+        if self._driving is None or not self._design.moving_masks:
+            return 0.0, 0.0
+        x_um, y_um = (
+            (self._driving.position_um(axis) or self._centre_um.get(axis, 0.0))
+            - self._centre_um.get(axis, 0.0)
+            for axis in ("mask_x", "mask_y")
+        )
+        return x_um, y_um
+
+    def _show_light_field(self, newest: Shown) -> None:
+        assert self.light_field is not None
+        if self._driving is not None and self._driving.moves:
+            self._ending.wait(POLL_S)
+            return
+        try:
+            shown = self.light_field.update(newest.frame, self._shot())
+        except AppError as fault:
+            self._publish(**{"light field": str(fault)})
+            self._ending.wait(RETRY_S)
+            return
+        drawn = (shown["pictures"] or {}).get("number", 0)
+        if drawn != self._drawn:
+            self._drawn, self._latency_s = drawn, time.monotonic() - newest.at_s
+        self._publish(
+            light_field={"frame": newest.number, "latency_s": self._latency_s, **shown},
+            **{"light field": ""},
+        )
+
+    def _shot(self) -> int | None:
+        """Return the shot of the light field's Psi at which the mask stands; None: at none."""
+        assert self.light_field is not None
+        psi, design = self.light_field.psi, self._design
+        if psi.shots == 1 or design is None or not design.moving_masks:
+            return 0 if psi.shots == 1 else None
+        x_um, y_um = self._mask_stands_um()
+        (name, *_) = design.moving_masks
+        for number, shot in enumerate(design.shots[: psi.shots]):
+            there_x, there_y = shot.offset_um.get(name, (0.0, 0.0))
+            if np.hypot(x_um - there_x, y_um - there_y) < AT_SHOT_UM:
+                return number
+        return None
+
+
+def _shift(frame: RawFrame, reference: RawFrame | None) -> dict[str, float] | None:
+    """Return how a frame lies over the reference, in sensor pixels; None where they differ."""
+    if reference is None or (reference.mosaic.shape, reference.cfa) != (
+        frame.mosaic.shape,
+        frame.cfa,
+    ):
+        return None
+    shift = registered(frame, reference, SHIFT_PX)
+    return asdict(shift) if shift.likeness >= LEAST_LIKENESS else None

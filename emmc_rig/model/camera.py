@@ -491,15 +491,19 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     return PsiLayout(shape, colour, k, camera.model_dump_json())
 
 
-def build_imaging_matrix(camera: Camera, size: tuple[int, int]) -> ImagingMatrix:
+def build_imaging_matrix(
+    camera: Camera, size: tuple[int, int], plates: dict[str, Plate] | None = None
+) -> ImagingMatrix:
     """Return Psi of a camera for a light field of `size` (rows, columns) samples (paper, eq. 6, 7).
+
+    plates: the masks as they came out, by name; None: as drawn, see `draw_plates`.
 
     Normalised so that the fully open camera reads 1 from a constant white light field, behind its
     colour filters. Raises CameraError for a mask smaller than the beam, for pixels that do not
     divide the light field, and for a shot that no light reaches.
     """
     response = sensor_response(camera, size)
-    plates = draw_plates(camera, size)
+    plates = draw_plates(camera, size) if plates is None else plates
     colours_seen = response.sum(axis=-1)
     single = bool((colours_seen <= 1).all())
     shots, views = len(camera.shots), camera.views

@@ -93,7 +93,7 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
             f"{', '.join(missing[:6])}{rest}"
         )
     with ThreadPoolExecutor() as pool:
-        views = list(pool.map(_read_picture, (paths[r, c] for r in rows for c in columns)))
+        views = list(pool.map(read_picture, (paths[r, c] for r in rows for c in columns)))
     for path, view in zip((paths[r, c] for r in rows for c in columns), views, strict=True):
         if view.shape != views[0].shape:
             raise SceneError(
@@ -409,7 +409,7 @@ def export_pictures(
     }
 
 
-def _read_picture(path: Path) -> np.ndarray:
+def read_picture(path: Path) -> np.ndarray:
     """One PNG file as float32 (y, x, 3) in [0, 1]."""
     content = path.read_bytes()
     if not content.startswith(_PNG_START):

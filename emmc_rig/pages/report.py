@@ -29,6 +29,7 @@ from emmc_rig.pages.display import (
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import Card, data_address, fragment
 from emmc_rig.pages.psi_panels import psi_panels
+from emmc_rig.pages.viewer import ViewerContent, viewer_data
 
 Array = NDArray[np.floating]
 ERROR_JPEG_QUALITY = 72  # an error map is mostly noise, and noise is what costs bytes
@@ -41,7 +42,8 @@ class ReportContent:
     Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x);
     psi and psi_std (v, u, y, x), the weights of shot 0; cfa_tile (y, x, rgb), the colour each
     pixel of the tile lets through. Under a sensor that bins, frames are smaller than views.
-    disparity_range_px is in pixels per view step; None where it is not known.
+    disparity_range_px is in pixels per view step; None where it is not known. maps: what is laid
+    over the picture in the viewer, by name, see `ViewerContent`.
     """
 
     title: str
@@ -63,6 +65,7 @@ class ReportContent:
     disparity_range_px: tuple[float, float] | None = None
     warnings: Sequence[str] = ()
     command: str = ""
+    maps: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self):
         _expect_axes("estimate", self.estimate, "v u y x c")
@@ -103,9 +106,10 @@ def render(content: ReportContent) -> str:
         content=content,
         caveats=(),
         lead="",
-        styles=(),
+        styles=("viewer.css",),
         heat=HEAT,
         warnings=_warnings(content),
+        verdict=_verdict_head(content),
         cards=_cards(content),
         capture={
             "shots": frames.shape[0],
@@ -126,8 +130,24 @@ def render(content: ReportContent) -> str:
         timings=_timings(content.stage_s),
         figures=_figures(content.metrics),
         provenance=_provenance(content),
-        data={"data": _page_data(content, shown, curve, errors)},
-        scripts=("report.js",),
+        data={
+            "data": _page_data(content, shown, curve, errors),
+            "viewer-data": viewer_data(_viewer_content(content), atlases=False),
+        },
+        scripts=("report.js", "viewer.js"),
+    )
+
+
+def _viewer_content(content: ReportContent) -> ViewerContent:
+    maps = content.maps
+    return ViewerContent(
+        content.title,
+        content.estimate,
+        truth=content.truth,
+        disparity=maps.get("disparity"),
+        sigma=maps.get("sigma"),
+        model=maps.get("model"),
+        misfit=maps.get("misfit"),
     )
 
 
@@ -259,7 +279,7 @@ FIGURES = {
         "Mean standard deviation of Psi", ".2e", "", "of one coefficient, as calibration states it"
     ),
     "noise_sigma": Figure(
-        "Noise of the readings", ".2e", "", "standard deviation given to the reconstruction"
+        "Noise of the readings", ".2e", "", "standard deviation that the reconstruction was told"
     ),
     "saturated_share": Figure("Saturated readings", ".2%", "", "share left out as clipped"),
     "whiteboard_frames": Figure("Whiteboard frames", "", "", "exposures taken to measure Psi"),
@@ -344,7 +364,6 @@ def _cards(content: ReportContent) -> list[Card]:
             f"{total_s:.1f} s" if stages else "not measured",
             "" if longest is None else f"of which {longest} {stages[longest]:.1f} s",
         ),
-        _verdict_card(metrics.get("verdict")),
         Card(
             "Solver",
             status,
@@ -354,16 +373,27 @@ def _cards(content: ReportContent) -> list[Card]:
     ]
 
 
-def _verdict_card(verdict: object) -> Card:
-    """Return whether to trust the light field, with the gravest reason."""
+class VerdictHead(NamedTuple):
+    """The first thing on the page. next: remedies; tone: see `Card`."""
+
+    level: str
+    why: str
+    next: list[str]
+    tone: str
+
+
+def _verdict_head(content: ReportContent) -> VerdictHead | None:
+    """Return whether to trust the light field and what to do next; None where nobody judged."""
+    verdict = content.metrics.get("verdict")
     if not isinstance(verdict, dict):
-        return Card("Verdict", "not judged", "")
-    reasons = [f"{reason['what']}; {reason['remedy']}" for reason in verdict["reasons"]]
-    level = verdict["level"]
-    return Card(
-        "Verdict",
+        return None
+    level, reasons = verdict["level"], verdict["reasons"]
+    why = [reason["what"] for reason in reasons]
+    advice = str(content.metrics.get("advice") or "")
+    return VerdictHead(
         level,
-        reasons[0] if reasons else "frames, Psi and light field agree",
+        "; ".join(why) or "nothing in frames, Psi and light field speaks against it",
+        [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
         {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
 

@@ -15,7 +15,7 @@ import cv2
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.results import shown_bytes, write_metrics
+from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import preview, thinned
 from emmc_rig.pages.page import (
@@ -246,6 +246,10 @@ def _event_text(entry: Entry) -> str:
         return f"{entry['wall']}: {entry['reason']}"
     if kind == "until":
         return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
+    if kind == "paused":
+        return f"{entry['wall']}: {entry['reason']}"
+    if kind == "resumed":
+        return f"{entry['wall']}: after {shown_seconds(entry['seconds'])}"
     if kind == "decided":
         return decided_words(entry)
     if kind == "metered":

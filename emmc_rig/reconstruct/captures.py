@@ -13,7 +13,7 @@ import numpy as np
 from numba import get_num_threads
 
 from emmc_rig.errors import ERRORS, AppError, StoppedError, WrongUsageError
-from emmc_rig.files.folders import is_session, result_folder
+from emmc_rig.files.folders import KEPT, is_session, result_folder
 from emmc_rig.files.frames import PSI
 from emmc_rig.reconstruct.pool import Pool, opened_pool
 from emmc_rig.reconstruct.solve import reconstruct_folder
@@ -49,6 +49,7 @@ class Request:
     truth: str | None = None
     chosen: str | None = None
     tile: int | None = None
+    as_zarr: bool = False
 
 
 def parse_memory(text: str) -> int:
@@ -103,8 +104,11 @@ def _one(request: Request, pool: Pool | None, on_step: Callable[[Progress], None
             return reconstruct_folder(
                 request.folder, folder, request.method, request.psi, request.dictionary,
                 request.settings, request.truth, on_step, request.chosen, pool, request.tile,
+                request.as_zarr,
             )  # fmt: skip
         except KeyboardInterrupt as stop:
+            if not (folder.parent / KEPT).is_dir():
+                raise
             raise StoppedError(
                 f"stopped by Ctrl-C; blocks that are done are kept in {request.out}, and the same "
                 "command goes on"

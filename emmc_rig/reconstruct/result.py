@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emmc_rig.files.exports import LIGHT_FIELD, save_maps
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
@@ -27,13 +25,13 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.pages.viewer import ViewerContent, render_viewer
 from reconstruction.result import Reconstruction
+from reconstruction.verdict.missed import missed_readings
 from reconstruction.verdict.rules import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 
 
 def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
@@ -94,9 +92,24 @@ class Result:
         return self.maps.get("sigma")
 
     @property
+    def stated_db(self) -> float | None:
+        """The PSNR that `sigma` stands for, dB; None where the method has none."""
+        if self.sigma is None:
+            return None
+        return float(-10 * np.log10(np.mean(np.square(self.sigma, dtype=np.float64))))
+
+    @property
     def disparity(self) -> NDArray[np.floating] | None:
         """Disparity (y, x) of the centre view, pixels per view step; None without an estimate."""
         return self.maps.get("disparity")
+
+    @cached_property
+    def misfit(self) -> NDArray[np.float32]:
+        """How far readings are missed around each place (y, x), in deviations: about 1 is right."""
+        given = self.frames
+        return missed_readings(
+            self.psi, self.light_field, given.readings, given.noise_sigma, given.usable
+        )
 
     @property
     def method(self) -> str:
@@ -130,6 +143,7 @@ class Result:
         """Return the figures of the reconstruction, as metrics.json has them."""
         return {
             **figures(self.solved, self.verdict, self.frames),
+            "stated_db": self.stated_db,
             "shots": self.psi.shots,
             "size": list(self.psi.size),
             "psi_sha256": self.psi.checksum(),
@@ -148,10 +162,7 @@ class Result:
         """Write light_field.h5, pictures/, maps.h5 and metrics.json into an existing folder."""
         save_hdf5(folder / LIGHT_FIELD, self.light_field, {"method": self.method})
         export_pictures(folder / "pictures", self.light_field, focus_disparities(self.light_field))
-        if self.maps:
-            with h5py.File(folder / MAPS, "w") as file:
-                for name, values in self.maps.items():
-                    file.create_dataset(name, data=values, compression="lzf")
+        save_maps(folder, {**self.maps, "misfit": self.misfit})
         write_metrics(folder, metrics)
 
     def show(self) -> Figure:
@@ -176,20 +187,26 @@ class Result:
             f"{self.seconds:.1f} s, verdict: {level})"
         )
 
+    def viewer(self, truth: ArrayLike | None = None) -> str:
+        """Return a page to turn, focus and look into: one HTML file that opens offline.
+
+        truth: the true light field, to wipe against.
+        """
+        return render_viewer(
+            ViewerContent(
+                self.method, self.light_field, self.verdict.words,
+                None if truth is None else np.asarray(truth),
+                self.disparity, self.sigma, self.maps.get("model"), self.misfit,
+            )
+        )  # fmt: skip
+
     @cached_property
-    def _picture(self) -> str:
-        from matplotlib.figure import Figure
-
-        from emmc_rig.pages.result_figure import draw_result
-
-        figure, png = Figure(layout="constrained"), io.BytesIO()
-        draw_result(figure, self.light_field, self.disparity, self.sigma)
-        figure.savefig(png, format="png", dpi=100)
-        return base64.b64encode(png.getvalue()).decode("ascii")
+    def _embedded(self) -> str:
+        return html.escape(self.viewer())
 
     def _repr_html_(self) -> str:
         return (
-            f'<figure><img alt="centre view, epipolar image and maps" '
-            f'src="data:image/png;base64,{self._picture}"><figcaption>{html.escape(repr(self))}'
-            f"<br>{html.escape(self.verdict.words)}</figcaption></figure>"
+            f'<figure><iframe title="viewer of the light field" srcdoc="{self._embedded}" '
+            f'style="width:100%;height:640px;border:0" allow="fullscreen"></iframe><figcaption>'
+            f"{html.escape(repr(self))}<br>{html.escape(self.verdict.words)}</figcaption></figure>"
         )

@@ -15,16 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import is_session, kept_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
+from emmc_rig.files.shards import opened_array
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.pool import Pool, opened_pool
-from emmc_rig.reconstruct.result import LIGHT_FIELD, MAPS, Result, compared, figures
+from emmc_rig.reconstruct.result import Result, compared, figures
 from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
 from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
@@ -34,6 +36,8 @@ from reconstruction.tiles import SavedPsi, check_frames, reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
+RESULT_GROUP = "result.zarr"
+"""Light field and maps, where they are written as Zarr."""
 
 
 def reconstruct(
@@ -148,6 +152,7 @@ def reconstruct_folder(
     chosen: str | None = None,
     pool: Pool | None = None,
     tile: int | None = None,
+    as_zarr: bool = False,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
@@ -155,7 +160,8 @@ def reconstruct_folder(
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    tile: see `run_capture`.
+    tile: see `run_capture`. as_zarr: write light field and maps as one Zarr group, by the pool, and
+    no pictures.
     """
     find_method(method)
     settings = settings or MethodSettings()
@@ -163,7 +169,7 @@ def reconstruct_folder(
     session = Session(folder) if is_session(folder) else None
     saved = SavedPsi(psi_path)
     one_block = is_one_block(saved.size, settings)
-    if one_block and pool is None:
+    if one_block and pool is None and not as_zarr:
         psi = ImagingMatrix.load(psi_path)
         result = reconstruct(
             psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
@@ -187,18 +193,16 @@ def reconstruct_folder(
 
     with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
         blocks = run_capture(capture, frames, workers, tile, on_block)
+        if as_zarr:
+            blocks.write_shards(out / RESULT_GROUP, workers)
     result, verdict = blocks.result(), blocks.verdict(saved.binning)
-    if one_block:
+    if one_block and not as_zarr:
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
-        small = Result(
-            replace(result, light_field=light_field, maps=arrays),
-            verdict,
-            ImagingMatrix.load(psi_path),
-            frames,
-        )
+        whole = replace(result, light_field=light_field, maps=arrays)
+        small = Result(whole, verdict, ImagingMatrix.load(psi_path), frames)
         if session is not None:
             small = with_exposure(small, session)
         metrics = {**small.metrics(), "chosen": chosen, **blocks.metrics()}
@@ -207,21 +211,25 @@ def reconstruct_folder(
         return metrics
     if session is not None:
         verdict = verdict_with_exposure(verdict, session)
-    with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
-        file.attrs["method"] = method
-        for name, (shape, dtype) in blocks.shapes().items():
-            home = file if name == "light_field" else maps
-            blocks.write(name, home.create_dataset(name, shape, dtype))
-        metrics = {
-            **figures(result, verdict, frames),
-            "shots": saved.shape[0],
-            "size": list(saved.size),
-            "psi_sha256": saved.checksum,
-            "dictionary": dictionary_spec,
-            "chosen": chosen,
-            **blocks.metrics(),
-            **_compared(file["light_field"], truth, saved),
-        }
+    metrics = {
+        **figures(result, verdict, frames),
+        "shots": saved.shape[0],
+        "size": list(saved.size),
+        "psi_sha256": saved.checksum,
+        "dictionary": dictionary_spec,
+        "chosen": chosen,
+        **blocks.metrics(),
+    }
+    if as_zarr:
+        light_field = opened_array(out / RESULT_GROUP, "light_field")
+        metrics |= _compared(light_field, truth, saved)
+    else:
+        with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
+            file.attrs["method"] = method
+            for name, (shape, dtype) in blocks.shapes().items():
+                home = file if name == "light_field" else maps
+                blocks.write(name, home.create_dataset(name, shape, dtype))
+            metrics |= _compared(file["light_field"], truth, saved)
     write_metrics(out, metrics)
     return metrics
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
@@ -40,6 +41,7 @@ from reconstruction.tiles import (
     AXES,
     Block,
     Grid,
+    Place,
     SavedPsi,
     SolvedBlock,
     Survey,
@@ -333,13 +335,50 @@ class Blocks:
         """Write an array of the whole into an array or dataset, blocks in a fixed order."""
         axes = AXES.get(name, 0)
         for block in self.grid:
-            out[(slice(None),) * axes + block.inner] = assembled(
-                self.grid, block, name, axes, self._part
+            out[(slice(None),) * axes + block.inner] = _assembled(
+                self.grid, self.kept, name, out.dtype, block.inner
             )
 
-    def _part(self, block: Block, name: str, at: tuple) -> NDArray:
-        with stored_arrays(self.tasks[block.name].path("h5"), AppError, AGAIN) as stored:
+    @property
+    def kept(self) -> Path:
+        """The folder that the blocks lie in."""
+        return next(iter(self.tasks.values())).capture.kept
+
+    def write_shards(self, folder: Path, pool: Pool) -> None:
+        """Write all arrays into a Zarr group by the workers of a pool, a shard each."""
+        tasks = []
+        group = created_group(folder)
+        for name, (shape, dtype) in self.shapes().items():
+            places = create_array(group, name, shape, dtype, AXES.get(name, 0))
+            tasks += [ShardTask(self.grid, self.kept, folder.absolute(), name, at) for at in places]
+        for _ in pool.run(shard_task, tasks):
+            pass
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """A shard of an array of a Zarr group, of blocks that are all done."""
+
+    grid: Grid
+    kept: Path
+    folder: Path
+    name: str
+    place: Place
+
+
+def shard_task(task: ShardTask) -> None:
+    """Write a shard in a worker."""
+    array = opened_array(task.folder, task.name, "r+")
+    values = _assembled(task.grid, task.kept, task.name, array.dtype, task.place)
+    array[(slice(None),) * AXES.get(task.name, 0) + task.place] = values
+
+
+def _assembled(grid: Grid, kept: Path, name: str, dtype: np.dtype, place: Place) -> NDArray:
+    def part(block: Block, at: tuple) -> NDArray:
+        with stored_arrays(kept / f"{block.name}.h5", AppError, AGAIN) as stored:
             return stored.dataset(name)[at]
+
+    return assembled(grid, place, AXES.get(name, 0), dtype, part)
 
 
 def run_capture(

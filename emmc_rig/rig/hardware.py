@@ -59,7 +59,7 @@ from emmc_rig.rig.stage_config import (
 )
 from emmc_rig.rig.trigger import SimulatedTrigger, Trigger
 from simulators.apt import AptController
-from simulators.bench import RAYS_PER_VIEW, Bench
+from simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
 from simulators.clock import ManualClock
 from simulators.effects import Flaws
 from simulators.firmware import SimulatedController
@@ -120,7 +120,8 @@ class Rig:
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
     about_to_expose: called with a frame's name before its exposure. trigger: the line by which
-    the stage's arrival begins an exposure; None: the program waits and asks.
+    the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
+    of that square window, to put its edges between views; None: not known.
     """
 
     stage: Stage
@@ -132,6 +133,7 @@ class Rig:
     reopen_camera: Callable[[], CameraDevice] | None = None
     about_to_expose: Callable[[str], None] = _unheard
     trigger: Trigger | None = None
+    window_side_um: float | None = None
 
 
 @dataclass(frozen=True)
@@ -266,6 +268,7 @@ def simulated_rig(
         opened,
         announced,
         trigger,
+        window_side_um(camera.views, camera.lens.aperture_cell_um),
         chain=chain,
         still=simulator,
     )

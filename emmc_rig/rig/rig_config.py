@@ -1,4 +1,4 @@
-"""The configuration of a rig: a simulated one, or real devices from a YAML file."""
+"""Which rig is meant: a simulated one before a scene, or real devices named in a YAML file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ class RealRig(Settings):
     stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
     far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
     the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
-    plate's open window. by_hand: a person is asked for what no axis moves: lamp, board, masks; if
+    plate's open window; window_side_um: its side, for plans that open parts of the aperture.
+    by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
     not, nothing of that changes, as in a recording that is replayed. trigger: the wire by which
     the stage's arrival begins an exposure, where there is one.
     """
@@ -40,6 +41,7 @@ class RealRig(Settings):
     camera: str
     zero_um: dict[str, float] = Field(default_factory=dict)
     window_um: float = 0.0
+    window_side_um: float | None = Field(default=None, gt=0)
     by_hand: bool = True
     trigger: Trigger | None = None
 
@@ -199,7 +201,7 @@ def rig(
 def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iterator[Rig]:
     """Yield the rig that a description names, its devices open; camera: as planned.
 
-    ask: shows a person what to do and returns when it is done. Raises AppError or what opening a
+    ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
     device raises.
     """
     settings = {key: value for key, value in description.items() if key != "kind"}
@@ -241,4 +243,5 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),
             trigger=real.trigger,
+            window_side_um=real.window_side_um,
         )

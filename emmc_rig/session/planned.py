@@ -53,7 +53,8 @@ class PlannedFrame:
     times as long as that frame asks for, a whiteboard because so much less light comes to the
     sensor. view: (v, u) of a whiteboard's pinhole. Frames of one shot that differ in exposure
     alone are its bracket; `repeat` counts equal ones. part: frames of one come before those of
-    the next, in whatever order else.
+    the next, in whatever order else. window: by how many aperture cells the plate's window is
+    moved, x and y.
     """
 
     id: str
@@ -66,6 +67,7 @@ class PlannedFrame:
     metered_by: str | None = None
     light: float = 1.0
     part: int = 0
+    window: tuple[int, int] = (0, 0)
 
     @property
     def is_metered_shot(self) -> bool:
@@ -97,6 +99,7 @@ class PlannedFrame:
             "metered_by": self.metered_by,
             "light": self.light,
             "part": self.part,
+            "window": list(self.window),
         }
 
     @classmethod
@@ -113,6 +116,7 @@ class PlannedFrame:
             data.get("board_turn_deg", 0.0),
         )
         view = data["view"]
+        window_x, window_y = data.get("window", (0, 0))
         return cls(
             data["id"],
             data["kind"],
@@ -124,4 +128,5 @@ class PlannedFrame:
             data["metered_by"],
             data["light"],
             data.get("part", 0),
+            (window_x, window_y),
         )

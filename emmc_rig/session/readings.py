@@ -130,7 +130,8 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
             turned[bench.board_turn_deg][bench.masks_in] = mean
             continue
         stage_um = bench.offsets_um.get("mask_x", 0.0), bench.offsets_um.get("mask_y", 0.0)
-        found[kind].append(BoardFrame(mean, stage_um, bench.shot, frames[0].view, bench.lamp))
+        view, window = frames[0].view, frames[0].window
+        found[kind].append(BoardFrame(mean, stage_um, bench.shot, view, bench.lamp, window))
     references = {key: _mean(session, frames) for key, frames in _references(session).items()}
     # The white lamp's first: the sensor's gain is told by it.
     references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))

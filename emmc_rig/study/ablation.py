@@ -24,7 +24,8 @@ from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
 from emmc_rig.study.sweep import Results, Sweep, machine
-from reconstruction.adaptive.method import AdaptiveSettings, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
 
 WHOLE = "adaptive"
@@ -37,7 +38,6 @@ LEFT_OUT = {
     "stacking of like blocks": {"texture": {"reach": 0}},
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},
     "momentum": {"texture": {"momentum": 0.0}},
-    "second layer": {"layers": False},
     "total variation in the mean": {"free": False},
     "a second fit, of less misfit": {"misfits": (0.004,)},
     "a second fit, of more misfit": {"misfits": (0.0015,)},

@@ -17,11 +17,13 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 MOST_FALL_DB = 0.3
@@ -88,15 +90,20 @@ def cases(
     ]
 
 
-def measured_db(case: Case) -> float:
-    """Return the PSNR of the default method; raises what scene, camera and method do."""
+def captured(case: Case) -> tuple[ImagingMatrix, NDArray[np.float32], NDArray]:
+    """Return Psi, the frames (shot, pixel_y, pixel_x) and the true light field of a case."""
     camera = find_camera(case.camera)
     truth = open_scene(case.scene, size=case.size, views=camera.views, seed=SEED).light_field
     psi = build_imaging_matrix(camera, case.size)
     frames = psi.forward(truth.astype(np.float32))
     noise = np.random.default_rng(SEED).normal(0, case.noise, frames.shape)
-    found = reconstruct(DEFAULT_METHOD, psi, (frames + noise).astype(np.float32), case.noise)
-    return psnr_db(found.light_field, truth)
+    return psi, (frames + noise).astype(np.float32), truth
+
+
+def measured_db(case: Case) -> float:
+    """Return the PSNR of the default method; raises what scene, camera and method do."""
+    psi, frames, truth = captured(case)
+    return psnr_db(reconstruct(DEFAULT_METHOD, psi, frames, case.noise).light_field, truth)
 
 
 def stored_figures() -> dict[str, float]:

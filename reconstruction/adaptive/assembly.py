@@ -77,19 +77,17 @@ def _place(disparity, y, margin, size, taps, fractions):
 
 
 @njit(cache=True, nogil=True)
-def _bound(weights, hidden, y, taps, reach):
-    """Widen reach (6, x) by row y's rays: first and last taps along y and x, entries, hidden ones.
+def _bound(weights, y, taps, reach):
+    """Widen reach (5, x) by row y's rays: first and last taps along y and x, and entries.
 
     weights: (v, u, y, stored, x) of one shot.
     """
     views_v, views_u, _, stored, columns = weights.shape
-    top, bottom, left, right, entries, behind = (
-        reach[0], reach[1], reach[2], reach[3], reach[4], reach[5],
-    )  # fmt: skip
+    top, bottom, left, right, entries = reach[0], reach[1], reach[2], reach[3], reach[4]
     for v in range(views_v):
         for u in range(views_u):
             ray = v * views_u + u
-            tap_y, tap_x, layer = taps[0, ray], taps[1, ray], hidden[v, u, y]
+            tap_y, tap_x = taps[0, ray], taps[1, ray]
             for k in range(stored):
                 row = weights[v, u, y, k]
                 for x in range(columns):
@@ -99,11 +97,10 @@ def _bound(weights, hidden, y, taps, reach):
                     left[x] = min(left[x], tap_x[x] if seen else left[x])
                     right[x] = max(right[x], tap_x[x] if seen else right[x])
                     entries[x] += 1 if seen else 0
-                    behind[x] += layer[x] if seen else 0
 
 
 @njit(cache=True, nogil=True)
-def _measure(weights, disparity, hidden, margin, binning, size, first_row, last_row, boxes, counts):
+def _measure(weights, disparity, margin, binning, size, first_row, last_row, boxes, counts):
     """Set boxes (reading, 4) to first row and column, height and width, and counts to the cells.
 
     A reading whose rays are kept one by one has a height of 0.
@@ -112,21 +109,21 @@ def _measure(weights, disparity, hidden, margin, binning, size, first_row, last_
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
     taps = np.empty((binning, 2, views_v * views_u, columns), np.int32)
     fractions = np.empty((2, views_v * views_u, columns), np.float32)
-    reach = np.empty((6, columns), np.int32)
+    reach = np.empty((5, columns), np.int32)
     for pixel_y in range(first_row, last_row):
         for sub_y in range(binning):
             _place(disparity, pixel_y * binning + sub_y, margin, size, taps[sub_y], fractions)
         for s in range(shots):
-            reach[0], reach[2], reach[1], reach[3], reach[4:] = size[0], size[1], 0, 0, 0
+            reach[0], reach[2], reach[1], reach[3], reach[4] = size[0], size[1], 0, 0, 0
             for sub_y in range(binning):
-                _bound(weights[s], hidden, pixel_y * binning + sub_y, taps[sub_y], reach)
+                _bound(weights[s], pixel_y * binning + sub_y, taps[sub_y], reach)
             for pixel_x in range(pixels_x):
                 reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
                 mine = reach[:, pixel_x * binning : (pixel_x + 1) * binning]
                 entries = mine[4].sum()
                 boxes[reading] = 0
                 counts[reading] = RAY * entries
-                if entries == 0 or mine[5].sum() > 0:
+                if entries == 0:
                     continue
                 top, left = mine[0].min(), mine[2].min()
                 height = mine[1].max() - top + TAPS
@@ -142,11 +139,9 @@ def _lay(
     weights,
     colour,
     disparity,
-    hidden,
     margin,
     binning,
     size,
-    colours,
     first_row,
     last_row,
     boxes,
@@ -194,8 +189,7 @@ def _lay(
                                             cells[first + i * width + j] += share * wx[j]
                                     continue
                                 c = colour[s, y, x] if stored == 1 else k
-                                plane = hidden[v, u, y, x] * colours + c
-                                taps_of[at] = (plane * size[0] + iy) * size[1] + ix
+                                taps_of[at] = (c * size[0] + iy) * size[1] + ix
                                 cells[at + 1] = fy
                                 cells[at + 2] = fx
                                 cells[at + 3] = w
@@ -303,14 +297,14 @@ def _return(
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the readings of Psi see a texture (layer, c, y, x) of `shape`.
+    """Where the readings of Psi see a texture (c, y, x) of `shape`.
 
     boxes: (reading, 4), first row and column, height and width; height 0: rays. starts:
     (reading + 1,), where each reading's cells begin.
     """
 
     psi: ImagingMatrix
-    shape: tuple[int, int, int, int]
+    shape: tuple[int, int, int]
     boxes: NDArray[np.int32]
     starts: NDArray[np.int64]
     cells: NDArray[np.float32]
@@ -320,7 +314,7 @@ class Layout:
         return (
             psi.colour_map,
             psi.binning,
-            self.shape[2:],
+            self.shape[1:],
             psi.weights.shape[4],
             first,
             last,
@@ -330,10 +324,10 @@ class Layout:
             self.cells.view(np.int32),
         )
 
-    def read(self, textures: Array) -> Array:
-        """Return what the frames (shot, pixel_y, pixel_x) see of textures (layer, c, y, x)."""
+    def read(self, texture: Array) -> Array:
+        """Return what the frames (shot, pixel_y, pixel_x) see of a texture (c, y, x)."""
         frames = np.empty(self.psi.frames_shape, dtype=np.float32)
-        texture = np.ascontiguousarray(textures, dtype=np.float32).reshape(-1)
+        texture = np.ascontiguousarray(texture, dtype=np.float32).reshape(-1)
 
         def work(_: int, first: int, last: int) -> None:
             _read(*[*self._rows(first, last), texture, frames])
@@ -342,7 +336,7 @@ class Layout:
         return frames
 
     def returned(self, frames: Array) -> Array:
-        """Return the adjoint of `read`, (layer, c, y, x)."""
+        """Return the adjoint of `read`, (c, y, x)."""
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         rows = frames.shape[1]
         # Bands of rows reach the same texture: each adds to its own.
@@ -363,23 +357,20 @@ class Layout:
 def laid_out(
     psi: ImagingMatrix,
     disparity: Array,
-    hidden: NDArray[np.uint8],
     margin: int,
-    shape: tuple[int, int, int, int],
+    shape: tuple[int, int, int],
 ) -> Layout | None:
-    """Return where Psi sees textures (layer, c, y, x) of a shape; None where that is too much.
+    """Return where Psi sees textures (c, y, x) of a shape; None where that is too much.
 
-    disparity, hidden: (v, u, y, x).
+    disparity: (v, u, y, x).
     """
     readings = int(np.prod(psi.frames_shape))
     counts = np.zeros(readings, dtype=np.int64)
     boxes = np.zeros((readings, 4), dtype=np.int32)
-    size, colours = shape[2:], shape[1]
+    size = shape[1:]
 
     def measure(_: int, first: int, last: int) -> None:
-        _measure(
-            psi.weights, disparity, hidden, margin, psi.binning, size, first, last, boxes, counts
-        )
+        _measure(psi.weights, disparity, margin, psi.binning, size, first, last, boxes, counts)
 
     in_bands(measure, psi.frames_shape[1])
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -392,11 +383,9 @@ def laid_out(
             psi.weights,
             psi.colour_map,
             disparity,
-            hidden,
             margin,
             psi.binning,
             size,
-            colours,
             first,
             last,
             boxes,

@@ -1,9 +1,9 @@
 """Edges that views do not reach: outermost rows and columns, black or nearly so.
 
 Light fields that were rectified often end so. The edge does not move with the surfaces beside it,
-and spoils their fit. It is told by its readings: darker than those of the next lines, and more
-suddenly so than brightness changes within. How much of the scene its pixels show is then read from
-the frames, given the scene.
+and spoils their fit. Its readings show it: in every line of it they are darker than those of the
+next lines within, and at its inner end more suddenly so than brightness changes within. How much of
+the scene its pixels show is then read from the frames, given the scene.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ BESIDE = 4
 ALONG_PX = 6.0
 """Deviation of the blur along an edge."""
 DARKER = 0.15
-"""Share by which an edge is darker than what is within: 0.22 to 1 on four real light fields."""
+"""Share by which every line of an edge is darker than what is within, and the next line by less
+than half of it: 0.22 to 1, and 0.05 at most, on four real light fields."""
 SUDDEN = 3.0
 """Times more that brightness changes, in squares, at the edge than at the next lines within: at
 least 3.5 on those four."""
@@ -42,7 +43,7 @@ class DarkEdges:
     within: NDArray[np.bool_]
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """Return which edges they are, in words."""
         wide = [f"{side} {width}" for side, width in zip(SIDES, self.widths, strict=True) if width]
         return f"edges that views do not reach: {', '.join(wide)} px"
@@ -112,10 +113,14 @@ def _lines(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_], side: int) -
 def _width(lines: _Lines) -> int:
     """Return how many lines are an edge."""
     mean, square = zip(*(lines.change(line) for line in range(WIDEST + 1)), strict=True)
-    for last in range(WIDEST - 1, -1, -1):
-        if mean[last] < -DARKER and square[last] > SUDDEN * max(square[last + 1 :]):
-            return last + 1
-    return 0
+    width = 0
+    for last in range(WIDEST):
+        if mean[last] >= -DARKER:
+            break
+        ends = mean[last + 1] > -DARKER / 2
+        if ends and square[last] > SUDDEN * max(square[last + 1 :]):
+            width = last + 1
+    return width
 
 
 def dark_edges(

@@ -4,10 +4,10 @@ Within a patch the scene is a texture T on a plane at disparity d, seen by the r
 of view u as T(x - d u). T less a smooth picture is Gaussian with covariance a k(|x - x'|) in
 luminance and a b k in each chrominance, k(r) = exp((e - sqrt(r^2 + e^2)) / l): power laws like a
 natural picture's up to the optics' blur e. The patch's m readings are then Gaussian too, with
-covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evidence) judges d, the
-amplitude a and the colourfulness b alike, and pays for what a model could have explained but
+covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evidence) compares d,
+the amplitude a and the colourfulness b alike, and pays for what a model could have explained but
 did not see (Occam's factor, log det). So it does for l, which differs from leaf to wall: textures
-of several lengths are judged, and the likelihood is their mean. With one length alone a picture
+of several lengths are compared, and the likelihood is their mean. With one length alone a picture
 that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
 
 Operations of a patch: m^2 / 2 (2 + L D) S + m R S + L (D + 4 H) m^3 / 6 with R rays a pixel (25, or
@@ -34,9 +34,9 @@ PROBES = 4
 
 @dataclass(frozen=True)
 class TexturePrior:
-    """Covariances of textures: correlation length and blur in samples, and the kinds to judge.
+    """Covariances of textures: correlation length and blur in samples, and the kinds to compare.
 
-    finer_px: lengths of further textures that evidence judges, as likely as the first. kinds: (a,
+    finer_px: lengths of further textures that evidence compares, as likely as the first. kinds: (a,
     b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared brightness,
     and that of a chrominance over that of luminance. The first is next to flat.
     """
@@ -152,7 +152,7 @@ def patch_evidence(
     data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
     pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
     (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. probes: at how many of the
-    disparities the kinds of texture are judged.
+    disparities the kinds of texture are compared.
     """
     count = len(corners)
     short = -count % LANES
@@ -172,16 +172,16 @@ def patch_evidence(
     textures = [replace(prior, length_px=length) for length in lengths]
     tables = [texture.covariance(square_px) @ back for texture in textures]
     tables = np.concatenate(tables, axis=1).astype(np.float32)
-    judged = tables.shape[1]
-    tables = np.pad(tables, ((0, 0), (0, -judged % TERMS), (0, 0)))
+    evaluated = tables.shape[1]
+    tables = np.pad(tables, ((0, 0), (0, -evaluated % TERMS), (0, 0)))
     probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])
-    out = np.empty((len(filled), judged), dtype=np.float32)
+    out = np.empty((len(filled), evaluated), dtype=np.float32)
     chosen = np.zeros((len(filled), len(lengths)), dtype=np.int64)
     noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
     index = offsets.reshape(len(places), len(places)).astype(np.int64)
 
-    def judge(first: int) -> None:
+    def evaluate(first: int) -> None:
         lanes = slice(first, first + LANES)
         evidence(
             psi.weights,
@@ -205,7 +205,7 @@ def patch_evidence(
         )
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        list(pool.map(judge, range(0, len(filled), LANES)))
+        list(pool.map(evaluate, range(0, len(filled), LANES)))
     each = out[:count].reshape(count, len(lengths), -1)
     mean = np.logaddexp.reduce(each, axis=1) - np.float32(np.log(len(lengths)))
     likeliest = each.max(axis=-1).argmax(axis=1)

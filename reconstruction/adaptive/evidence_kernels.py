@@ -236,7 +236,7 @@ def evidence(
     apart. tables: (offset, hypothesis, wave), the texture's correlation, padded with zeros to a
     multiple of TERMS hypotheses. amplitudes, chromas: (kind,), variance of luminance,
     times scales (lane,), and of a chrominance over that of luminance. probes: indices of
-    the disparities at which every kind is judged; out is that of the best of them, `chosen`.
+    the disparities at which every kind is compared; out is that of the best of them, `chosen`.
     """
     stored = weights.shape[4]
     readings = places.shape[0]

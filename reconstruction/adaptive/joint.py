@@ -2,8 +2,8 @@
 
 Half-quadratic splitting with momentum: with the noise that is still presumed in the texture falling
 from step to step, remove it (`shrinkage`), then fit the frames again (`texture.fitted`). Once the
-texture is nearly known, planes are swept with it (`sweep`), and what it misses in the frames
-sharpens the disparity (`refine`).
+texture is nearly known, planes are swept with it (`sweep`), and its residual of the frames sharpens
+the disparity (`refine`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import refined
 from reconstruction.adaptive.shrinkage import denoised
-from reconstruction.adaptive.texture import background, fitted
+from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.visibility import carried
 
 Array = NDArray[np.floating]
@@ -57,8 +57,8 @@ class TextureSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Surfaces, their texture (layer, c, y, x), the same less its noise (`clean`), and the centre
-    view's disparity (y, x), without the margin that the textures have."""
+    """Surfaces, their texture (c, y, x), the same less its noise (`clean`), and the centre view's
+    disparity (y, x), without the margin that the textures have."""
 
     surfaces: Surfaces
     texture: Array
@@ -82,7 +82,6 @@ def solve(
     precision: Array,
     picture: Array,
     settings: TextureSettings,
-    layers: bool = True,
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
 ) -> Scene:
@@ -90,10 +89,9 @@ def solve(
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
-    not usable. picture: (y, x, c) to begin with, of one colour or three. layers: whether
-    hidden surfaces continue those beside them, else they look like what hides them. again: returns
-    the disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given what it
-    misses of the frames, and the margin.
+    not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
+    disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
+    the frames, and the margin.
     """
     furthest = float(np.abs(centre).max()) + settings.room_px
     half = max(psi.light_field_shape[:2]) // 2
@@ -101,21 +99,18 @@ def solve(
     around = ((margin, margin), (margin, margin))
     padded = searched = np.pad(centre, around, mode="edge")
     begun = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge")
-    reach = max(1, int(np.ceil(np.ptp(centre) * half)))
     colours = picture.shape[-1]
     surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
-    now = np.stack([begun, begun]).astype(np.float32)
+    now = begun.astype(np.float32)
     before, clean = now, now
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
     for step, sigma in enumerate(sigmas):
         if step:
             ahead = now + np.float32(settings.momentum) * (now - before)
-            guide = clean[0] if step > 1 else ahead[0]
-            clean = ahead
-            clean[0] = denoised(
-                ahead[0],
-                guide,
+            clean = denoised(
+                ahead,
+                clean if step > 1 else ahead,
                 float(sigma),
                 settings.block_step,
                 step,
@@ -123,20 +118,17 @@ def solve(
                 settings.chroma,
                 settings.reach,
             )
-            if not layers:
-                clean[1] = clean[0]
-            elif surfaces.hidden.any():
-                clean[1] = background(clean[0], padded, nearer, reach)
         if again is not None and step in settings.sweeps:
-            found = again(clean[0], frames - surfaces.forward(clean), margin)
-            padded = searched = np.pad(found, around, mode="edge")
-            reach = max(1, int(np.ceil(np.ptp(found) * half)))
+            searched = np.pad(
+                again(clean, frames - surfaces.forward(clean), margin), around, "edge"
+            )
+            padded = searched
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
         if step >= max(2, settings.steps - settings.refine_steps):
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
-            missed = frames - surfaces.forward(now)
+            residual = frames - surfaces.forward(now)
             padded = refined(
-                surfaces, padded, now[0], missed, doubted.astype(np.float32), settings.slope_px
+                surfaces, padded, now, residual, doubted.astype(np.float32), settings.slope_px
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)

@@ -1,9 +1,9 @@
 """The mean of several light fields, each weighted by how well it predicts readings kept from all.
 
 No one model holds everywhere: surfaces fail at glass, gloss, and occlusions finer than the pixels,
-and how closely a texture should follow the readings depends on how wrong its disparity is. Model k
-misses the held-out readings y near a place by the mean square E_k = mean((y - Psi L_k)^2 - noise).
-The mean of the models, weighted by w_k ~ E_k^-2, is returned:
+and how closely a texture should follow the readings depends on how wrong its disparity is. The mean
+square residual of held-out readings y near a place, E_k = mean((y - Psi L_k)^2 - noise), tells how
+good model k is there. The mean of the models, weighted by w_k ~ E_k^-2, is returned:
 
     L = sum_k w_k L_k,    sum_k w_k = 1.
 
@@ -11,14 +11,12 @@ For two models with independent errors E_k^-1 is the mean of least error; their 
 where both are good, and then the better one deserves more. E_k is a mean over few readings, so it
 is drawn towards that of the whole picture (empirical Bayes), and noise's own chance is its floor.
 
-Were the models' errors the same, the mean's would be sum_k w_k E_k^(1/2) squared; what the mean
-misses of the held-out readings tells how much less it is (`deviation`).
+How far the models differ from their mean, place by place, says where it is in doubt (`spread`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -34,30 +32,17 @@ PRIOR_READINGS = 4.0
 """Readings that the whole picture's mean square counts for at every place."""
 
 
-LEAST_RATIO = 0.25
-"""Of the mean's squared error to that of models that err alike: with four of independent errors."""
+def shares_of(
+    residuals: Sequence[Array], noise: Array, held: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return the weight of every model at every pixel, (model, pixel_y, pixel_x); their sum is 1.
 
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """shares: (model, pixel_y, pixel_x), their sum is 1. excess: likewise, E_k. noise, held: as
-    given to `weighted`."""
-
-    shares: NDArray[np.float32]
-    excess: NDArray[np.float64]
-    noise: Array
-    held: NDArray[np.bool_]
-
-
-def weighted(missed: Sequence[Array], noise: Array, held: NDArray[np.bool_]) -> Weights:
-    """Return the weight of every model at every pixel.
-
-    missed: what each misses of the frames; noise: their variance; held: the readings kept from
-    every fit, at least one, all (shot, pixel_y, pixel_x).
+    residuals: the frames less what each model predicts; noise: variance of the readings; held:
+    those kept from every fit, at least one, all (shot, pixel_y, pixel_x).
     """
     readings = _around(held.astype(np.float64)) + PRIOR_READINGS
     excess = []
-    for residual in missed:
+    for residual in residuals:
         square = np.where(held, np.square(residual, dtype=np.float64) - noise, 0)
         whole = max(float(square.sum() / held.sum()), 0.0)
         excess.append((_around(square) + PRIOR_READINGS * whole) / readings)
@@ -65,9 +50,8 @@ def weighted(missed: Sequence[Array], noise: Array, held: NDArray[np.bool_]) -> 
     typical = (_around(allowed) + PRIOR_READINGS * allowed.sum() / held.sum()) / readings
     # A mean of n squares of Gaussian noise is off by sqrt(2 / n) of it.
     floor = typical * np.sqrt(2 / readings) + 1e-20
-    excess = np.maximum(excess, floor)
-    inverse = excess**-POWER
-    return Weights((inverse / inverse.sum(axis=0)).astype(np.float32), excess, noise, held)
+    inverse = np.maximum(excess, floor) ** -POWER
+    return (inverse / inverse.sum(axis=0)).astype(np.float32)
 
 
 def _around(values: Array) -> NDArray[np.float64]:
@@ -79,7 +63,7 @@ def _around(values: Array) -> NDArray[np.float64]:
 
 
 def mean_light_field(light_fields: Sequence[Array], shares: Array, binning: int) -> Array:
-    """Return the mean of light fields (v, u, y, x, c), shares: see `Weights`."""
+    """Return the mean of light fields (v, u, y, x, c), shares: see `shares_of`."""
     samples = _samples(shares, binning)[..., None]
     total = light_fields[0] * samples[0]
     for share, one in zip(samples[1:], light_fields[1:], strict=True):
@@ -87,21 +71,16 @@ def mean_light_field(light_fields: Sequence[Array], shares: Array, binning: int)
     return total
 
 
-def mean_deviation(
-    sigmas: Sequence[Array | float], weights: Weights, missed: Sequence[Array], binning: int
-) -> Array:
-    """Return the standard deviation (v, u, y, x) of the mean of models of these deviations.
+def spread(light_fields: Sequence[Array], mean: Array, shares: Array, binning: int) -> Array:
+    """Return the variance (v, u, y, x) of light fields about their mean, averaged over colours.
 
-    missed: what each misses of the frames.
+    light_fields, mean: (v, u, y, x, c); shares: see `shares_of`.
     """
-    each = zip(_samples(weights.shares, binning), sigmas, strict=True)
-    alike = sum(share * sigma for share, sigma in each)
-    mean = sum(share * one for share, one in zip(weights.shares, missed, strict=True))
-    held = weights.held
-    square = np.square(np.where(held, mean, 0), dtype=np.float64) - np.where(held, weights.noise, 0)
-    allowed = np.sum(weights.shares * np.sqrt(weights.excess), axis=0) ** 2
-    ratio = float(square.sum()) / max(float((held * allowed).sum()), 1e-30)
-    return np.asarray(alike * np.sqrt(np.clip(ratio, LEAST_RATIO, 1)), dtype=np.float32)
+    out = np.zeros(mean.shape[:4], dtype=np.float32)
+    for share, one in zip(_samples(shares, binning), light_fields, strict=True):
+        for v, u in np.ndindex(mean.shape[:2]):
+            out[v, u] += share * np.square(one[v, u] - mean[v, u]).mean(axis=-1)
+    return out
 
 
 def _samples(shares: Array, binning: int) -> Array:

@@ -2,8 +2,8 @@
 
 One plane has three numbers where a disparity for each patch has thousands; it is taken when next to
 no patch speaks against it, and disparity 0, one picture for all views, before any other. A scene is
-taken to be grey when readings kept from the fit are missed no more by a grey texture than by a
-coloured one. What is left out is told, with the PSNR that leaving it out allows at best.
+taken to be grey when a grey texture predicts held-out readings as well as a coloured one. What is
+left out is reported, with the PSNR that leaving it out allows at best.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
 UNLIKELY = 20.0
-"""Log-likelihood, below its patch's best, of disparities that were not judged, or are no better."""
+"""Log-likelihood, below its patch's best, of disparities not evaluated, or that are no better."""
 UNSERVED = 0.01
 """Share of the deciding patches that may prefer a disparity of their own decisively."""
 GREY_RMS = 0.02
@@ -141,7 +141,7 @@ def grey_psi(psi: ImagingMatrix) -> ImagingMatrix:
 
 
 def colour_is_needed(coloured: Array, grey: Array) -> bool:
-    """Return whether readings kept from both fits are missed less with colour, beyond chance.
+    """Return whether colour predicts the readings kept from both fits better, beyond chance.
 
     coloured, grey: what each misses of them, (reading,).
     """

@@ -29,22 +29,20 @@ def _follow(
     weights,
     colour,
     disparity,
-    hidden,
     margin,
     binning,
     first,
     last,
     back,
-    textures,
+    texture,
     frames,
 ):
-    """Project textures to the pixel rows first to last - 1 of frames, or, back, frames to textures.
+    """Project a texture to the pixel rows first to last - 1 of frames, or, back, frames to it.
 
-    textures: (layer, c, y, x), padded. frames: (shot, pixel_y, pixel_x). What is projected to is
-    added to.
+    texture: (c, y, x), padded. frames: (shot, pixel_y, pixel_x). What is projected to is added to.
     """
     shots, views_v, views_u, _, stored, columns = weights.shape
-    last_y, last_x = textures.shape[2] - TAPS, textures.shape[3] - TAPS
+    last_y, last_x = texture.shape[1] - TAPS, texture.shape[2] - TAPS
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for y in range(first * binning, last * binning):
         for v in range(views_v):
@@ -52,7 +50,6 @@ def _follow(
                 for x in range(columns):
                     placed = False
                     iy, ix = 0, 0
-                    layer = hidden[v, u, y, x]
                     for s in range(shots):
                         total = np.float32(0)
                         for k in range(stored):
@@ -69,30 +66,28 @@ def _follow(
                             c = colour[s, y, x] if stored == 1 else k
                             if back:
                                 w *= frames[s, y // binning, x // binning]
-                            texture = textures[layer, c]
                             for i in range(TAPS):
                                 share = w * wy[i]
                                 for j in range(TAPS):
                                     if back:
-                                        texture[iy + i, ix + j] += share * wx[j]
+                                        texture[c, iy + i, ix + j] += share * wx[j]
                                     else:
-                                        total += share * wx[j] * texture[iy + i, ix + j]
+                                        total += share * wx[j] * texture[c, iy + i, ix + j]
                         if not back:
                             frames[s, y // binning, x // binning] += total
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _render(disparity, hidden, textures, margin, first, last, out):
-    """Set rows first to last - 1 of out (v, u, y, x, c) to what rays see of (layer, c, y, x)."""
+def _render(disparity, texture, margin, first, last, out):
+    """Set rows first to last - 1 of out (v, u, y, x, c) to what rays see of (c, y, x)."""
     views_v, views_u, _, columns, colours = out.shape
-    last_y, last_x = textures.shape[2] - TAPS, textures.shape[3] - TAPS
+    last_y, last_x = texture.shape[1] - TAPS, texture.shape[2] - TAPS
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for v in range(views_v):
         for u in range(views_u):
             for y in range(first, last):
                 for x in range(columns):
                     d = disparity[v, u, y, x]
-                    texture = textures[hidden[v, u, y, x]]
                     iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
                     ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
                     cubic(fy, wy)
@@ -148,9 +143,9 @@ class Surfaces:
     """Psi of textures on surfaces: forward and adjoint between textures and frames.
 
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
-    centre view does not. Textures have the shape `textures_shape`, (layer, c, y, x), padded by
-    `margin` samples on all sides; colours: of them, 1 for a Psi that sees only the first. layers: 1
-    where Psi sees nothing hidden.
+    centre view does not: there it sees the texture beside it. Textures have the shape
+    `texture_shape`, (c, y, x), padded by `margin` samples on all sides; colours: of them, 1 for a
+    Psi that sees only the first.
     """
 
     def __init__(
@@ -160,26 +155,25 @@ class Surfaces:
         hidden: NDArray[np.uint8],
         margin: int,
         colours: int = 3,
-        layers: int = 2,
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
-        self.textures_shape = (layers, colours, rows + 2 * margin, columns + 2 * margin)
+        self.texture_shape = (colours, rows + 2 * margin, columns + 2 * margin)
 
     @cached_property
     def _layout(self) -> Layout | None:
-        return laid_out(self.psi, self.disparity, self.hidden, self.margin, self.textures_shape)
+        return laid_out(self.psi, self.disparity, self.margin, self.texture_shape)
 
     def _rays(self, first: int, last: int) -> tuple[Any, ...]:
         psi = self.psi
-        seen = psi.weights, psi.colour_map, self.disparity, self.hidden
+        seen = psi.weights, psi.colour_map, self.disparity
         return (*seen, self.margin, psi.binning, first, last)
 
-    def _project(self, textures: Array) -> Array:
+    def _project(self, texture: Array) -> Array:
         frames = np.zeros(self.psi.frames_shape, dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
-            _follow(*[*self._rays(first, last), False, textures, frames])
+            _follow(*[*self._rays(first, last), False, texture, frames])
 
         in_bands(work, frames.shape[1])
         return frames
@@ -189,7 +183,7 @@ class Surfaces:
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         # Bands of rows reach the same texture: each adds to its own.
         textures = [
-            np.zeros(self.textures_shape, dtype=np.float32)
+            np.zeros(self.texture_shape, dtype=np.float32)
             for _ in range(min(rows, get_num_threads()))
         ]
 
@@ -199,19 +193,19 @@ class Surfaces:
         in_bands(work, rows, len(textures))
         return sum(textures[1:], start=textures[0])
 
-    def forward(self, textures: Array) -> Array:
-        """Return the frames (shot, pixel_y, pixel_x) of textures (layer, c, y, x)."""
-        return self._project(textures) if self._layout is None else self._layout.read(textures)
+    def forward(self, texture: Array) -> Array:
+        """Return the frames (shot, pixel_y, pixel_x) of a texture (c, y, x)."""
+        return self._project(texture) if self._layout is None else self._layout.read(texture)
 
     def adjoint(self, frames: Array) -> Array:
-        """Return the adjoint of `forward`, (layer, c, y, x)."""
+        """Return the adjoint of `forward`, (c, y, x)."""
         return self._back(frames) if self._layout is None else self._layout.returned(frames)
 
     def derivative(self, slopes: Array) -> tuple[Callable, Callable]:
         """Return how frames change with the centre view's disparity, and the adjoint of that.
 
         slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. The first maps
-        (y, x), padded, to (shot, pixel_y, pixel_x); layers behind keep their disparity.
+        (y, x), padded, to (shot, pixel_y, pixel_x); what is hidden keeps its disparity.
         """
         psi = self.psi
         steep = np.zeros((*psi.weights.shape[:4], 1, psi.size[1]), dtype=np.float32)
@@ -223,19 +217,18 @@ class Surfaces:
         in_bands(work, psi.size[0])
         colours = np.zeros((psi.shots, *psi.size), np.uint8)
         steep_psi = ImagingMatrix(steep, colours, psi.binning)
-        changes = Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1, 1)
-        size = changes.textures_shape[2:]
+        changes = Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1)
         return (
-            lambda change: changes.forward(change.reshape(changes.textures_shape)),
-            lambda missed: changes.adjoint(missed).reshape(size),
+            lambda change: changes.forward(change[None]),
+            lambda residual: changes.adjoint(residual)[0],
         )
 
-    def light_field(self, textures: Array) -> Array:
-        """Return the light field (v, u, y, x, c) of textures (layer, c, y, x)."""
-        out = np.empty((*self.disparity.shape, textures.shape[1]), dtype=np.float32)
+    def light_field(self, texture: Array) -> Array:
+        """Return the light field (v, u, y, x, c) of a texture (c, y, x)."""
+        out = np.empty((*self.disparity.shape, texture.shape[0]), dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
-            _render(self.disparity, self.hidden, textures, self.margin, first, last, out)
+            _render(self.disparity, texture, self.margin, first, last, out)
 
         in_bands(work, self.psi.size[0])
         return out

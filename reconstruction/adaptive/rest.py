@@ -1,4 +1,4 @@
-"""What surfaces miss: a light field of its own, as far as readings kept from all fits speak for it.
+"""The light field of the residual, as far as readings kept from all fits speak for it.
 
 With L the light field so far and r = I - Psi L, the rest is the light field R of least total
 variation that explains r; L + a R is returned, a in [0, 1]. Readings that no fit has seen choose a:
@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import choose_mu
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
 UNEXPLAINED = 1.5
-"""Times their noise that readings must be missed by for a rest to be looked for."""
+"""Root mean square residual, over the noise, above which a rest is looked for."""
 LIGHTER = 0.3
 """Of the weight that total variation alone would get: there is less to lose. On eight shots of
 deep-occlusions without noise 0.1, 0.3, 1 and 3 gained 0.9, 0.9, 0.7 and 0.5 dB."""
@@ -29,26 +28,26 @@ PROOF = 3.0
 MIDDLE = 0.5
 """The solver's light fields lie in [0, 1], the rest about 0: it is solved for about this value."""
 WINDOW_PX = 8.0
-"""Deviation of the window in which the place that is missed most is looked for."""
+"""Deviation of the window in which the place of the largest residual is looked for."""
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """times: what readings are missed by over their noise, root mean squares; row, column: the
-    pixel about which most."""
+    """times: root mean square of the residual over the noise; row, column: the pixel about which it
+    is largest."""
 
     times: float
     row: int
     column: int
 
 
-def misfit_of(missed: Array, noise: Array, fitted: NDArray[np.bool_]) -> Misfit:
+def misfit_of(residual: Array, noise: Array, fitted: NDArray[np.bool_]) -> Misfit:
     """Return how far readings are from being explained.
 
-    missed: what is missed of the frames; noise: their variance; fitted: the readings that count,
-    all (shot, pixel_y, pixel_x).
+    residual: the frames less what is predicted; noise: variance of the readings; fitted: those that
+    count, all (shot, pixel_y, pixel_x).
     """
-    relative = np.where(fitted, np.square(missed) / np.maximum(noise, 1e-20), 0)
+    relative = np.where(fitted, np.square(residual) / np.maximum(noise, 1e-20), 0)
     around = cv2.GaussianBlur(relative.sum(axis=0, dtype=np.float64), (0, 0), WINDOW_PX)
     row, column = np.unravel_index(around.argmax(), around.shape)
     times = float(np.sqrt(relative.sum(dtype=np.float64) / max(int(fitted.sum()), 1)))
@@ -57,8 +56,8 @@ def misfit_of(missed: Array, noise: Array, fitted: NDArray[np.bool_]) -> Misfit:
 
 def rest(
     psi: ImagingMatrix,
-    frames: Array,
-    missed: Array,
+    residual: Array,
+    mu: float,
     typical: float,
     fitted: NDArray[np.bool_],
     held: NDArray[np.bool_],
@@ -66,18 +65,18 @@ def rest(
 ) -> Array | None:
     """Return what to add to a light field (v, u, y, x, c); None where nothing speaks for it.
 
-    missed: what it misses of the frames; fitted, held: readings that were fitted, and kept from
-    it, all (shot, pixel_y, pixel_x). typical: deviation of the readings. steps: of the solver.
+    residual: the frames less what it predicts; fitted, held: readings that were fitted, and kept
+    from it, all (shot, pixel_y, pixel_x). mu: weight that total variation alone would get. typical:
+    deviation of the readings. steps: of the solver.
     """
     middle = np.full(psi.light_field_shape, MIDDLE, dtype=np.float32)
-    mu = LIGHTER * choose_mu(psi, frames[fitted], typical, 1)
-    settings = TVSettings(mu=mu, max_steps=steps, objective_every=steps + 1)
-    shifted = (missed + psi.forward(middle)).astype(np.float32)
-    found = reconstruct_tv(psi, shifted, typical, settings, fitted, start=middle).light_field
-    found -= MIDDLE
-    seen = psi.forward(found)[held].astype(np.float64)
-    share, error = _regression(missed[held].astype(np.float64), seen)
-    return np.float32(min(share, 1.0)) * found if share > PROOF * error else None
+    settings = TVSettings(mu=LIGHTER * mu, max_steps=steps, objective_every=steps + 1)
+    shifted = (residual + psi.forward(middle)).astype(np.float32)
+    more = reconstruct_tv(psi, shifted, typical, settings, fitted, start=middle).light_field
+    more -= MIDDLE
+    seen = psi.forward(more)[held].astype(np.float64)
+    share, error = _regression(residual[held].astype(np.float64), seen)
+    return np.float32(min(share, 1.0)) * more if share > PROOF * error else None
 
 
 def _regression(values: Array, on: Array) -> tuple[float, float]:
@@ -86,8 +85,8 @@ def _regression(values: Array, on: Array) -> tuple[float, float]:
     if len(values) < 2 or square <= 0:
         return 0.0, np.inf
     slope = float(values @ on) / square
-    # Misses differ in size from place to place: the error that assumes they are alike may be small.
-    missed = values - slope * on
-    alike = float(np.sqrt(missed @ missed / (len(values) - 1) / square))
-    unlike = float(np.sqrt(np.sum(np.square(on * missed)))) / square
+    # Residuals differ in size from place to place: the error for alike ones may be too small.
+    left = values - slope * on
+    alike = float(np.sqrt(left @ left / (len(values) - 1) / square))
+    unlike = float(np.sqrt(np.sum(np.square(on * left)))) / square
     return slope, max(alike, unlike)

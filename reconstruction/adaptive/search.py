@@ -1,8 +1,9 @@
 """Search the disparities of a capture, from coarse to fine: where, and which, they may be.
 
-Wide patches of every third pixel judge disparities, half a pixel apart where they are small and one
-beyond, the range growing while its ends are wanted. Each tile of the fine search then judges only
-what the coarse one left possible there, so that cost grows with the disparities a scene really has.
+The likelihood of disparities is evaluated for wide patches of every third pixel, half a pixel apart
+where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
+fine search then evaluates only what the coarse one left possible there, so that cost grows with the
+disparities a scene really has.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5
 COARSE_SPACING = 3
 NEAR_PX, FAR_STEP_PX = 3.0, 1.0
-"""Disparities beyond are judged this much apart."""
+"""Disparities beyond are evaluated this much apart."""
 START_PX, GROWTH_PX = 9.0, 3.0
 """Disparities searched first, to both sides; by how much the range grows at a time."""
 DECISIVE = 5.0
@@ -53,9 +54,9 @@ class Volume:
     """Probabilities of disparities on a grid of patches.
 
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
-    disparity); evidence: theirs, log-likelihoods, -inf where not judged. kind: (row, column) of the
-    texture. decisive: (row, column), whether the patch's
-    own evidence prefers any disparity. at_end: share of deciding patches at the range's ends.
+    disparity); evidence: theirs, log-likelihoods, -inf where not evaluated. kind: (row, column) of
+    the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
+    at_end: share of deciding patches at the range's ends.
     """
 
     disparities: NDArray[np.float64]
@@ -77,7 +78,7 @@ def coarse_side(shots: int) -> int:
     return min(8, max(4, round(12 / shots**0.5)))
 
 
-def _judged(
+def _evaluated(
     data: Data, patches: EvidencePatches, disparities: Array, prior: TexturePrior
 ) -> tuple[Array, NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return evidence (row, column, disparity), kinds (row, column), and the corners' grid."""
@@ -127,7 +128,7 @@ def coarse(
     near = np.append(0.0, _reach(0, min(NEAR_PX, furthest_px), COARSE_STEP_PX))
     beyond = np.concatenate([near, _reach(near[-1], min(START_PX, furthest_px), FAR_STEP_PX)])
     known = np.concatenate([-beyond[:0:-1], beyond])
-    evidence, kind, grid = _judged(data, patches, known, prior)
+    evidence, kind, grid = _evaluated(data, patches, known, prior)
     while True:
         deciding = _deciding(evidence)
         pairs = compatibility(known, slope_px * patches.stride, jump, _spacing(known))
@@ -146,11 +147,11 @@ def coarse(
         if not len(below) + len(above):
             break
         further = -below[::-1], above
-        judged = [
-            _judged(data, patches, part, prior)[0] if len(part) else evidence[..., :0]
+        evaluated = [
+            _evaluated(data, patches, part, prior)[0] if len(part) else evidence[..., :0]
             for part in further
         ]
-        evidence = np.concatenate([judged[0], evidence, judged[1]], axis=-1)
+        evidence = np.concatenate([evaluated[0], evidence, evaluated[1]], axis=-1)
         known = np.concatenate([further[0], known, further[1]])
     half = (patches.side - 1) * patches.spacing / 2
     centres = grid[0] + half, grid[1] + half

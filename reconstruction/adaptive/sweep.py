@@ -1,9 +1,9 @@
 """The disparity again, once the texture is nearly known: a plane sweep in the measurement domain.
 
 The texture T predicts the frames for every plane, F_d = Psi L(T, d), one product each. Given that
-pixel p lies at d its reading misses F_d(p) by noise and by what the texture is wrong by there. That
-variance is read off the frames: the mean square, around p, of what the present surfaces miss. Its
-tails are heavy (occlusions), so the log-likelihood is that of a Student t,
+pixel p lies at d its reading differs from F_d(p) by noise and by what the texture is wrong by
+there. That variance is estimated from the frames: the mean square, around p, of the residual of the
+present surfaces. Its tails are heavy (occlusions), so the log-likelihood is that of a Student t,
 
     l_d(p) = -(nu + 1) / 2 sum_shots log(1 + (I - F_d)^2(p) / (nu s^2(p))).
 
@@ -35,7 +35,7 @@ FREEDOM = 3.0
 RADIUS_PX, EDGE = 3, 1e-3
 """Of the guided filter; EDGE is the variance of the picture, in [0, 1], that counts as an edge."""
 VARIANCE_PX = 4.0
-"""Deviation of the window in which the misses are averaged."""
+"""Deviation of the window in which squared residuals are averaged."""
 STRIDE = 2
 """Pixels between those whose disparity is asked for."""
 OWN_SHARE = 0.5
@@ -136,18 +136,18 @@ def swept(
     noise: Array,
     used: NDArray[np.bool_],
     texture: Array,
-    missed: Array,
+    residual: Array,
     margin: int,
     slope_px: float,
     jump: float,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
-    volume: of the search. frames, their variance `noise`, which are used, and what the present
-    surfaces miss: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
+    volume: of the search. frames, their variance `noise`, which are used, and the residual
+    of the present surfaces: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
     """
     weight = used.astype(np.float32)
-    variance = np.maximum(_smooth(np.square(missed), weight), noise.mean(axis=0))
+    variance = np.maximum(_smooth(np.square(residual), weight), noise.mean(axis=0))
     k = psi.binning
     inner = texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
     pixels = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k).mean(axis=(2, 4))
@@ -170,8 +170,8 @@ def swept(
     for label, (disparity, belief) in enumerate(
         zip(labels, np.moveaxis(volume.probability[..., within], -1, 0), strict=True)
     ):
-        residual = frames - plane_frames(psi, texture, disparity, margin)
-        likelihood = _likelihood(residual, variance, weight, guide)[::STRIDE, ::STRIDE]
+        of_plane = frames - plane_frames(psi, texture, disparity, margin)
+        likelihood = _likelihood(of_plane, variance, weight, guide)[::STRIDE, ::STRIDE]
         believed = interpolated(np.ascontiguousarray(belief), at[1], at[0])
         evidence[..., label] = OWN_SHARE * likelihood + np.log(believed + LEAST_BELIEF)
     chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))

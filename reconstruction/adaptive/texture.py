@@ -1,10 +1,9 @@
-"""The texture of known surfaces: its fit to the frames, and what lies behind the nearest ones."""
+"""The texture of known surfaces, fitted to the frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +42,7 @@ def fitted(
     sigma: float,
     steps: int,
 ) -> Array:
-    """Return the texture (layer, c, y, x) near `prior`, deviation sigma, that explains the frames.
+    """Return the texture (c, y, x) near `prior`, deviation sigma, that explains the frames.
 
     The minimiser of 1/2 |S^-1/2 (Psi W T - I)|^2 + |T - prior|^2 / (2 sigma^2), S the variance of
     each reading: the mean of T given the frames, if its prior is Gaussian.
@@ -57,29 +56,3 @@ def fitted(
         return surfaces.adjoint(precision * surfaces.forward(textures)) + ridge * textures
 
     return prior + conjugate_gradients(normal, rhs, steps)
-
-
-def background(front: Array, centre: Array, nearer: int, reach: int) -> Array:
-    """Return the texture (c, y, x) behind the nearest surfaces: the further ones', continued.
-
-    front: texture of the centre view. centre: its disparity (y, x). reach: samples that surfaces
-    may hide.
-    """
-    depth = nearer * centre
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    furthest = cv2.erode(depth, kernel)
-    known = (depth - furthest < 0.3).astype(np.float32)
-    filled = front * known
-    have = known.copy()
-    for width in (1.5, 3.0, 6.0, 12.0, 24.0):
-        missing = have < 1e-3
-        if not missing.any():
-            break
-        share = cv2.GaussianBlur(known, (0, 0), width)
-        for c in range(len(front)):
-            blurred = cv2.GaussianBlur(front[c] * known, (0, 0), width)
-            filled[c][missing] = (blurred / np.maximum(share, 1e-6))[missing]
-        have = np.where(missing, share, have)
-    empty = have < 1e-3
-    filled[:, empty] = front[:, empty]
-    return filled

@@ -1,10 +1,21 @@
-"""How far off a reconstruction is: a deviation per sample, calibrated on held-out readings.
+"""The standard deviation of a reconstruction, per sample, calibrated on held-out readings.
 
-Some readings are kept from the fit. What a texture may be wrong by is the noise that its last fit
-let in or left in, and more where it is steep: by a blur that is the same for all views, and by a
-wrong disparity, which counts more in views further from the centre. How much of the last two the
-held-out readings tell: their misses are Gaussian with the variance of the noise and of these parts
-(maximum likelihood, with heavy tails for what is wild).
+Some readings are kept from every fit. The variance of a sample of the light field is modelled as
+
+    sigma^2 = s (N + b B + e E):
+
+N, the noise that the last fit let into the texture or left in it; B, the squared slopes of the
+texture, for errors of position that all views share; E, the spread between the models of the mean
+(`mixture`), which is large where they disagree, at wrong disparities and occlusions.
+
+Each part predicts a variance of the held-out residuals r = I - Psi L, if errors are correlated
+along the texture: rays of one pixel that meet it far apart err independently. b and e maximise the
+likelihood of r, of a Student t since some residuals are wild. The scale s then makes a share
+WITHIN_ONE of them lie within one deviation: a split conformal calibration (Vovk et al. 2005) on
+readings instead of samples, which needs no true light field.
+
+It rests on the correlation, and errors that the rays of a pixel average out stay unseen: with the
+noise of a real light field's own views, say, fewer errors lie within sigma than stated.
 """
 
 from __future__ import annotations
@@ -16,30 +27,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.joint import Scene
 from reconstruction.adaptive.refine import slopes
 
 Array = NDArray[np.floating]
 HELD_SHARE, MOST_SHARE = 0.02, 0.06
 SMOOTH_PX = 2.0
+"""Deviation of the blur of every part, in pixels. For E alone, 1 and 0.7 change the scatter of the
+coverage over group A by less than 0.005."""
 CORRELATED_PX = 0.6
-"""Errors of a texture are alike over about so far, exp(-r / it)."""
+"""Errors of a texture are correlated as exp(-r / CORRELATED_PX) at a distance r."""
 LET_IN, LEFT_IN = 6.0, 3.0
 """Variance of the texture over that of the noise which its last step let in; and, everywhere, over
-that of a reading: what smoothing made of noise looks like texture. With these, on 14 captures (nine
-real crops, five built-in scenes, one shot) 51 to 77 % of the errors lie within one deviation, 68 %
-on average; without the second 45 to 79 %."""
-SURE_PX = 0.05
-"""Deviation of a disparity that the patches agree on."""
+that of a reading: what smoothing made of noise looks like texture. Fitted on 14 captures (nine real
+crops, five built-in scenes, one shot): without the second the coverage scatters twice as much."""
 WITHIN_ONE = 0.6827
-LEAST_SCALE = 0.25
-APART = 0.55
-"""Total variation: its light field's variance over what the readings' misfit is if its errors were
-independent from ray to ray, 0.45 to 0.70 on four captures where it is better than surfaces (wide
-disparities, glass, gloss)."""
+FREEDOM = 4.0
+"""Of the Student t of the residuals."""
+LEAST_SCALE = 0.1
 FEWEST = 50
-"""Held-out readings below which nothing is fitted."""
+"""Held-out readings below which no deviation is stated."""
 
 
 def held_out(
@@ -47,50 +54,33 @@ def held_out(
 ) -> NDArray[np.bool_]:
     """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit.
 
-    A pixel is kept with all its shots: what it read in one would tell what it reads in another, and
-    nothing of how well the light field is known in between. More than the share where there are
-    few, so that a deviation can be fitted to them.
+    A pixel is kept with all its shots: one of them would predict the others, whether or not the
+    light field is right between the rays. More than the share where there are few readings, so that
+    a deviation can be fitted to them.
     """
     share = min(max(share, 2 * FEWEST / max(int(usable.sum()), 1)), MOST_SHARE)
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-@dataclass(frozen=True, eq=False)
-class Deviation:
-    """sigma: (v, u, y, x), of a value of any colour there. held: how many readings were kept from
-    the fit. blur, slip: the fitted weights of squared slopes, alike in all views, and of those
-    along the parallax: the square of a length in pixels, and a factor on the disparity's variance.
-    """
-
-    sigma: Array
-    held: int
-    blur: float
-    slip: float
-
-
-def _parts(scene: Scene, doubt: Array, noise_variance: float) -> Array:
-    """Return the variance's parts, (3, v, u, y, x): noise, slopes, those by parallax."""
-    let_in = np.square(scene.texture[0] - scene.clean[0]).mean(axis=0)
-    steep = np.square(slopes(scene.clean[0])).mean(axis=1)
-    smooth = [cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, *steep)]
-    both = np.stack([np.stack(smooth)] * 2).astype(np.float32)
-    seen = np.maximum(scene.surfaces.light_field(both), 0)
-    views_v, views_u = seen.shape[:2]
-    v = (np.arange(views_v, dtype=np.float32) - views_v // 2)[:, None, None, None]
-    u = (np.arange(views_u, dtype=np.float32) - views_u // 2)[None, :, None, None]
-    noise, along_y, along_x = (seen[..., i] for i in range(3))
-    parts = np.empty((3, *noise.shape), dtype=np.float32)
-    np.multiply(noise, np.float32(LET_IN), out=parts[0])
-    parts[0] += np.float32(LEFT_IN * noise_variance)
-    np.add(along_y, along_x, out=parts[1])
-    np.multiply(v**2, along_y, out=parts[2])
-    parts[2] += u**2 * along_x
-    parts[2] *= doubt + np.float32(SURE_PX**2)
+def _parts(scene: Scene, brightness: float, noise_variance: float, spread: Array) -> Array:
+    """Return N, B and E of every sample, (3, v, u, y, x)."""
+    let_in = np.square(scene.texture - scene.clean).mean(axis=0)
+    steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
+    smooth = np.stack([cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, steep)])
+    seen = np.maximum(scene.surfaces.light_field(smooth), 0) * np.float32(brightness**2)
+    parts = np.empty((3, *spread.shape), dtype=np.float32)
+    parts[0] = np.float32(LET_IN) * seen[..., 0] + np.float32(LEFT_IN * noise_variance)
+    parts[1] = seen[..., 1]
+    for v, u in np.ndindex(spread.shape[:2]):
+        parts[2, v, u] = cv2.GaussianBlur(spread[v, u], (0, 0), SMOOTH_PX)
     return parts
 
 
-def _gathered(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return what the parts add to the variance of the held-out readings, (part, reading)."""
+def _of_readings(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return what parts (part, v, u, y, x) add to the variance of the held-out readings.
+
+    (part, reading). The rays of a pixel meet the texture |disparity| apart per view step.
+    """
     psi = scene.surfaces.psi
     k = psi.binning
     shot, pixel_y, pixel_x = np.nonzero(held)
@@ -113,51 +103,49 @@ def _gathered(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """sigma: (v, u, y, x), standard deviation of a value of any colour there. scale, blur, spread:
+    the fitted s, b (a length squared, in pixels) and e."""
+
+    sigma: Array
+    scale: float
+    blur: float
+    spread: float
+
+
 def deviation(
     scene: Scene,
-    doubt: Array,
-    frames: Array,
+    brightness: float,
+    spread: Array,
+    residual: Array,
     noise: Array,
     held: NDArray[np.bool_],
 ) -> Deviation | None:
-    """Return the standard deviation of the scene's light field; None with too few readings held.
+    """Return the standard deviation of a mean of models; None with too few readings held out.
 
-    doubt: (y, x), variance of the disparity. frames, their variance `noise`, held: (shot, pixel_y,
-    pixel_x).
+    scene: the last fit, of a light field over `brightness`. spread: variance (v, u, y, x) between
+    the models. residual: of the mean; noise: variance of the readings; held: those kept from the
+    fits, all (shot, pixel_y, pixel_x).
     """
-    count = int(held.sum())
-    if count < FEWEST:
+    if held.sum() < FEWEST:
         return None
-    of_readings = noise[held].astype(np.float64)
-    parts = _parts(scene, doubt, float(np.median(of_readings)))
-    missed = (frames - scene.surfaces.forward(scene.texture))[held].astype(np.float64)
-    let_in, blur, slip = _gathered(scene, parts, held)
-    base = of_readings + let_in + 1e-12
+    allowed = noise[held].astype(np.float64)
+    square = np.square(residual[held], dtype=np.float64)
+    parts = _parts(scene, brightness, float(np.median(allowed)), spread)
+    of_readings = _of_readings(scene, parts, held)
+
+    def predicted(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.append(1, np.exp(logs)) @ of_readings
 
     def surprise(logs: NDArray[np.float64]) -> float:
-        variance = base + np.exp(logs[0]) * blur + np.exp(logs[1]) * slip
-        # Student's t of 4 degrees: a few wild readings (occlusions) must not set the scale.
-        return float(np.sum(np.log(variance) + 5 * np.log1p(missed**2 / (4 * variance))))
+        variance = allowed + predicted(logs) + 1e-12
+        tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
+        return float(np.sum(np.log(variance) + tails))
 
-    found = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
-    weights = np.exp(found)
-    predicted = let_in + weights[0] * blur + weights[1] * slip
-    # The scale at which 68 % of the held-out readings lie within one deviation, noise included.
-    beyond = np.maximum(np.square(missed) - of_readings, 0) / np.maximum(predicted, 1e-20)
-    scale = max(float(np.quantile(beyond, WITHIN_ONE)), LEAST_SCALE)
-    variance = np.tensordot(np.array([scale, *(scale * weights)], np.float32), parts, axes=1)
-    return Deviation(np.sqrt(variance), count, *map(float, weights))
-
-
-def plain_deviation(
-    psi: ImagingMatrix, missed: Array, noise: Array, held: NDArray[np.bool_], share: Array
-) -> float:
-    """Return the standard deviation of total variation's light field, where it has a share.
-
-    missed: what it misses of the frames, noise: their variance, held: the readings kept from the
-    fit, all (shot, pixel_y, pixel_x); share: (pixel_y, pixel_x).
-    """
-    weight = np.where(held, share, 0).astype(np.float64)
-    rows = np.einsum("ssyx->syx", psi.gram)
-    excess = float((weight * (np.square(missed) - noise)).sum())
-    return float(np.sqrt(APART * max(excess, 0.0) / max(float((weight * rows).sum()), 1e-12)))
+    logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
+    over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), 1e-20)
+    scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
+    blur, apart = (float(one) for one in np.exp(logs))
+    weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
+    return Deviation(np.sqrt(np.tensordot(weights, parts, axes=1)), scale, blur, apart)

@@ -1,7 +1,7 @@
 """Which surface every ray sees: the centre view's disparity carried to all views, nearest in front.
 
-Rays that no point of the centre view reaches are hidden from it: they see the further of the
-surfaces beside them, on a second layer of texture.
+Rays that no point of the centre view reaches are hidden from it: they are given the disparity of
+the further of the surfaces beside them.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from pydantic import Field, create_model
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.method import AdaptiveSettings
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs, checked_noise

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from reconstruction.adaptive.method import AdaptiveSettings, fast, reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.method import Given, Method, Sensitivity
 from reconstruction.result import Reconstruction
 

@@ -159,7 +159,7 @@ class _Steps(Unwatched):
         assert self._first is not None
         return self._last[1] - self._first[1]
 
-    def phase(self, name: str, frame: PlannedFrame) -> None:
+    def step(self, name: str, frame: PlannedFrame) -> None:
         """Note the time."""
         now_s = time.perf_counter()
         if name == "hand over":

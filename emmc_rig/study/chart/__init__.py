@@ -1,1 +1,1 @@
-"""Speed against accuracy: every method measured on the same frames, its charts, and advice."""
+"""Speed against accuracy: every method measured on the same frames, and its charts."""

@@ -1,4 +1,4 @@
-"""`emmc-rig chart`: measure the points, and write table, page, charts, advice and metrics."""
+"""`emmc-rig chart`: measure the points, and write table, page, charts and metrics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from emmc_rig.advice.recommend import ADVICE, saved
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
@@ -17,7 +16,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_drawing import draw_chart, draw_growths
 from emmc_rig.study.chart.chart_page import chart_page
 from emmc_rig.study.chart.chart_sweep import ChartSweep
-from emmc_rig.study.chart.front import POOLED, Chart, advice_rows, charts
+from emmc_rig.study.chart.front import POOLED, Chart, charts
 from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import ChartSettings, Point, charted_points, scalings
 from emmc_rig.study.chart.scaling import Growth, growths
@@ -98,7 +97,7 @@ def run_chart(
 
 
 def _write(sweep: ChartSweep, results: dict[Point, dict], outcome: ChartOutcome, new: Path) -> None:
-    """Write the charts, chart.csv, the advice, the page and metrics.json."""
+    """Write the charts, chart.csv, the page and metrics.json."""
     settings, folder = sweep.settings, new / DRAWN
     folder.mkdir()
     marks = [mark for chart in outcome.charts for mark in chart.marks]
@@ -119,7 +118,6 @@ def _write(sweep: ChartSweep, results: dict[Point, dict], outcome: ChartOutcome,
         for chart in outcome.charts
     }
     write_text(new / CSV, csv_text([_row(*one) for one in sweep.results.items()], COLUMNS))
-    write_text(new / ADVICE, saved(advice_rows(results), sources))
     write_text(new / PAGE, text)
     metrics = {
         "points": len(sweep.results),

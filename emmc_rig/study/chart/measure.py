@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
-from emmc_rig.advice.reference import reference
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
@@ -32,6 +31,7 @@ from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.study.chart.captures import read_frames, read_truth
 from emmc_rig.study.chart.peers import PEERS
+from emmc_rig.study.chart.reference import reference
 from emmc_rig.study.chart.scores import scored
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -45,10 +45,9 @@ KNOWN = (AppError, ModelError, ReconstructionError, CalibrationError, DriverErro
 def measured(job: dict) -> dict:
     """Return the figures of a job: capture, method, settings, dictionary, repeats, ...
 
-    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. window_cpu_s: of
-    the warm-up's window once it is warm, the part that does not grow with the picture.
-    base_mib: resident memory of the process before the timed runs, with Psi and frames; peak_mib:
-    at most during them. dictionary_s: of the one that this process has made.
+    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. base_mib: resident
+    memory of the process before the timed runs, with Psi and frames; peak_mib: at most during them.
+    dictionary_s: of the one that this process has made.
     """
     psi, frames = read_frames(Path(job["capture"]))
     settings = MethodSettings.model_validate(job["settings"])
@@ -56,11 +55,7 @@ def measured(job: dict) -> dict:
     if job["needs_dictionary"]:
         views = psi.light_field_shape[:2]
         dictionary, dictionary_s = _dictionary(job["dictionary"], views, psi.binning)
-    window = _window(psi, frames)
-    _solved(job["method"], *window, dictionary, settings)
-    cpu_started = time.process_time()
-    _solved(job["method"], *window, dictionary, settings)
-    window_cpu_s = time.process_time() - cpu_started
+    _solved(job["method"], *_window(psi, frames), dictionary, settings)
     load, before = os.getloadavg()[0], reference()
     forget_peak()
     base_mib = peak_memory_mib()
@@ -85,8 +80,6 @@ def measured(job: dict) -> dict:
         "fastest_s": min(wall),
         "slowest_s": max(wall),
         "cpu_seconds": statistics.median(cpu),
-        "window_cpu_s": window_cpu_s,
-        "window_values": int(np.prod(window[0].light_field_shape)),
         "repeats": len(wall),
         "reference_s": (before.seconds + after.seconds) / 2,
         "reference_cpu_s": (before.cpu_seconds + after.cpu_seconds) / 2,

@@ -20,7 +20,7 @@ from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.calibrate.simulated import measured_stage, run_calibration
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.progress import Silent
-from emmc_rig.study.checks.rows import Row, target_row
+from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 
 Array = NDArray[np.floating]
 FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
@@ -30,7 +30,7 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     """All routes on the harsh bench: error of Psi, of the geometry, frames."""
     run = run_calibration(replace(settings, route="auto"))
     metrics = run.metrics
-    errors = metrics["psi_relative_error"]
+    errors, stated = metrics["psi_relative_error"], metrics["psi_stated_error"]
     parametric = run.outcome.parametric
     assert parametric is not None
     at, truth = parametric.fit.placement, true_parameters(settings.truth)
@@ -42,7 +42,12 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     turn = abs(np.degrees(at.rotation_rad - truth["rotation_rad"]))
     rows = [
         target_row("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
-        target_row("Psi, mixed", errors["mixed"], None, ".3%"),
+        target_row(
+            f"Psi, mixed (states {stated['mixed']:.2%})",
+            errors["mixed"],
+            2 * stated["mixed"],
+            ".3%",
+        ),
         target_row("Psi, free", errors["free"], 0.02, ".3%"),
         target_row("Psi, combined", errors["combined"], 0.005, ".3%"),
         target_row("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
@@ -51,6 +56,24 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         target_row("rotation, degrees", float(turn), 0.005, ".6f"),
     ]
     return rows, metrics
+
+
+def check_few(settings: CalibrateSettings) -> tuple[list[Row], dict]:
+    """The fitted mask from about ten whiteboards: open ones, halves and corners of the aperture."""
+    run = run_calibration(replace(settings, few=True, route="mixed"))
+    metrics = run.metrics
+    assert run.planned is not None
+    boards = sum(run.planned.counts.values())
+    chosen = metrics["chosen"]
+    error, stated = (metrics[f"psi_{key}_error"][chosen] for key in ("relative", "stated"))
+    once, twice = metrics["psi_coverage"][chosen]
+    rows = [
+        target_row("few: whiteboards", boards, 12, ".0f"),
+        target_row(f"few: true error of Psi ({chosen}, states {stated:.2%})", error, 0.005, ".2%"),
+        covered("few: within one deviation", once, COVERED),
+        covered("few: within two", twice, COVERED_TWICE),
+    ]
+    return rows, {**metrics, "whiteboards": boards}
 
 
 def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:

@@ -14,7 +14,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.progress import Watcher
-from emmc_rig.study.checks.bench import check_psi, check_sensor, check_stage
+from emmc_rig.study.checks.bench import check_few, check_psi, check_sensor, check_stage
 from emmc_rig.study.checks.effects import check_effect, effects
 from emmc_rig.study.checks.large import check_large
 from emmc_rig.study.checks.rows import Row
@@ -30,6 +30,7 @@ from emmc_rig.study.sweep import Results, Sweep, machine, sweep_folder
 
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "psi": check_psi,
+    "few": check_few,
     "bound": check_bound,
     "plan": check_plan,
     "sensor": check_sensor,

@@ -8,11 +8,10 @@ from dataclasses import replace
 from emmc_rig.calibrate.bench import BenchTruth
 from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.calibrate.simulated import run_calibration
-from emmc_rig.study.checks.rows import Row, target_row
+from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 from simulators.effects import EFFECTS, ORDINARY, TOGETHER, flawed
 
 TRUE_ERROR = 0.01
-COVERED, COVERED_TWICE, MARGIN = 0.683, 0.954, 0.03
 
 
 def effects(shipped: BenchTruth) -> Mapping[str, BenchTruth]:
@@ -31,8 +30,8 @@ def check_effect(settings: CalibrateSettings, name: str) -> tuple[list[Row], dic
     rows = [
         target_row(f"{name}: true error of Psi ({chosen}, states {stated:.2%})", true, TRUE_ERROR,
                ".2%"),
-        _covered(f"{name}: within one deviation", once, COVERED),
-        _covered(f"{name}: within two", twice, COVERED_TWICE),
+        covered(f"{name}: within one deviation", once, COVERED),
+        covered(f"{name}: within two", twice, COVERED_TWICE),
     ]  # fmt: skip
     return rows, {key: metrics[key] for key in KEPT}
 
@@ -48,8 +47,3 @@ KEPT = (
     "psi_stated_error",
     "psi_coverage",
 )
-
-
-def _covered(what: str, share: float, asked: float) -> Row:
-    met = abs(share - asked) <= MARGIN
-    return Row(what, f"{share:.1%}", f"{asked:.0%} +- {MARGIN:.0%}", "met" if met else "missed")

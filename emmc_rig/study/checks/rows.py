@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+COVERED, COVERED_TWICE, MARGIN = 0.683, 0.954, 0.03
 
 
 @dataclass(frozen=True)
@@ -27,3 +28,9 @@ def target_row(what: str, value: float, limit: float | None, form: str, above: b
     met = value >= limit if above else value <= limit
     asked = f"{'at least' if above else 'at most'} {limit:{form}}"
     return Row(what, format(value, form), asked, "met" if met else "missed")
+
+
+def covered(what: str, share: float, asked: float) -> Row:
+    """Return the row of a share of coefficients within so many stated deviations."""
+    met = abs(share - asked) <= MARGIN
+    return Row(what, f"{share:.1%}", f"{asked:.0%} +- {MARGIN:.0%}", "met" if met else "missed")

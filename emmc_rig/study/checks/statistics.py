@@ -20,7 +20,7 @@ from calibration.placement import (
     labels,
     with_aperture_mean_one,
 )
-from calibration.planning import REFERENCE_FRAMES
+from calibration.planning import REFERENCE_FRAMES, Kind, reading_variance
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import measure_psi
 from emmc_rig.calibrate.bench import (
@@ -65,12 +65,10 @@ def _noise_boards(
         channels = np.ascontiguousarray(layout.colour[0, ::k, ::k])
     found = []
     for one in wanted:
-        views_open = np.full(camera.views, one.pinhole is None)
-        if one.pinhole is not None:
-            views_open[one.pinhole] = True
+        views_open = one.views_open(camera.views)
         clean = shadow.readings(pixels, channels.ravel(), views_open, one.stage_um)
-        times = 1.0 if one.pinhole is None else light.pinhole_times
-        variance = light.noise.variance(clean, light.exposure_s * times, light.light) / one.repeats
+        kind = Kind(one.pinhole, one.stage_um, one.window)
+        variance = reading_variance(clean, kind, light) / one.repeats
         white = light.noise.variance(np.ones(1), light.exposure_s, light.light)[0]
         variance = variance + clean**2 * white / REFERENCE_FRAMES
         read = clean + rng.normal(0, 1, len(clean)) * np.sqrt(variance)

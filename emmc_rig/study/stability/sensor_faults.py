@@ -15,10 +15,15 @@ from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
 BLACK_DEVIATIONS = 6
+HEADROOM = 1.1
+"""Of the white level over a white reading, for its noise."""
+CFA_PERIOD = 12
+"""Pixels in which every known tile of colour filters repeats."""
 
 
 def exposure(setup: Setup, electrons: float) -> Trial:
     """A white reading is worth `electrons`, all shots together."""
+    setup = _with_room(setup, electrons)
     camera = setup.camera
     now = camera.sensor.noise.electrons_per_s * float(camera.exposures_s().sum())
     factor = electrons / now
@@ -31,6 +36,19 @@ def exposure(setup: Setup, electrons: float) -> Trial:
     return trial_of(
         setup.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots)
     )
+
+
+def _with_room(setup: Setup, electrons: float) -> Setup:
+    """Return the setup with a gain low enough that white in all shots' light is not clipped."""
+    noise, camera = setup.camera.sensor.noise, setup.camera
+    share = camera.exposures_s() / camera.exposures_s().sum()
+    side = CFA_PERIOD * camera.sensor.binning
+    light = float(pixel_light(camera, (side, side)).max())
+    room_dn = noise.white_level_dn - noise.black_level_dn
+    most = room_dn / (HEADROOM * electrons * float(share.max()) * light)
+    if most >= noise.gain_dn_per_electron:
+        return setup
+    return _with_noise(setup, {"gain_dn_per_electron": most})
 
 
 def read_noise(setup: Setup, electrons: float) -> Trial:
@@ -97,7 +115,8 @@ def _bad(setup: Setup, percent: float, listed: bool) -> Trial:
 FAULTS = (
     Fault(
         "exposure", "Exposure", "electrons at white",
-        (50_000, 15_500, 5_000, 1_500, 500, 150, 50, 15, 5), (15_500, 500, 50, 5),
+        (1_000_000, 200_000, 50_000, 15_500, 5_000, 1_500, 500, 150, 50, 15, 5),
+        (1_000_000, 15_500, 500, 50, 5),
         SENSOR, exposure,
     ),
     Fault(

@@ -1,0 +1,80 @@
+"""The command `emmc-rig design`: which mask to order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from emmc_rig.commands.options import ScenesOption, SeedOption, SizeOption
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from emmc_rig.study.design.check import Simulated
+
+
+def design(
+    bench: Annotated[
+        Path | None,
+        typer.Argument(help="a YAML file of what the bench has (default: see docs/design.md)"),
+    ] = None,
+    scene: ScenesOption = None,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="instead: does theory order cameras as simulation does"),
+    ] = False,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="folder to write (default: emmc-design or emmc-design-check)"),
+    ] = None,
+) -> None:
+    """Choose the mask to order: by theory, confirmed by simulation; a camera and a mask file."""
+    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.files.results import parse_size
+    from emmc_rig.study.design.bench import load_bench
+    from emmc_rig.study.design.designing import run_check, run_design
+
+    described = load_bench(bench)
+    sides = parse_size(size)
+    if check:
+        with shown_bars() as bars:
+            place = out or Path("emmc-design-check")
+            checked = run_check(described, scene or [], sides, seed, place, bars)
+        _show(checked.simulated)
+        ranks = ", ".join(f"{name} {rank:+.2f}" for name, rank in checked.ranks.items())
+        typer.echo(f"rank correlation of theory with simulation: {ranks}")
+        typer.echo(f"open {checked.page}")
+        return
+    with shown_bars() as bars:
+        place = out or Path("emmc-design")
+        designed = run_design(described, scene or [], sides, seed, place, bars)
+    best = designed.found.expected
+    loss_db = designed.found.ideal_db - best.psnr_db
+    typer.echo(designed.found.winner.label)
+    typer.echo(
+        f"expected {best.psnr_db:.2f} dB, {best.light:.0%} of the light, Fresnel number "
+        f"{best.fresnel:.2g}: diffraction costs {loss_db:.2f} dB"
+    )
+    _show(designed.simulated)
+    typer.echo(designed.verdict)
+    for line in designed.left_out:
+        say("left out", line)
+    typer.echo(f"open {designed.page}")
+
+
+def _show(found: Sequence[Simulated]) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    from emmc_rig.study.design.design_page import simulated_table
+
+    heads, rows = simulated_table(found)
+    table = Table(*heads, box=SIMPLE)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)

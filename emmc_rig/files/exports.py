@@ -1,0 +1,84 @@
+"""What is exported: a folder of a result, or a scene by its name, with all maps that it has."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
+from emmc_rig.files.formats import Export
+from emmc_rig.files.results import METRICS
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.errors import SceneError
+from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.model.reading import stored_arrays
+
+LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
+"""Of a result's folder."""
+IN_SESSION = "reconstruction"
+
+
+def open_export(spec: str, truth: str | None = None) -> Export:
+    """Open a result's folder, a session's reconstruction, or a scene, see `open_scene`.
+
+    truth: the scene that was captured, to compare with. Raises AppError or SceneError.
+    """
+    folder = Path(spec)
+    if is_session(folder):
+        folder = folder / IN_SESSION
+        if not (folder / LIGHT_FIELD).is_file():
+            raise AppError(f"{spec}: not reconstructed yet; run: emmc-rig reconstruct {spec}")
+    if (folder / LIGHT_FIELD).is_file():
+        light_field, maps = load_hdf5(folder / LIGHT_FIELD), read_maps(folder)
+        caption = _caption(folder)
+    else:
+        scene = open_scene(spec)
+        light_field, caption = scene.light_field, scene.provenance
+        maps = {} if scene.disparity_px is None else {"disparity": scene.disparity_px}
+    true = None
+    if truth is not None:
+        true = open_scene(truth, light_field.shape[2:4], light_field.shape[:2]).light_field
+        if true.shape != light_field.shape:
+            raise SceneError(f"{truth}: shape {true.shape}, but {spec} has {light_field.shape}")
+    fitting = {name: one for name, one in maps.items() if _fits(one, light_field.shape)}
+    return Export(
+        folder.resolve().name, caption, light_field, true, **{
+            name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")
+        },
+    )  # fmt: skip
+
+
+def read_maps(folder: Path) -> dict[str, NDArray]:
+    """Return the maps of a result's folder by name; empty where it has none."""
+    if not (folder / MAPS).is_file():
+        return {}
+    with stored_arrays(folder / MAPS, AppError, "reconstruct it again") as stored:
+        return {name: stored.array(name) for name in map(str, stored.file)}
+
+
+def save_maps(folder: Path, maps: Mapping[str, NDArray]) -> None:
+    """Write the maps of a result into its folder."""
+    with h5py.File(folder / MAPS, "w") as file:
+        for name, values in maps.items():
+            file.create_dataset(name, data=values, compression="lzf")
+
+
+def _fits(values: NDArray, shape: tuple[int, ...]) -> bool:
+    return values.shape in (shape[2:4], shape[:4])
+
+
+def _caption(folder: Path) -> str:
+    """Return what metrics.json says of a result, in one line."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+        told = [f"reconstructed by {metrics['method']}"]
+        if isinstance(metrics.get("psnr_db"), float):
+            told.append(f"{metrics['psnr_db']:.2f} dB against the truth")
+        return "; ".join([*told, f"verdict: {metrics['verdict']['level']}"])
+    return "a reconstructed light field"

@@ -1,0 +1,12 @@
+"""The formats that light fields are written in for others, by name; one module a family."""
+
+from emmc_rig.files.formats import displays, geometry, hci, lytro, ome_zarr, pictures
+from emmc_rig.files.formats.format import Export, Format
+
+FORMATS: dict[str, Format] = {
+    one.name: one
+    for module in (pictures, hci, lytro, ome_zarr, displays, geometry)
+    for one in module.FORMATS
+}
+
+__all__ = ["FORMATS", "Export", "Format"]

@@ -1,0 +1,109 @@
+"""Every view as a picture of its own: PNG of 8 or 16 bits, TIFF and EXR of floating values.
+
+Values are linear. PNG files say so by the chunk gAMA = 1, so that viewers that heed it show the
+scene as it looked; EXR files are linear by definition. Source: PNG 1.2, section 4.2.2.1.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.formats.format import Array, Export, Format, codes_of, write_picture
+
+IHDR_END = 33
+"""Of every PNG: signature 8, length 4, type 4, data 13, checksum 4."""
+VIEW = re.compile(r"view_(\d+)_(\d+)\.(tif|exr)")
+
+
+def _write_png(folder: Path, export: Export, bits: int) -> None:
+    for v, u in np.ndindex(export.light_field.shape[:2]):
+        path = folder / f"view_{v}_{u}.png"
+        write_picture(path, codes_of(export.light_field[v, u], bits))
+        path.write_bytes(_tagged_linear(path.read_bytes()))
+
+
+def _tagged_linear(png: bytes) -> bytes:
+    """Return a PNG with the chunk that says gamma 1, in hundred thousandths."""
+    chunk = b"gAMA" + struct.pack(">I", 100_000)
+    whole = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return png[:IHDR_END] + whole + png[IHDR_END:]
+
+
+def _write_tiff(folder: Path, export: Export) -> None:
+    for v, u in np.ndindex(export.light_field.shape[:2]):
+        view = np.ascontiguousarray(export.light_field[v, u], np.float32)
+        tifffile.imwrite(
+            folder / f"view_{v}_{u}.tif", view, photometric="rgb", compression="zlib",
+            description="linear RGB, 1 is white",
+        )  # fmt: skip
+
+
+def _openexr():
+    try:
+        import OpenEXR
+    except ImportError:
+        raise AppError('EXR needs OpenEXR: pip install "emmc-rig[formats]"') from None
+    return OpenEXR
+
+
+def _write_exr(folder: Path, export: Export) -> None:
+    openexr = _openexr()
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    for v, u in np.ndindex(export.light_field.shape[:2]):
+        view = np.ascontiguousarray(export.light_field[v, u], np.float32)
+        with openexr.File(header, {"RGB": view}) as file:
+            file.write(str(folder / f"view_{v}_{u}.exr"))
+
+
+def _read_exr(path: Path) -> NDArray:
+    with _openexr().File(str(path)) as file:
+        return file.channels()["RGB"].pixels
+
+
+def _views(path: Path, ending: str) -> dict[tuple[int, int], Path]:
+    if not path.is_dir():
+        return {}
+    found = ((VIEW.fullmatch(one.name), one) for one in path.iterdir())
+    return {(int(m[1]), int(m[2])): one for m, one in found if m and m[3] == ending}
+
+
+def _holds(path: Path, ending: str) -> bool:
+    return bool(_views(path, ending))
+
+
+def _read(path: Path, ending: str) -> Array:
+    views = _views(path, ending)
+    rows, columns = (max(place[k] for place in views) + 1 for k in (0, 1))
+    missing = [place for place in np.ndindex(rows, columns) if place not in views]
+    if missing:
+        raise AppError(f"{path}: view_{missing[0][0]}_{missing[0][1]}.{ending} is missing")
+    read = tifffile.imread if ending == "tif" else _read_exr
+    try:
+        pictures = [read(views[place]) for place in np.ndindex(rows, columns)]
+        stacked = np.stack(pictures).astype(np.float32)
+    except (OSError, ValueError, KeyError, RuntimeError, tifffile.TiffFileError) as fault:
+        raise AppError(f"{path}: views cannot be read ({fault}); copy them again") from fault
+    return stacked.reshape(rows, columns, *stacked.shape[1:])
+
+
+FORMATS = (
+    Format("png8", "view_ROW_COL.png", "8 bits, linear, tagged so", partial(_write_png, bits=8)),
+    Format("png16", "view_ROW_COL.png", "16 bits, linear, tagged so", partial(_write_png, bits=16)),
+    Format(
+        "tiff", "view_ROW_COL.tif", "32-bit floating values, linear", _write_tiff,
+        partial(_holds, ending="tif"), partial(_read, ending="tif"),
+    ),
+    Format(
+        "exr", "view_ROW_COL.exr", "32-bit floating values, linear", _write_exr,
+        partial(_holds, ending="exr"), partial(_read, ending="exr"),
+    ),
+)  # fmt: skip

@@ -1,0 +1,73 @@
+"""Zarr groups (v3, sharded): arrays that many processes write at once, a shard each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.lightfield import check_light_field
+from emmc_rig.model.reading import one_line, shown_path
+
+ENDING = ".zarr"
+CHUNK, SHARD = 128, 512
+"""Samples a side of what is read at once, and of one file."""
+
+Place = tuple[slice, slice]
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError as fault:
+        raise AppError("Zarr is not installed: pip install 'emmc-rig[zarr]'") from fault
+    return zarr
+
+
+def created_group(folder: Path) -> Any:
+    """Return a new group in a folder that must not exist; raises AppError without Zarr."""
+    return _zarr().create_group(folder, zarr_format=3)
+
+
+def create_array(
+    group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype, axes: int
+) -> list[Place]:
+    """Create an array with `axes` axes before (y, x); return the places of its shards.
+
+    A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK.
+    """
+    after = shape[axes + 2 :]
+    group.create_array(
+        name,
+        shape=shape,
+        dtype=dtype,
+        chunks=(*(1,) * axes, CHUNK, CHUNK, *after),
+        shards=(*shape[:axes], SHARD, SHARD, *after),
+    )
+    rows, columns = shape[axes : axes + 2]
+    return [
+        (slice(top, min(top + SHARD, rows)), slice(left, min(left + SHARD, columns)))
+        for top in range(0, rows, SHARD)
+        for left in range(0, columns, SHARD)
+    ]
+
+
+def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
+    """Return an array of a group, not read; raises AppError where there is none."""
+    zarr = _zarr()
+    try:
+        found = zarr.open_group(folder, mode=mode)[name]
+    except (OSError, KeyError, ValueError, TypeError) as fault:
+        raise AppError(
+            f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
+        ) from fault
+    return found
+
+
+def load_light_field(folder: Path) -> NDArray[np.float32]:
+    """Return the array `light_field` of a group, all of it; raises AppError or SceneError."""
+    found = np.asarray(opened_array(folder, "light_field")[...])
+    return check_light_field(found, shown_path(folder)).astype(np.float32)

@@ -1,0 +1,351 @@
+"""The light field while the camera watches: coarse at once, `reconstruct`'s own when nothing moves.
+
+Every frame moves a preview on (`reconstruction.preview`). Once the scene has stood still, a
+reconstruction of the frame that it stands still at runs beside, by the same call as
+`emmc-rig reconstruct` makes, and is dropped as soon as something changes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.bracket import fuse
+from calibration.errors import CalibrationError
+from drivers.raw import RawFrame
+from emmc_rig.errors import AppError
+from emmc_rig.model.errors import SensingError
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.pages.frame_view import srgb_codes
+from emmc_rig.session.readings import Scale
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import DEFAULT_METHOD
+from reconstruction.preview import Preview
+from reconstruction.result import Progress, Reconstruction
+from reconstruction.verdict.rules import Verdict
+from reconstruction.verdict.run import reconstruct_judged
+
+Array = NDArray[np.floating]
+FACTOR = 4
+"""Samples along each axis that the preview takes as one: quarter size."""
+STEPS = 3
+"""Of the preview for each frame."""
+STILL_S = 1.5
+"""How long nothing changes before the reconstruction begins."""
+CHANGED = 4.0
+"""Mean square of the difference of two frames in a block, over its variance, from which on the
+scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
+BLOCK_PX = 16
+ANOTHER_BRIGHTNESS = 1.2
+LONGEST_SHEET_PX = 4096
+SURE_PX = 0.15
+"""Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
+WINDOW_PX = 7
+
+Solve = Callable[..., tuple[Reconstruction, Verdict]]
+
+
+class _ChangedError(Exception):
+    """The scene is another one than that being reconstructed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """What the page draws from: all views side by side, and the centre view's disparity.
+
+    sheet: (V y, U x, BGR). disparity: (y, x) in pixels of the sheet per view step, NaN where the
+    views do not tell.
+    """
+
+    number: int
+    views: tuple[int, int]
+    sheet: NDArray[np.uint8]
+    disparity: NDArray[np.float32]
+
+
+class LiveLightField:
+    """Follows frames; `update` is called by one thread, all else by any.
+
+    scale: Psi, and what turns frames into its readings. method: of the reconstruction. preview:
+    what the last frame moved on; None before the first.
+    """
+
+    def __init__(
+        self,
+        scale: Scale,
+        method: str = DEFAULT_METHOD,
+        solve: Solve = reconstruct_judged,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._scale, self._method, self._solve, self._clock = scale, method, solve, clock
+        self._held: dict[int, RawFrame] = {}
+        self._since_s = clock()
+        self.preview: Preview | None = None
+        self._level = 0.0
+        self._pictures: Pictures | None = None
+        self._numbers = 0
+        self._lock = threading.Lock()
+        self._run: _Refinement | None = None
+        self._drawn: _Refinement | None = None
+
+    @property
+    def psi(self) -> ImagingMatrix:
+        """Of all shots."""
+        return self._scale.psi
+
+    def close(self) -> None:
+        """Give up a reconstruction under way."""
+        self._give_up()
+
+    def pictures(self) -> Pictures | None:
+        """Return what was drawn last; None before the first."""
+        return self._pictures
+
+    def refined(self) -> tuple[Reconstruction, Verdict] | None:
+        """Return the finished reconstruction of what stands still; None while there is none."""
+        return None if self._run is None else self._run.result
+
+    def update(self, frame: RawFrame, shot: int | None = 0) -> dict[str, Any]:
+        """Take a frame of a shot (None: of no shot of Psi), and return what there is to say.
+
+        Raises AppError for frames that do not fit Psi.
+        """
+        expected = self.psi.frames_shape[1:]
+        if frame.mosaic.shape != expected:
+            raise AppError(
+                f"the Psi is for frames of {expected[0]}x{expected[1]} pixels, the camera sends "
+                f"{frame.mosaic.shape[0]}x{frame.mosaic.shape[1]}"
+            )
+        if shot is None:
+            return self._report("the mask stands at no shot of this Psi")
+        if shot not in self._held or self._changed(shot, frame):
+            if shot in self._held:
+                self._held.clear()
+            self._held[shot] = frame
+            self._since_s = self._clock()
+            self._give_up()
+        try:
+            if self._run is None:
+                self._go_on()
+            if self._run is None and self._clock() - self._since_s >= STILL_S:
+                self._run = _Refinement(*self._problem(), self._method, self._solve)
+        except (SensingError, ReconstructionError, CalibrationError) as fault:
+            return self._report(str(fault))
+        run = self._run
+        if run is not None and run.result is not None and self._drawn is not run:
+            self._drawn = run
+            found = run.result[0]
+            self._draw(found.light_field, found.maps.get("disparity"))
+        return self._report("")
+
+    def _give_up(self) -> None:
+        run, self._run = self._run, None
+        if run is not None:
+            run.give_up()
+
+    def _changed(self, shot: int, frame: RawFrame) -> bool:
+        """Return whether a frame differs from the held one of its shot by more than noise."""
+        held = self._held[shot]
+        one, other = self._rate(frame), self._rate(held)
+        gain, dark = self._scale.gain, self._scale.dark
+        mean = np.maximum((one + other) / 2, 0)
+        variance = sum(
+            (gain.gain_dn_per_electron * mean + dark.variance_dn2 / exposure_s) / exposure_s
+            for exposure_s in (_exposure_s(frame), _exposure_s(held))
+        )
+        square = np.where(self._scale.good, (one - other) ** 2 / variance, 1.0)
+        return bool(cv2.blur(square, (BLOCK_PX, BLOCK_PX)).max() > CHANGED)
+
+    def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
+        """Return DN per second above the dark, (y, x)."""
+        return (frame.mosaic - self._scale.dark.mean_dn) / np.float32(_exposure_s(frame))
+
+    def _of_shots(self) -> tuple[list[int], ImagingMatrix]:
+        shots = sorted(self._held)
+        whole = shots == list(range(self.psi.shots))
+        return shots, self.psi if whole else self.psi.of_shots(shots)
+
+    def _go_on(self) -> None:
+        """Move the preview on by the frames held."""
+        shots = sorted(self._held)
+        white = self._scale.white_dn_per_s[shots]
+        seen = (white > 0) & self._scale.good
+        readings = np.stack([self._rate(self._held[shot]) for shot in shots])
+        readings = np.where(seen, readings / np.where(seen, white, 1), 0).astype(np.float32)
+        level = float(readings[seen].mean())
+        if level <= 0:
+            raise ReconstructionError("the picture is dark: no light field to see")
+        factor = max(self._level / level, level / max(self._level, 1e-12))
+        if self.preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
+            psi = self._of_shots()[1]
+            self._shots, self._level = len(shots), level
+            step = FACTOR // np.gcd(FACTOR, psi.binning) * psi.binning
+            noise = self._noise(shots, readings)
+            self.preview = Preview(psi, int(step), readings, noise, seen)
+        self.preview.follow(readings, STEPS)
+        self._draw(self.preview.light_field, None)
+
+    _shots = 0
+
+    def _noise(self, shots: list[int], readings: Array) -> float:
+        """Return the typical deviation of readings."""
+        white = self._scale.white_dn_per_s[shots]
+        exposures_s = np.array([_exposure_s(self._held[shot]) for shot in shots])[:, None, None]
+        full = np.where(white > 0, white, np.inf) * exposures_s
+        dn = np.maximum(readings, 0) * np.where(np.isfinite(full), full, 0)
+        variance = self._scale.gain.gain_dn_per_electron * dn + self._scale.gain.dark_variance_dn2
+        return float(np.sqrt(np.mean(variance / full**2)))
+
+    def _problem(self) -> tuple[ImagingMatrix, Frames]:
+        """Return Psi and the frames held, as `emmc-rig reconstruct` takes them of a session."""
+        shots, psi = self._of_shots()
+        scale = self._scale
+        readings, deviation = np.empty(psi.frames_shape, np.float32), np.empty(psi.frames_shape)
+        usable = np.empty(psi.frames_shape, bool)
+        for place, shot in enumerate(shots):
+            held = self._held[shot]
+            linear = fuse(
+                [held.mosaic], [_exposure_s(held)], scale.dark, scale.gain, held.white_level_dn
+            )
+            seen = scale.white_dn_per_s[shot] > 0
+            white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
+            readings[place] = linear.dn_per_s / white
+            deviation[place] = np.sqrt(linear.variance / white**2)
+            usable[place] = linear.usable & seen & scale.good
+        return psi, Frames(readings, deviation, usable)
+
+    def _draw(self, light_field: Array, disparity: Array | None) -> None:
+        self._numbers += 1
+        views_v, views_u, high, wide, _ = light_field.shape
+        shrink = max(1, int(np.ceil(max(views_v * high, views_u * wide) / LONGEST_SHEET_PX)))
+        size = wide // shrink, high // shrink
+        tiles = [[_fitted(light_field[v, u], size) for u in range(views_u)] for v in range(views_v)]
+        linear = np.concatenate([np.concatenate(row, axis=1) for row in tiles], axis=0)
+        if disparity is None:
+            small = np.stack([np.stack(row) for row in tiles])
+            found = disparity_of(small)
+        else:
+            found = _fitted(np.asarray(disparity), size) / np.float32(shrink)
+        sheet = np.ascontiguousarray(srgb_codes(linear)[..., ::-1])
+        self._pictures = Pictures(self._numbers, (views_v, views_u), sheet, found)
+
+    def _report(self, why: str) -> dict[str, Any]:
+        """Return what the page says: what is shown, how far a reconstruction is, the verdict."""
+        pictures, run = self._pictures, self._run
+        stage, verdict = "preview", None
+        if run is not None and run.result is not None:
+            found, judged = run.result
+            stage = f"{found.method}: {found.status} in {found.seconds:.1f} s, as `reconstruct`"
+            verdict = {"level": judged.level, "words": judged.words}
+        elif run is not None and run.fault:
+            why = run.fault
+        elif run is not None:
+            stage = f"preview; {self._method} at work, step {run.step}"
+        shown = None
+        if pictures is not None:
+            known = pictures.disparity[np.isfinite(pictures.disparity)]
+            rows, columns = pictures.sheet.shape[:2]
+            shown = {
+                "number": pictures.number,
+                "views": list(pictures.views),
+                "size": [rows // pictures.views[0], columns // pictures.views[1]],
+                "disparities": [float(d) for d in np.percentile(known, (5, 95))]
+                if known.size
+                else None,
+            }
+        return {
+            "stage": stage,
+            "why": why,
+            "shots": [len(self._held), self.psi.shots],
+            "pictures": shown,
+            "verdict": verdict,
+        }
+
+
+class _Refinement:
+    """A reconstruction in a thread of its own, which can be given up between two steps."""
+
+    def __init__(self, psi: ImagingMatrix, frames: Frames, method: str, solve: Solve) -> None:
+        self.result: tuple[Reconstruction, Verdict] | None = None
+        self.fault = ""
+        self.step = 0
+        self._given_up = threading.Event()
+        self._work = psi, frames, method, solve
+        threading.Thread(target=self._run, name="live reconstruction", daemon=True).start()
+
+    def give_up(self) -> None:
+        """End at the next step."""
+        self._given_up.set()
+
+    def _run(self) -> None:
+        psi, frames, method, solve = self._work
+        try:
+            self.result = solve(
+                method,
+                psi,
+                frames.readings,
+                frames.noise_sigma,
+                None,
+                None,
+                frames.usable,
+                self._on_step,
+            )
+        except _ChangedError:
+            return
+        except (ReconstructionError, SensingError) as fault:
+            self.fault = str(fault)
+
+    def _on_step(self, progress: Progress) -> None:
+        if self._given_up.is_set():
+            raise _ChangedError
+        self.step = progress.step
+
+
+def _exposure_s(frame: RawFrame) -> float:
+    if not frame.exposure_s:
+        raise AppError("the camera does not say how long its frames were exposed")
+    return float(frame.exposure_s)
+
+
+def _fitted(view: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return a picture (y, x[, c]) at size (x, y)."""
+    if view.shape[1::-1] == size:
+        return np.asarray(view, np.float32)
+    whole = np.ascontiguousarray(view, np.float32)
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def disparity_of(light_field: Array) -> NDArray[np.float32]:
+    """Return the disparity of small views, (y, x), pixels per view step; NaN where not decided.
+
+    light_field: (v, u, y, x, c). Where views are shifted by less than a pixel, brightness stays
+    along lines of slope d: L_u = -d L_x and L_v = -d L_y, solved by least squares over a window
+    and all views (Bolles, Baker and Marimont 1987; as Lucas and Kanade 1981 for flow).
+    """
+    grey = light_field.mean(axis=-1, dtype=np.float32)
+    by_v, by_u, by_y, by_x = (
+        np.gradient(grey, axis=axis) if grey.shape[axis] > 1 else np.zeros_like(grey)
+        for axis in range(4)
+    )
+
+    def gathered(values: Array) -> Array:
+        return cv2.blur(values.sum(axis=(0, 1)), (WINDOW_PX, WINDOW_PX))
+
+    power = gathered(by_x**2 + by_y**2)
+    product = gathered(by_u * by_x + by_v * by_y)
+    change = gathered(by_u**2 + by_v**2)
+    safe = np.maximum(power, 1e-12)
+    found = -product / safe
+    left = np.maximum(change - product**2 / safe, 0)
+    # Views that differ by interpolation are no independent witnesses: one window of pixels counts.
+    deviation = np.sqrt(left / safe / WINDOW_PX)
+    sure = (deviation < SURE_PX) & (power > 1e-4 * float(power.max() + 1e-12))
+    return np.where(sure, found, np.nan).astype(np.float32)

@@ -1,0 +1,189 @@
+"""Pictures from where no view was: between the views, by their disparities, and through apertures.
+
+Positions are in view steps: (v, u) = (1.5, 2) lies halfway between two views of column 2. Samples
+between pixels are bilinear, and beyond an edge its last pixel continues. The viewer's shader is
+the twin of `between` and `photograph`: what is changed here is changed in `viewer.js` too.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from emmc_rig.model.lightfield import centre_view, focus_disparities, shear
+
+Array = NDArray[np.floating]
+STEPS = 3
+"""Fixed point steps from a view's disparity to that of the ray; shifts are below one view step."""
+TOLERANCE_PX = 0.25
+"""Disparities this far apart are of two surfaces; below the least step that occlusion shows."""
+LEAST_WEIGHT = 1e-3
+"""Of a view that no other confirms: what no view sees is shown as the views have it."""
+CANDIDATES, WINDOW_PX = 33, 7
+"""Disparities tried, and the side of the square over which views are compared."""
+UNSEEN = np.finfo(np.float32).max
+"""What OpenCV takes a picture to have beyond its edge, where the least is looked for."""
+CRACK_SHARE = 0.5
+"""Of unseen samples around one: fewer are a crack in a surface that widens, not its outline."""
+LARGEST_PX = 320
+"""Width of the views that disparity is estimated on."""
+
+
+def sampled(picture: Array, y: Array, x: Array) -> Array:
+    """Return a picture (y, x) or (y, x, c) at places (y, x), bilinear."""
+    if picture.ndim == 3:
+        return np.stack([sampled(picture[..., c], y, x) for c in range(picture.shape[2])], axis=-1)
+    return map_coordinates(picture, (y, x), order=1, mode="nearest", output=np.float32)
+
+
+def estimated_disparity(light_field: Array) -> NDArray[np.float32]:
+    """Return a disparity (y, x) of the centre view, pixels per view step, by a plane sweep.
+
+    At each place the disparity at which the views agree best, over a small window; for methods
+    that estimate none. Even places have the disparity that happens to agree best there.
+    """
+    height, width = light_field.shape[2:4]
+    shrink = max(1.0, width / LARGEST_PX)
+    size = max(2, round(width / shrink)), max(2, round(height / shrink))
+    grey = light_field.mean(axis=4, dtype=np.float32)
+    small = np.stack(
+        [
+            cv2.resize(grey[place], size, interpolation=cv2.INTER_AREA)
+            for place in np.ndindex(grey.shape[:2])
+        ]
+    ).reshape(*grey.shape[:2], size[1], size[0], 1)
+    back, _, front = focus_disparities(light_field)
+    margin = max(0.15 * (front - back), 0.1)
+    tried = np.linspace(back - margin, front + margin, CANDIDATES) / shrink
+    cost = np.stack(
+        [
+            cv2.blur(shear(small, float(d)).var(axis=(0, 1))[..., 0], (WINDOW_PX, WINDOW_PX))
+            for d in tried
+        ]
+    )
+    best = cv2.medianBlur(tried[cost.argmin(axis=0)].astype(np.float32), 5)
+    return cv2.resize(best, (width, height), interpolation=cv2.INTER_NEAREST) * np.float32(shrink)
+
+
+def view_disparities(centre: Array, views: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the disparity (v, u, y, x) that every view sees, from that of the centre view.
+
+    Surfaces move with the view, near ones over far ones; what they uncover continues what lies
+    behind.
+    """
+    height, width = centre.shape
+    order = np.argsort(centre, axis=None)
+    rows, columns = np.divmod(order, width)
+    depth = centre.ravel()[order].astype(np.float32)
+    seen = np.empty((*views, height, width), np.float32)
+    for v, u in np.ndindex(*views):
+        y = np.rint(rows + depth * (v - views[0] // 2)).astype(int)
+        x = np.rint(columns + depth * (u - views[1] // 2)).astype(int)
+        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        view = np.full((height, width), UNSEEN, np.float32)
+        view[y[inside], x[inside]] = depth[inside]  # the nearest comes last
+        if not inside.any():
+            view[:] = centre
+        hole = view == UNSEEN
+        cracks = hole & (cv2.blur(hole.astype(np.float32), (3, 3)) < CRACK_SHARE)
+        view[cracks] = cv2.erode(view, np.ones((3, 3), np.uint8))[cracks]
+        # What a near thing uncovers is as wide as it moved against what lies behind it.
+        steps = max(abs(v - views[0] // 2), abs(u - views[1] // 2))
+        wide = 2 * int(np.ceil(steps * (depth[-1] - depth[0]))) + 3
+        while (hole := view == UNSEEN).any():
+            view[hole] = cv2.erode(view, np.ones((wide, wide), np.uint8))[hole]
+        seen[v, u] = cv2.medianBlur(view, 3)
+    return seen
+
+
+def between(light_field: Array, disparities: Array, v: float, u: float) -> Array:
+    """Return the picture (y, x, c) at a position between the views.
+
+    Each ray takes its colour from the four views around it, where its surface is in them. Views
+    whose disparity does not confirm the surface, and surfaces behind a nearer one, count little.
+
+    Args:
+        light_field: (v, u, y, x, c).
+        disparities: (v, u, y, x), see `view_disparities`.
+        v, u: position, 0 to the number of views less one.
+    """
+    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
+    least, most = float(disparities.min()), float(disparities.max())
+    top, left = (
+        min(max(int(np.floor(at)), 0), max(count - 2, 0))
+        for at, count in zip((v, u), light_field.shape, strict=False)
+    )
+    found = []
+    for j, i in ((top, left), (top, left + 1), (top + 1, left), (top + 1, left + 1)):
+        share = (1 - abs(j - v)) * (1 - abs(i - u))
+        if share <= 0:
+            continue
+
+        def at(d, picture, j=j, i=i):
+            return sampled(picture[j, i], y + d * np.float32(j - v), x + d * np.float32(i - u))
+
+        d = disparities[j, i]
+        for guess in (least, (least + most) / 2, most):
+            d = np.maximum(d, at(np.float32(guess), disparities))
+        for _ in range(STEPS):
+            d = at(d, disparities)
+        missed = np.abs(at(d, disparities) - d)
+        found.append((np.float32(share), d, missed, at(d, light_field)))
+    nearest = np.max([d - missed for _, d, missed, _ in found], axis=0)
+    total = np.zeros(light_field.shape[2:], np.float32)
+    weights = np.zeros_like(nearest)
+    for share, d, missed, colour in found:
+        agreeing = 1 / (1 + (missed / TOLERANCE_PX) ** 2)
+        weight = share * (
+            agreeing * np.exp(-(nearest - (d - missed)) / TOLERANCE_PX) + LEAST_WEIGHT
+        )
+        total += weight[..., None] * colour
+        weights += weight
+    return total / weights[..., None]
+
+
+def photograph(
+    light_field: Array,
+    disparities: Array,
+    v: float,
+    u: float,
+    focus_px: float,
+    aperture: float,
+    gamma: float = 1.0,
+) -> Array:
+    """Return the picture (y, x, c) through an aperture around a position, focused on a disparity.
+
+    Ng et al. 2005, eq. 5, over the views that the aperture lets through: those nearer than its
+    radius, in view steps, and partly those less than a step further. A closed one is `between`.
+    gamma: of the light field's values; light is averaged, not codes.
+    """
+    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
+    total = np.zeros(light_field.shape[2:], np.float32)
+    weights = max(0.0, 1.0 - aperture)
+    if weights:
+        pinhole = between(light_field, disparities, v, u)
+        if aperture <= 0:
+            return pinhole
+        total += np.float32(weights) * np.maximum(pinhole, 0) ** np.float32(gamma)
+    for j, i in np.ndindex(light_field.shape[:2]):
+        weight = min(max(aperture - float(np.hypot(j - v, i - u)), 0.0), 1.0)
+        if weight:
+            shift = np.float32(focus_px)
+            seen = sampled(
+                light_field[j, i], y + shift * np.float32(j - v), x + shift * np.float32(i - u)
+            )
+            total += np.float32(weight) * np.maximum(seen, 0) ** np.float32(gamma)
+            weights += weight
+    return (total / np.float32(weights)) ** np.float32(1 / gamma)
+
+
+def centre_disparity(light_field: Array, disparity: Array | None) -> NDArray[np.float32]:
+    """Return a finite disparity (y, x) of the centre view: the given one, or an estimate."""
+    if disparity is None or disparity.shape != centre_view(light_field).shape[:2]:
+        return estimated_disparity(light_field)
+    middle = (
+        float(np.median(disparity[np.isfinite(disparity)])) if np.isfinite(disparity).any() else 0.0
+    )
+    return np.nan_to_num(disparity.astype(np.float32), nan=middle, posinf=middle, neginf=middle)

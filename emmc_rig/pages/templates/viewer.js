@@ -1,0 +1,539 @@
+"use strict";
+// A light field to turn, focus and look into. The shader is the twin of model/novel_view.py.
+(() => {
+const data = JSON.parse(document.getElementById("viewer-data").textContent);
+if (!data.estimate) { // a part of a report, which holds the views already
+  const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
+  Object.assign(data, { estimate, truth });
+}
+const byId = (id) => document.getElementById(`viewer-${id}`);
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const { rows, columns, width, height } = data.views;
+const padded = (length) => Math.ceil(length / data.tile) * data.tile;
+const tileWidth = padded(width), tileHeight = padded(height), count = rows * columns;
+const farthest = Math.hypot(rows - 1, columns - 1) + 1;
+const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus.at, aperture: 0, wipe: 0 });
+const state = { ...home(), overlay: -1, x: width >> 1, y: height >> 1 };
+const picture = byId("picture");
+let renderer, atlases = {}, depth, overlayLevels = [];
+
+async function decoded(uri) {
+  const image = new Image();
+  image.src = uri;
+  await image.decode();
+  const canvas = document.createElement("canvas");
+  canvas.width = image.naturalWidth;
+  canvas.height = image.naturalHeight;
+  canvas.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
+  return canvas;
+}
+
+const VERTEX = `#version 300 es
+void main() {
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2DArray;
+uniform sampler2DArray views, depths;
+uniform sampler2D overlay;
+uniform ivec2 grid;
+uniform vec2 size, range, position;  // position: (u, v), in view steps
+uniform float focus, aperture, gamma, wipe, opacity;
+uniform bool compared;
+out vec4 colour;
+
+const float TOLERANCE = 0.25, LEAST = 1e-3;
+
+vec2 p;
+int first;  // layer of the first view: the truth's or the estimate's
+
+int layer(ivec2 view) { return view.y * grid.x + view.x; }
+vec3 seen(ivec2 view, vec2 at) { return texture(views, vec3((at + 0.5) / size, first + layer(view))).rgb; }
+float depthAt(ivec2 view, vec2 at) {
+  return mix(range.x, range.y, texture(depths, vec3((at + 0.5) / size, layer(view))).r);
+}
+
+vec3 between(out float surface) {
+  ivec2 corner = clamp(ivec2(floor(position)), ivec2(0), max(grid - 2, ivec2(0)));
+  vec3 colours[4];
+  float shares[4], found[4], missed[4], nearest = -1e9;
+  for (int k = 0; k < 4; k++) {
+    ivec2 view = corner + ivec2(k & 1, k >> 1);
+    vec2 away = vec2(view) - position;
+    shares[k] = max((1.0 - abs(away.x)) * (1.0 - abs(away.y)), 0.0);
+    if (shares[k] <= 0.0) continue;
+    float d = depthAt(view, p);
+    for (int guess = 0; guess < 3; guess++)
+      d = max(d, depthAt(view, p + mix(range.x, range.y, float(guess) * 0.5) * away));
+    for (int step = 0; step < 3; step++) d = depthAt(view, p + d * away);
+    missed[k] = abs(depthAt(view, p + d * away) - d);
+    found[k] = d;
+    colours[k] = seen(view, p + d * away);
+    nearest = max(nearest, d - missed[k]);
+  }
+  vec3 total = vec3(0.0);
+  float weights = 0.0;
+  surface = 0.0;
+  for (int k = 0; k < 4; k++) {
+    if (shares[k] <= 0.0) continue;
+    float off = missed[k] / TOLERANCE;
+    float weight = shares[k] * (exp(-(nearest - (found[k] - missed[k])) / TOLERANCE) / (1.0 + off * off) + LEAST);
+    total += weight * colours[k];
+    surface += weight * found[k];
+    weights += weight;
+  }
+  surface /= weights;
+  return total / weights;
+}
+
+void main() {
+  p = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - 0.5;
+  first = compared && p.x + 0.5 < wipe * size.x ? grid.x * grid.y : 0;
+  float surface = focus, weights = max(0.0, 1.0 - aperture);
+  vec3 total = vec3(0.0);
+  if (weights > 0.0 || opacity > 0.0) {
+    vec3 pinhole = between(surface);
+    colour = vec4(pinhole, 1.0);
+    total = weights * pow(pinhole, vec3(gamma));
+  }
+  if (aperture > 0.0) {
+    for (int j = 0; j < grid.y; j++)
+      for (int i = 0; i < grid.x; i++) {
+        vec2 away = vec2(i, j) - position;
+        float weight = clamp(aperture - length(away), 0.0, 1.0);
+        if (weight <= 0.0) continue;
+        total += weight * pow(seen(ivec2(i, j), p + focus * away), vec3(gamma));
+        weights += weight;
+      }
+    colour = vec4(pow(total / weights, vec3(1.0 / gamma)), 1.0);
+  }
+  if (opacity > 0.0) {
+    vec2 centre = vec2(grid / 2);
+    vec3 laid = texture(overlay, (p + surface * (centre - position) + 0.5) / size).rgb;
+    colour.rgb = mix(colour.rgb, laid, opacity);
+  }
+}`;
+
+function webgl(canvas) {
+  const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
+  if (!gl || gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS) < 2 * count) return null;
+  const program = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  const at = (name) => gl.getUniformLocation(program, name);
+  gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+
+  function texture(unit, kind) {
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(kind, gl.createTexture());
+    for (const [name, value] of [
+      [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
+      [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+    ]) gl.texParameteri(kind, name, value);
+  }
+  function layers(unit, format, sources, pixels) {
+    texture(unit, gl.TEXTURE_2D_ARRAY);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, width, height, count * sources.length);
+    sources.forEach((source, k) => {
+      const context = source.getContext("2d");
+      for (let view = 0; view < count; view++) {
+        const tile = context.getImageData(
+          (view % columns) * tileWidth, Math.floor(view / columns) * tileHeight, width, height);
+        pixels(tile, k * count + view);
+      }
+    });
+  }
+  const sources = atlases.truth ? [atlases.estimate, atlases.truth] : [atlases.estimate];
+  layers(0, gl.RGBA8, sources, (tile, layer) =>
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGBA, gl.UNSIGNED_BYTE, tile.data));
+  // Half floats are filtered finer than bytes, and hold every code of a byte.
+  layers(1, gl.R16F, [depth], (tile, layer) => {
+    const codes = new Float32Array(width * height);
+    for (let i = 0; i < codes.length; i++) codes[i] = tile.data[4 * i] / 255;
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RED, gl.FLOAT, codes);
+  });
+  texture(2, gl.TEXTURE_2D);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  gl.uniform1i(at("views"), 0);
+  gl.uniform1i(at("depths"), 1);
+  gl.uniform1i(at("overlay"), 2);
+  gl.uniform2i(at("grid"), columns, rows);
+  gl.uniform2f(at("size"), width, height);
+  gl.uniform2f(at("range"), data.disparity.low, data.disparity.high);
+  gl.uniform1f(at("gamma"), data.gamma);
+  gl.uniform1i(at("compared"), atlases.truth ? 1 : 0);
+  const [position, focus, aperture, wipe, opacity] =
+    ["position", "focus", "aperture", "wipe", "opacity"].map(at);
+  gl.viewport(0, 0, width, height);
+  return {
+    kind: "WebGL2",
+    draw() {
+      gl.uniform2f(position, state.u, state.v);
+      gl.uniform1f(focus, state.focus);
+      gl.uniform1f(aperture, state.aperture);
+      gl.uniform1f(wipe, state.wipe);
+      gl.uniform1f(opacity, state.overlay < 0 ? 0 : 0.7);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    },
+    lay(coloured) {
+      gl.activeTexture(gl.TEXTURE2);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, coloured.data);
+    },
+    finish() { gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); },
+  };
+}
+
+// Without WebGL2: the nearest view, and views laid over each other in equal shares.
+function plain(canvas) {
+  const context = canvas.getContext("2d");
+  let laid = null;
+  const view = (source, v, u, dx, dy) => context.drawImage(
+    source, u * tileWidth, v * tileHeight, width, height, dx, dy, width, height);
+  function scene(source) {
+    const open = [];
+    for (let v = 0; v < rows; v++)
+      for (let u = 0; u < columns; u++)
+        if (Math.hypot(v - state.v, u - state.u) < state.aperture) open.push([v, u]);
+    if (open.length < 2) { view(source, Math.round(state.v), Math.round(state.u), 0, 0); return; }
+    open.forEach(([v, u], k) => {
+      context.globalAlpha = 1 / (k + 1);
+      view(source, v, u, -state.focus * (u - state.u), -state.focus * (v - state.v));
+    });
+    context.globalAlpha = 1;
+  }
+  return {
+    kind: "plain canvas",
+    draw() {
+      scene(atlases.estimate);
+      if (atlases.truth && state.wipe > 0) {
+        context.save();
+        context.beginPath();
+        context.rect(0, 0, state.wipe * width, height);
+        context.clip();
+        scene(atlases.truth);
+        context.restore();
+      }
+      if (state.overlay >= 0 && laid) {
+        context.globalAlpha = 0.7;
+        context.drawImage(laid, 0, 0);
+        context.globalAlpha = 1;
+      }
+    },
+    lay(coloured) {
+      laid = document.createElement("canvas");
+      laid.width = width;
+      laid.height = height;
+      laid.getContext("2d").putImageData(coloured, 0, 0);
+    },
+    finish() {},
+  };
+}
+
+// Drawing: once per screen refresh, however many events asked for it.
+
+let waiting = false;
+function changed() {
+  if (waiting) return;
+  waiting = true;
+  requestAnimationFrame(() => { waiting = false; draw(); });
+}
+
+function draw() {
+  renderer.draw();
+  byId("aperture").value = state.aperture;
+  byId("aperture-value").textContent = state.aperture.toFixed(2);
+  byId("focus").value = state.focus;
+  byId("focus-value").textContent = `${(state.focus / data.scale).toFixed(2)} px`;
+  byId("wipe").value = state.wipe;
+  const wiping = atlases.truth && state.wipe > 0;
+  for (const id of ["wipe-line", "side-left", "side-right"]) byId(id).hidden = !wiping;
+  if (wiping) {
+    const { left, scale } = shownAt(), stage = byId("stage").getBoundingClientRect();
+    byId("wipe-line").style.left = `${left - stage.left + state.wipe * width * scale}px`;
+  }
+  drawEpi();
+  byId("status").textContent =
+    `View v ${state.v.toFixed(2)}, u ${state.u.toFixed(2)}; at x ${Math.round(state.x / data.scale)}, ` +
+    `y ${Math.round(state.y / data.scale)}: ${reading()}`;
+}
+
+function depthHere() {
+  const u = Math.round(state.u), v = Math.round(state.v);
+  const code = depth.getContext("2d").getImageData(
+    u * tileWidth + state.x, v * tileHeight + state.y, 1, 1).data[0];
+  return data.disparity.low + (code / 255) * (data.disparity.high - data.disparity.low);
+}
+
+function reading() {
+  const d = depthHere(), here = [`disparity ${(d / data.scale).toFixed(2)} px`];
+  const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
+  const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
+  const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
+  data.overlays.forEach((one, k) => {
+    if (one.key === "disparity" || !overlayLevels[k]) return;
+    const level = overlayLevels[k].data[4 * (y * width + x)] / 255;
+    const value = one.low + level * (one.high - one.low);
+    here.push(one.names.length ? `${one.label}: ${one.names[Math.round(value)]}`
+      : `${one.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${one.unit}`.trimEnd());
+  });
+  return here.join(", ");
+}
+
+function drawEpi() {
+  const source = atlases.truth && state.x < state.wipe * width ? atlases.truth : atlases.estimate;
+  const v = Math.round(state.v), u = Math.round(state.u);
+  const across = byId("epi-h"), down = byId("epi-v");
+  across.width = width; across.height = columns;
+  const one = across.getContext("2d");
+  for (let k = 0; k < columns; k++)
+    one.drawImage(source, k * tileWidth, v * tileHeight + state.y, width, 1, 0, k, width, 1);
+  one.fillStyle = "#fff9";
+  one.fillRect(state.x, 0, 1, columns);
+  down.width = height; down.height = rows;
+  const other = down.getContext("2d");
+  other.setTransform(0, 1, 1, 0, 0, 0); // y along the strip, v down it
+  for (let k = 0; k < rows; k++)
+    other.drawImage(source, u * tileWidth + state.x, k * tileHeight, 1, height, k, 0, 1, height);
+  other.fillStyle = "#fff9";
+  other.fillRect(0, state.y, rows, 1);
+}
+
+function colourOf(colours, at, kinds) {
+  const last = colours.length - 1, place = at * last;
+  if (kinds) return colours[Math.round(place)];
+  const k = Math.min(Math.floor(place), last - 1);
+  return [0, 1, 2].map((c) => Math.round(colours[k][c] + (place - k) * (colours[k + 1][c] - colours[k][c])));
+}
+
+function choose(overlay) {
+  state.overlay = overlay < data.overlays.length ? overlay : -1;
+  for (const input of byId("overlays").querySelectorAll("input")) input.checked = +input.value === state.overlay;
+  const legend = byId("legend"), one = data.overlays[state.overlay];
+  legend.hidden = !one;
+  legend.replaceChildren();
+  if (one) {
+    const levels = overlayLevels[state.overlay], coloured = new ImageData(width, height);
+    const table = Array.from({ length: 256 }, (_, i) => colourOf(one.colours, i / 255, one.names.length));
+    for (let i = 0; i < coloured.data.length; i += 4) {
+      const [r, g, b] = table[levels.data[i]];
+      coloured.data.set([r, g, b, 255], i);
+    }
+    renderer.lay(coloured);
+    const add = (to, kind, text, name) => {
+      const made = to.appendChild(document.createElement(kind));
+      made.textContent = text;
+      if (name) made.className = name;
+      return made;
+    };
+    if (one.names.length)
+      one.names.forEach((name, k) => {
+        const row = add(legend, "div", "", "kind");
+        add(row, "i", "").style.background = `rgb(${one.colours[k]})`;
+        add(row, "span", name);
+      });
+    else {
+      add(legend, "i", "").style.background = `linear-gradient(90deg,${one.colours.map((c) => `rgb(${c})`)})`;
+      const ends = add(legend, "div", "");
+      add(ends, "span", one.low.toPrecision(2));
+      add(ends, "span", `${one.high.toPrecision(2)} ${one.unit}`);
+    }
+  }
+  changed();
+}
+
+// Acting: pointer, wheel, keys
+
+function set(more) {
+  stopSway();
+  Object.assign(state, more);
+  state.v = clamp(state.v, 0, rows - 1);
+  state.u = clamp(state.u, 0, columns - 1);
+  state.aperture = clamp(state.aperture, 0, farthest);
+  state.focus = clamp(state.focus, data.focus.low, data.focus.high);
+  state.wipe = clamp(state.wipe, 0, 1);
+  changed();
+}
+
+// Where the picture is on the screen: in full screen the canvas is wider or taller than it.
+function shownAt() {
+  const box = picture.getBoundingClientRect();
+  const scale = Math.min(box.width / width, box.height / height);
+  return {
+    box, scale,
+    left: box.left + (box.width - scale * width) / 2, top: box.top + (box.height - scale * height) / 2,
+  };
+}
+
+function place(event) {
+  const { box, scale, left, top } = shownAt();
+  return {
+    x: clamp(Math.floor((event.clientX - left) / scale), 0, width - 1),
+    y: clamp(Math.floor((event.clientY - top) / scale), 0, height - 1), box,
+  };
+}
+
+let gliding = 0;
+function focusOn(x, y, event) {
+  Object.assign(state, { x, y });
+  const from = state.focus, to = depthHere(), begun = performance.now();
+  const mark = byId("mark"), stage = byId("stage").getBoundingClientRect();
+  mark.style.left = `${event.clientX - stage.left}px`;
+  mark.style.top = `${event.clientY - stage.top}px`;
+  mark.style.opacity = 1;
+  setTimeout(() => { mark.style.opacity = 0; }, 500);
+  if (state.aperture < 1) state.aperture = Math.max(rows, columns) / 2;
+  cancelAnimationFrame(gliding);
+  const glide = (now) => {
+    const share = reduced ? 1 : clamp((now - begun) / 260, 0, 1);
+    state.focus = from + (to - from) * share * (2 - share);
+    changed();
+    if (share < 1) gliding = requestAnimationFrame(glide);
+  };
+  glide(performance.now());
+}
+
+const reduced = matchMedia("(prefers-reduced-motion: reduce)").matches;
+let swaying = 0;
+function sway() {
+  if (swaying) { stopSway(); return; }
+  byId("sway").setAttribute("aria-pressed", "true");
+  const begun = performance.now();
+  const turn = (now) => {
+    const angle = (now - begun) / 650;
+    state.v = ((rows - 1) / 2) * (1 + 0.85 * Math.sin(angle));
+    state.u = ((columns - 1) / 2) * (1 + 0.85 * Math.cos(angle));
+    changed();
+    swaying = requestAnimationFrame(turn);
+  };
+  swaying = requestAnimationFrame(turn);
+}
+function stopSway() {
+  cancelAnimationFrame(swaying);
+  swaying = 0;
+  byId("sway").setAttribute("aria-pressed", "false");
+}
+
+function listen() {
+  const down = new Map();
+  let moved = 0, spread = 0;
+  picture.addEventListener("pointerdown", (event) => {
+    picture.setPointerCapture(event.pointerId);
+    down.set(event.pointerId, event);
+    moved = 0;
+    spread = 0;
+  });
+  picture.addEventListener("pointermove", (event) => {
+    const { x, y, box } = place(event), before = down.get(event.pointerId);
+    if (before === undefined) { Object.assign(state, { x, y }); changed(); return; }
+    const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+    down.set(event.pointerId, event);
+    moved += Math.hypot(dx, dy);
+    if (down.size === 2) {
+      const [a, b] = [...down.values()];
+      const apart = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+      if (spread) set({ aperture: state.aperture + ((apart - spread) / box.width) * farthest });
+      spread = apart;
+    } else if (moved > 4) {
+      // The scene follows the hand: a whole picture's width is all the views there are.
+      set({
+        u: state.u - (dx / box.width) * 1.6 * (columns - 1), v: state.v - (dy / box.height) * 1.6 * (rows - 1),
+      });
+    }
+  });
+  const up = (event) => {
+    if (down.size === 1 && moved <= 4 && event.type === "pointerup") {
+      const { x, y } = place(event);
+      focusOn(x, y, event);
+    }
+    down.delete(event.pointerId);
+  };
+  picture.addEventListener("pointerup", up);
+  picture.addEventListener("pointercancel", up);
+  picture.addEventListener("wheel", (event) => {
+    if (event.ctrlKey) return; // the browser's own zoom
+    event.preventDefault();
+    set({ aperture: state.aperture - Math.sign(event.deltaY) * 0.25 });
+  }, { passive: false });
+  const step = (data.focus.high - data.focus.low) / 60;
+  const keys = {
+    ArrowLeft: () => set({ u: state.u - 0.1 }), ArrowRight: () => set({ u: state.u + 0.1 }),
+    ArrowUp: () => set({ v: state.v - 0.1 }), ArrowDown: () => set({ v: state.v + 0.1 }),
+    "+": () => set({ aperture: state.aperture + 0.25 }), "=": () => set({ aperture: state.aperture + 0.25 }),
+    "-": () => set({ aperture: state.aperture - 0.25 }),
+    PageUp: () => set({ focus: state.focus + step }), PageDown: () => set({ focus: state.focus - step }),
+    w: () => atlases.truth && set({ wipe: state.wipe ? 0 : 0.5 }),
+    " ": sway, r: reset, f: full,
+  };
+  picture.addEventListener("keydown", (event) => {
+    const number = "01234".indexOf(event.key);
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (number >= 0) choose(number - 1);
+    else if (keys[event.key]) keys[event.key]();
+    else return;
+    event.preventDefault();
+  });
+  for (const name of ["aperture", "focus", "wipe"])
+    byId(name).addEventListener("input", (event) => set({ [name]: +event.target.value }));
+  byId("sway").addEventListener("click", sway);
+  byId("reset").addEventListener("click", reset);
+  byId("full").addEventListener("click", full);
+  addEventListener("resize", changed);
+}
+
+function reset() { set(home()); choose(-1); }
+function full() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else byId("stage").requestFullscreen?.().then(() => picture.focus());
+}
+
+function prepareControls() {
+  picture.width = width;
+  picture.height = height;
+  byId("stage").style.maxWidth = `calc(80vh * ${width / height})`;
+  byId("aperture").max = farthest;
+  byId("focus").min = data.focus.low;
+  byId("focus").max = data.focus.high;
+  for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
+  const choices = [["nothing", -1], ...data.overlays.map((one, k) => [one.label, k])];
+  for (const [label, value] of choices) {
+    const row = byId("overlays").appendChild(document.createElement("label"));
+    const input = row.appendChild(document.createElement("input"));
+    Object.assign(input, { type: "radio", name: "viewer-overlay", value, checked: value < 0 });
+    input.addEventListener("change", () => choose(value));
+    row.append(label);
+  }
+}
+
+async function main() {
+  prepareControls();
+  atlases.estimate = await decoded(data.estimate);
+  if (data.truth) atlases.truth = await decoded(data.truth);
+  depth = await decoded(data.disparity.atlas);
+  const laid = await Promise.all(data.overlays.map((one) => decoded(one.picture)));
+  overlayLevels = laid.map((canvas) => canvas.getContext("2d").getImageData(0, 0, width, height));
+  const wanted = new URLSearchParams(location.search).get("renderer");
+  renderer = (wanted === "plain" ? null : webgl(picture)) ?? plain(picture);
+  listen();
+  draw();
+  const stage = document.getElementById("viewer");
+  stage.dataset.renderer = renderer.kind;
+  stage.dataset.ready = "yes";
+  // For tests: set a state, draw it now, and how long a drawing takes.
+  stage.show = (more) => { set(more); draw(); renderer.finish(); };
+}
+
+main().catch((error) => {
+  byId("status").textContent = `The light field could not be drawn (${error}).`;
+  console.error(error);
+});
+})();

@@ -1,0 +1,228 @@
+"""A light field to turn, focus and look into: one HTML page, or a part of one; loads nothing.
+
+    views and truth   JPEG atlases of all views, as screen codes
+    disparity         one PNG atlas of what every view sees, 256 levels
+    overlays          one PNG each, of the centre view: disparity, how sure, model, doubt
+
+`viewer.js` draws with WebGL2, by the formulas of `emmc_rig.model.novel_view`; without it, the
+views themselves by canvas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.files.formats import Export, Format
+from emmc_rig.model.files import write_text
+from emmc_rig.model.novel_view import centre_disparity, view_disparities
+from emmc_rig.pages.display import (
+    HEAT,
+    TILE_MULTIPLE_PX,
+    DisplayCurve,
+    finite,
+    png_of,
+    reduced,
+    round_up,
+    sprite,
+    three_colours,
+)
+from emmc_rig.pages.page import fragment
+
+Array = NDArray[np.floating]
+JPEG_QUALITY = 84
+"""Of the atlases: 25 views of 376x541, the truth and the maps stay below 6 MB."""
+DEPTH = (
+    (48, 18, 59),
+    (50, 108, 222),
+    (38, 188, 190),
+    (140, 216, 84),
+    (252, 194, 52),
+    (196, 40, 28),
+)
+"""Colours of disparity, far to near."""
+KINDS = ((120, 130, 145), (86, 160, 211), (86, 180, 100), (232, 160, 50), (204, 70, 90))
+"""Colours of the models of `reconstruction.adaptive.models`."""
+MODEL_NAMES = ("flat", "plane", "slanted", "two layers", "free")
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """One map (y, x) of the centre view, as the viewer lays it over the picture.
+
+    label, unit: for people. low, high: values at the first and the last colour. names: of the
+    values 0, 1, ... where they are kinds, each with a colour of its own.
+    """
+
+    key: str
+    label: str
+    unit: str
+    values: NDArray
+    low: float
+    high: float
+    colours: Sequence[tuple[int, int, int]] = HEAT
+    names: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class ViewerContent:
+    """What the viewer shows: light fields (v, u, y, x, c), linear, and maps (y, x) of the centre.
+
+    caption: one line under the title. disparity: pixels per view step; estimated where None.
+    sigma: standard deviation (v, u, y, x). model: indices of MODEL_NAMES. misfit: readings missed,
+    in deviations of their noise. lossless: pictures as PNG, for comparisons to the last code.
+    """
+
+    title: str
+    light_field: Array
+    caption: str = ""
+    truth: Array | None = None
+    disparity: Array | None = None
+    sigma: Array | None = None
+    model: NDArray | None = None
+    misfit: Array | None = None
+    lossless: bool = field(default=False)
+
+
+def write_viewer(path: str | Path, content: ViewerContent) -> None:
+    """Write the page, whole or not at all; raises OSError."""
+    write_text(Path(path), render_viewer(content))
+
+
+def render_viewer(content: ViewerContent) -> str:
+    """Return the page as text."""
+    return fragment(
+        "viewer_page.html",
+        title=content.title,
+        about=[content.caption] if content.caption else [],
+        caveats=(), sections=(), lead="", styles=("viewer.css",), scripts=("viewer.js",),
+        data={"viewer-data": viewer_data(content)},
+    )  # fmt: skip
+
+
+def viewer_data(content: ViewerContent, atlases: bool = True) -> dict[str, object]:
+    """Return what viewer.js reads; without atlases it takes those of the report it is part of."""
+    shown = reduced(content.light_field)
+    rows, columns, height, width, _ = shown.shape
+    shrink = width / content.light_field.shape[3]
+    curve = DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
+    centre = _resized(centre_disparity(content.light_field, content.disparity), shown) * np.float32(
+        shrink
+    )
+    maps = view_disparities(centre, (rows, columns))
+    low, high = float(maps.min()), float(maps.max())
+    span = max(high - low, 1e-3)
+    codes = np.rint((maps - low) * (255 / span)).astype(np.uint8)
+    back, middle, front = (
+        float(d) * shrink for d in (np.percentile(centre, (2, 50, 98)) / shrink).tolist()
+    )
+    return {
+        "views": {"rows": rows, "columns": columns, "height": height, "width": width},
+        "scale": shrink,
+        "tile": TILE_MULTIPLE_PX,
+        "gamma": curve.gamma,
+        **(_atlases(curve, shown, content) if atlases else {}),
+        "disparity": {"atlas": _grey_atlas(codes), "low": low, "high": low + span},
+        "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
+        "overlays": [_overlay(one, shown) for one in overlays_of(content)],
+    }
+
+
+def overlays_of(content: ViewerContent) -> list[Overlay]:
+    """Return the maps that there are, ready to be drawn."""
+    found = []
+    rows, columns = content.light_field.shape[:2]
+    if content.disparity is not None:
+        low, high = _ends(content.disparity)
+        found.append(
+            Overlay("disparity", "disparity", "px per view", content.disparity, low, high, DEPTH)
+        )
+    if content.sigma is not None:
+        values = content.sigma[rows // 2, columns // 2]
+        high = round_up(_ends(values)[1])
+        found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
+    if content.model is not None:
+        high = len(MODEL_NAMES) - 1
+        found.append(
+            Overlay("model", "model of each place", "", content.model, 0, high, KINDS, MODEL_NAMES)
+        )
+    if content.misfit is not None:
+        found.append(
+            Overlay("doubt", "readings missed", "times their noise", content.misfit, 1.0, 5.0)
+        )
+    return found
+
+
+def _ends(values: Array) -> tuple[float, float]:
+    good = values[np.isfinite(values)]
+    if not good.size:
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.percentile(good, (1, 99)))
+    return low, max(high, low + 1e-6)
+
+
+def _resized(values: NDArray, shown: Array) -> NDArray:
+    height, width = shown.shape[2:4]
+    return cv2.resize(
+        finite(np.asarray(values, np.float32)), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+
+
+def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
+    levels = np.clip((_resized(one.values, shown) - one.low) / (one.high - one.low), 0, 1)
+    return {
+        "key": one.key, "label": one.label, "unit": one.unit, "low": one.low, "high": one.high,
+        "colours": one.colours, "names": one.names,
+        "picture": png_of(np.rint(levels * 255).astype(np.uint8)),
+    }  # fmt: skip
+
+
+def _atlases(curve: DisplayCurve, shown: Array, content: ViewerContent) -> dict[str, str | None]:
+    truth = None if content.truth is None else reduced(content.truth)
+    return {
+        "estimate": _atlas(curve, shown, content.lossless),
+        "truth": None if truth is None else _atlas(curve, truth, content.lossless),
+    }
+
+
+def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:
+    codes = three_colours(curve.encode(views))
+    return (
+        png_of(np.ascontiguousarray(_tiled(codes)[..., ::-1]))
+        if lossless
+        else sprite(codes, JPEG_QUALITY)
+    )
+
+
+def _grey_atlas(codes: NDArray[np.uint8]) -> str:
+    return png_of(_tiled(codes[..., None])[..., 0])
+
+
+def _tiled(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    rows, columns, height, width, colours = codes.shape
+    multiple = TILE_MULTIPLE_PX
+    around = [(0, 0), (0, 0), (0, -height % multiple), (0, -width % multiple), (0, 0)]
+    padded = np.pad(codes, around, mode="edge")
+    return np.ascontiguousarray(
+        padded.transpose(0, 2, 1, 3, 4).reshape(
+            rows * padded.shape[2], columns * padded.shape[3], colours
+        )
+    )
+
+
+def _write(folder: Path, export: Export) -> None:
+    content = ViewerContent(
+        export.title, export.light_field, export.caption, export.truth, export.disparity,
+        export.sigma, export.model, export.misfit,
+    )  # fmt: skip
+    write_viewer(folder / "viewer.html", content)
+
+
+VIEWER = Format(
+    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps", _write
+)

@@ -1,0 +1,289 @@
+"""The live page under load: how soon it stops, how fast it shows, how soon a light field follows.
+
+Clients run in processes of their own and speak HTTP as a browser does, each on one connection; the
+camera is one that has its frame in memory, so that the page alone is measured.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import multiprocessing
+import socket
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import uvicorn
+from numpy.typing import NDArray
+
+from drivers.camera import CameraIdentity
+from drivers.raw import RawFrame
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.live.light_field import LiveLightField
+from emmc_rig.live.scale import designed_scale
+from emmc_rig.live.server import application, new_token
+from emmc_rig.live.watch import Watch
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.study.benchmarks.timing import Figures
+
+CLIENTS, STOPS = 100, 20
+LARGE_PX = (4000, 6000)
+SIZES = ((192, 256), (376, 541), (593, 840))
+WATCHED_S = 10.0
+WARM_UP_S = 3.0
+PATIENCE_S = 60.0
+FOLLOWED = 12
+"""Frames of a scene that stands still, for a preview to settle."""
+
+
+@dataclass(frozen=True)
+class StopTiming(Figures):
+    """From sending `stop` to the stage being told, of several, in ms."""
+
+    clients: int
+    median_ms: float
+    worst_ms: float
+
+
+@dataclass(frozen=True)
+class ShownTiming(Figures):
+    """Pictures of a large frame that one client got, each of a newer frame, and their size."""
+
+    megapixels: float
+    frames_per_s: float
+    kilobytes: float
+    cpu_s_per_frame: float
+
+
+@dataclass(frozen=True)
+class FieldTiming(Figures):
+    """The preview of one size: seconds of a frame by the clock and of computing, and its PSNR.
+
+    copied_db: of the true centre view in place of every view, at the same quarter size.
+    """
+
+    size: tuple[int, int]
+    first_s: float
+    frame_s: float
+    cpu_s: float
+    psnr_db: float
+    copied_db: float
+
+    @property
+    def frames_per_s(self) -> float:
+        """By the clock."""
+        return 1 / self.frame_s
+
+
+def raw_frame(
+    mosaic: NDArray[np.uint16], cfa: str, black_dn: int, white_dn: int, exposure_s: float
+) -> RawFrame:
+    """Return a frame that no file holds."""
+    return RawFrame(
+        mosaic=mosaic,
+        cfa=cfa,
+        black_level_dn=np.full(4, float(black_dn)),
+        white_level_dn=white_dn,
+        exposure_s=exposure_s,
+        original=b"",
+        sha256="",
+    )
+
+
+class MemoryCamera:
+    """A camera that has one frame in memory, and counts."""
+
+    identity = CameraIdentity(model="memory")
+    exposure_limits_s, gain_limits = (0.01, 0.01), (1.0, 1.0)
+    exposure_s, gain = 0.01, 1.0
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        mosaic = np.random.default_rng(0).integers(256, 4000, shape).astype(np.uint16)
+        self.shape, self.cfa = shape, "rggb"
+        self._frame = raw_frame(mosaic, "rggb", 256, 4095, 0.01)
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Do nothing: there is one exposure."""
+
+    def set_gain(self, gain: float) -> None:
+        """Do nothing: there is one gain."""
+
+    def snap(self) -> RawFrame:
+        """Return the frame."""
+        return self._frame
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class StoppingStage:
+    """A stage of one axis that does nothing but note when it was told to stop."""
+
+    axes = ("mask_x",)
+
+    def __init__(self) -> None:
+        self.told_s: list[float] = []
+
+    def stop(self, axes: object = None) -> None:
+        """Note the time."""
+        self.told_s.append(time.monotonic())
+
+    def position_um(self, axis: str) -> float:
+        """Return a place."""
+        return 0.0
+
+    def limits_um(self, axis: str) -> tuple[float, float]:
+        """Return a travel."""
+        return 0.0, 1.0
+
+
+@contextmanager
+def _served(watch: Watch) -> Iterator[tuple[int, str]]:
+    """Serve a page; yield its port and the path that begins with its token."""
+    token, listening = new_token(), socket.create_server(("127.0.0.1", 0))
+    config = uvicorn.Config(application(watch, token), log_level="warning", lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    watch.start()
+    thread.start()
+    try:
+        yield listening.getsockname()[1], f"/{token}"
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE_S)
+        watch.close()
+
+
+def _poll(port: int, path: str, clients: int, ready: Any) -> None:
+    """Ask for the state again and again, as so many pages do, until ended."""
+
+    def one() -> None:
+        link, version = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S), 0
+        while True:
+            link.request("GET", f"{path}/state?after={version}")
+            version = json.loads(link.getresponse().read())["version"]
+            ready.release()
+
+    threads = [threading.Thread(target=one, daemon=True) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
+    """Return how soon the stage is told to stop while so many pages follow a running camera."""
+    stage, camera = StoppingStage(), MemoryCamera((480, 640))
+    spawning = multiprocessing.get_context("spawn")
+    with _served(Watch(camera, stage)) as (port, path):  # pyright: ignore[reportArgumentType]
+        ready = spawning.Semaphore(0)
+        crowd = spawning.Process(target=_poll, args=(port, path, clients, ready), daemon=True)
+        crowd.start()
+        for _ in range(2 * clients):
+            ready.acquire()
+        delays_s = []
+        for _ in range(stops):
+            link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+            before, sent_s = len(stage.told_s), time.monotonic()
+            link.request("POST", f"{path}/do/stop", "{}", {"Content-Type": "application/json"})
+            link.getresponse().read()
+            link.close()
+            delays_s.append(stage.told_s[before] - sent_s)
+            time.sleep(0.1)
+        crowd.terminate()
+        crowd.join()
+    ms = [1e3 * one for one in delays_s]
+    return StopTiming(clients, statistics.median(ms), max(ms))
+
+
+def _fetch(port: int, path: str, seconds: float, told: Any) -> None:
+    """Follow the page for some seconds as its script does; send how many pictures came."""
+    links = [http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S) for _ in range(2)]
+
+    def ask(link: http.client.HTTPConnection, what: str) -> bytes:
+        link.request("GET", f"{path}/{what}")
+        return link.getresponse().read()
+
+    version, frame, pictures, size, started_s = 0, 0, 0, 0, 0.0
+    begin_s = time.monotonic() + WARM_UP_S
+    while time.monotonic() < begin_s + seconds:
+        state = json.loads(ask(links[0], f"state?after={version}"))
+        version = state["version"]
+        if state["frame"] == frame:
+            continue
+        frame, data = state["frame"], ask(links[1], "picture.jpg?px=1600")
+        if time.monotonic() >= begin_s:
+            started_s = started_s or time.monotonic()
+            pictures, size = pictures + 1, len(data)
+    told.put(((pictures - 1) / (time.monotonic() - started_s), size))
+
+
+def shown_timing(shape: tuple[int, int] = LARGE_PX, seconds: float = WATCHED_S) -> ShownTiming:
+    """Return how many pictures a second of a large camera reach one page, with all its figures."""
+    spawning = multiprocessing.get_context("spawn")
+    with _served(Watch(MemoryCamera(shape))) as (port, path):
+        told = spawning.Queue()
+        client = spawning.Process(target=_fetch, args=(port, path, seconds, told), daemon=True)
+        client.start()
+        before_s, began_s = time.process_time(), time.monotonic()
+        rate, size = told.get(timeout=PATIENCE_S + seconds)
+        cpu_share = (time.process_time() - before_s) / (time.monotonic() - began_s)
+        client.join()
+    return ShownTiming(shape[0] * shape[1] / 1e6, rate, size / 1e3, cpu_share / rate)
+
+
+def field_timing(camera: Camera, size: tuple[int, int], scene: str) -> FieldTiming:
+    """Return how soon a light field follows a frame of a scene, and how good it is then.
+
+    Measured from the frame in memory to the pictures that a page is sent, less their encoding.
+    """
+    light_field = open_scene(scene, size=size, views=camera.views).light_field
+    psi = camera.psi(size)
+    noise = camera.sensor.noise
+    frames = [camera.expose(light_field, seed, psi).frames_dn[0] for seed in range(2)]
+    first = raw_frame(
+        frames[0],
+        camera.sensor.cfa_name,
+        noise.black_level_dn,
+        noise.white_level_dn,
+        float(camera.exposures_s()[0]),
+    )
+    # A clock that stands still begins no reconstruction beside.
+    live = LiveLightField(designed_scale(psi), clock=lambda: 0.0)
+    live.update(replace(first))
+    live = LiveLightField(designed_scale(psi), clock=lambda: 0.0)
+    first_s = _seconds(lambda: live.update(first))
+    seconds, cpu = [], []
+    for number in range(FOLLOWED):
+        frame = replace(first, mosaic=frames[number % 2])
+        before_s = time.process_time()
+        seconds.append(_seconds(lambda frame=frame: live.update(frame)))
+        cpu.append(time.process_time() - before_s)
+    assert live.preview is not None
+    found = live.preview.light_field
+    rows, columns = (4 * count for count in found.shape[2:4])
+    cut = light_field[:, :, :rows, :columns]
+    true = cut.reshape(*cut.shape[:2], rows // 4, 4, columns // 4, 4, 3).mean(axis=(3, 5))
+    true = np.ascontiguousarray(true, dtype=np.float32)
+    copied = np.ascontiguousarray(replicate_centre(true))
+    return FieldTiming(
+        size,
+        first_s,
+        statistics.median(seconds),
+        statistics.median(cpu),
+        psnr_db(found, true),
+        psnr_db(copied, true),
+    )
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    started_s = time.perf_counter()
+    call()
+    return time.perf_counter() - started_s

@@ -1,0 +1,1 @@
+"""Which mask to order: candidates that a bench can mount, by their expected error."""

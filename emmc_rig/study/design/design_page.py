@@ -1,0 +1,143 @@
+"""The page of a design: the mask, light against error, what was tried; and the check's page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from emmc_rig.pages.drawing import ACCENT, FAINT, INK, save_drawing, sheet, titled
+from emmc_rig.pages.page import (
+    Card,
+    Section,
+    embedded,
+    fragment,
+    framed,
+    number,
+    provenance_section,
+)
+from emmc_rig.study.design.check import Simulated
+from emmc_rig.study.design.search import Search, pareto
+
+CAVEATS = (
+    "Theory knows textures on two planes half a sample of disparity apart, and noise; it knows no "
+    "occlusion. Differences of a tenth of a dB are below what it can order: see `--check`.",
+    "Frames are simulated by the Psi of the mask as printed, on the grid of the reconstruction; "
+    "a bench measures that Psi.",
+)
+SHOWN = 20
+"""Masks in the table."""
+
+
+def draw_pareto(found: Search, path: Path) -> Path:
+    """Write light against expected PSNR as SVG and PNG; return the SVG's path."""
+    figure, (axes,) = sheet(1, 6.4, 3.8, "PSNR expected, dB")
+    light = [100 * one.light for _, one in found.tried]
+    axes.plot(light, [one.psnr_db for _, one in found.tried], "o", color=FAINT, markersize=4)
+    front = pareto(found.tried)
+    axes.plot(
+        [100 * one.light for _, one in front], [one.psnr_db for _, one in front],
+        "-o", color=ACCENT, markersize=6,
+    )  # fmt: skip
+    best = found.expected
+    axes.plot([100 * best.light], [best.psnr_db], "o", color=INK, markersize=9, fillstyle="none")
+    titled(axes, "Light against error: none beats the line in both", "light that passes, %")
+    return save_drawing(figure, path)
+
+
+def draw_check(found: Sequence[Simulated], path: Path) -> Path:
+    """Write expected against simulated PSNR as SVG and PNG; return the SVG's path."""
+    figure, (axes,) = sheet(1, 5.6, 3.8, "simulated, mean over scenes, dB")
+    axes.plot([one.expected_db for one in found], [one.mean_db for one in found], "o", color=ACCENT)
+    titled(axes, "Every camera once", "PSNR expected from Psi alone, dB")
+    return save_drawing(figure, path)
+
+
+def design_page(
+    about: Sequence[str],
+    found: Search,
+    simulated: Sequence[Simulated],
+    verdict: str,
+    picture: Path,
+    provenance: Mapping[str, str],
+) -> str:
+    """Return the page of a design. simulated: the chosen mask first, then the shipped cameras."""
+    best = found.expected
+    loss_db = found.ideal_db - best.psnr_db
+    cards = (
+        Card(
+            "PSNR expected",
+            f"{best.psnr_db:.2f} dB",
+            f"{found.held[0].worst_db:.2f} at worst; {found.bounds.known_db:.2f} were depth known",
+        ),
+        Card("Light", f"{best.light:.0%}", "of the open camera's"),
+        Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction costs {loss_db:.2f} dB"),
+        Card("Disparity", f"{found.bounds.disparity_px:.3f} px", "Ziv-Zakai bound"),
+    )
+    names = list(found.held[0].psnr_db)
+    body = fragment(
+        "design.html",
+        cards=cards,
+        verdict=verdict,
+        picture=embedded(picture),
+        tried=_tried(found),
+        held=(
+            ["Mask", *names],
+            [
+                [one.candidate.label, *(number(one.psnr_db[name], ".2f") for name in names)]
+                for one in found.held
+            ],
+        ),
+        simulated=simulated_table(simulated),
+    )
+    sections = [Section("design", found.winner.label, body, "Design")]
+    sections.append(provenance_section(provenance))
+    return framed("Which mask to order", about, CAVEATS, sections)
+
+
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads of the columns, and rows."""
+
+
+def _tried(found: Search) -> Table:
+    heads = ("Mask", "PSNR expected, dB", "Light", "Fresnel number")
+    rows = [
+        [
+            one.label,
+            f"{what.psnr_db:.2f}",
+            f"{what.light:.0%}",
+            f"{what.fresnel:.2g}",
+        ]
+        for one, what in found.tried[:SHOWN]
+    ]
+    return heads, rows
+
+
+def simulated_table(found: Sequence[Simulated]) -> Table:
+    """Return theory and simulation, a row a camera."""
+    scenes = list(found[0].psnr_db)
+    rows = [
+        [
+            one.name,
+            f"{one.expected_db:.2f}",
+            f"{one.mean_db:.2f}",
+            *(f"{one.psnr_db[scene]:.2f}" for scene in scenes),
+        ]
+        for one in found
+    ]
+    return ("Camera", "Theory", "Simulated, mean", *scenes), rows
+
+
+def check_page(
+    about: Sequence[str],
+    found: Sequence[Simulated],
+    ranks: str,
+    picture: Path,
+    provenance: Mapping[str, str],
+) -> str:
+    """Return the page of the check. ranks: the rank correlations, in words."""
+    body = fragment(
+        "design_check.html", ranks=ranks, picture=embedded(picture), rows=simulated_table(found)
+    )
+    sections = [Section("check", "Theory beside simulation", body, "Check")]
+    sections.append(provenance_section(provenance))
+    return framed("Does theory order masks as simulation does?", about, CAVEATS, sections)

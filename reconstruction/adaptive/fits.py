@@ -1,0 +1,128 @@
+"""Several models of one scene, fitted to the frames, and their mean by held-out readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.adaptive import mixture, search
+from reconstruction.adaptive.joint import Scene, solve
+from reconstruction.adaptive.rest import UNEXPLAINED, misfit_of, rest
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import Survey, in_front
+from reconstruction.adaptive.sweep import swept
+from reconstruction.adaptive.uncertainty import Deviation, deviation
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """The models, total variation last if it is one of them. light_fields: (v, u, y, x, c) of each;
+    residuals: frames less what each predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces
+    and texture, at the survey's brightness."""
+
+    light_fields: list[Array]
+    residuals: list[Array]
+    scene: Scene
+
+
+def fitted_models(
+    survey: Survey, settings: AdaptiveSettings, on_step: Callable[[int], None]
+) -> Fits:
+    """Return a fit for each of `settings.misfits`, and total variation's.
+
+    All fits but the last search the disparity again with their texture (`sweep`); where that leads
+    astray the last one, which keeps what the patches agreed on, predicts held-out readings better.
+    on_step: called with the number of steps done.
+    """
+    given, bright, held, model = survey.given, survey.bright, survey.held, survey.model
+    scale = np.float32(survey.scale)
+
+    def again(texture: Array, residual: Array, margin: int) -> Array:
+        beliefs = swept(
+            survey.volume,
+            model.psi,
+            bright.frames,
+            bright.noise,
+            given.usable & ~held,
+            texture,
+            residual,
+            margin,
+            settings.slope_px,
+            settings.jump,
+        )
+        return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
+
+    light_fields, residuals, scene = [], [], None
+    for fit, misfit in enumerate(settings.misfits):
+        # One layout of rays at a time: it is as large as the light field.
+        scene = None
+        done = fit * settings.texture.steps
+        scene = solve(
+            model.psi,
+            model.centre,
+            in_front(settings),
+            bright.frames,
+            bright.precision(held, misfit),
+            model.picture,
+            model.texture,
+            on_step=lambda step, done=done: on_step(done + step),
+            again=again if fit < len(settings.misfits) - 1 else None,
+        )
+        seen = scale * scene.surfaces.light_field(scene.texture)
+        light_fields.append(np.broadcast_to(np.clip(seen, 0, 1), given.psi.light_field_shape))
+        residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
+    assert scene is not None
+    if settings.free:
+        light_fields.append(survey.plain)
+        residuals.append(given.frames - given.psi.forward(survey.plain))
+    return Fits(light_fields, residuals, scene)
+
+
+@dataclass(frozen=True, eq=False)
+class Mean:
+    """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sure: its
+    standard deviation, None with too few held-out readings."""
+
+    light_field: Array
+    shares: NDArray[np.float32]
+    sure: Deviation | None
+
+
+def averaged(survey: Survey, fits: Fits) -> Mean:
+    """Return the mean of the models, by the held-out readings; the first model without any."""
+    given, held = survey.given, survey.held
+    if not held.any():
+        shares = np.zeros((len(fits.residuals), *held.shape[1:]), dtype=np.float32)
+        shares[0] = 1
+        return Mean(fits.light_fields[0], shares, None)
+    k = given.psi.binning
+    shares = mixture.shares_of(fits.residuals, given.noise, held)
+    light_field = mixture.mean_light_field(fits.light_fields, shares, k)
+    spread = mixture.spread(fits.light_fields, light_field, shares, k)
+    residual = sum(share * one for share, one in zip(shares, fits.residuals, strict=True))
+    sure = deviation(fits.scene, survey.scale, spread, np.asarray(residual), given.noise, held)
+    return Mean(light_field, shares, sure)
+
+
+def with_rest(survey: Survey, light_field: Array, settings: AdaptiveSettings) -> Array:
+    """Return a light field with one of its residual added, where held-out readings speak for it."""
+    given, fitted = survey.given, survey.given.usable & ~survey.held
+    residual = (given.frames - given.psi.forward(light_field)).astype(np.float32)
+    if misfit_of(residual, given.noise, fitted).times <= UNEXPLAINED:
+        return light_field
+    scale = np.float32(survey.scale)
+    more = rest(
+        given.psi,
+        residual / scale,
+        survey.mu / survey.scale,
+        survey.bright.typical,
+        fitted,
+        survey.held,
+        settings.start_steps,
+    )
+    return light_field if more is None else np.clip(light_field + scale * more, 0, 1)

@@ -1,0 +1,80 @@
+"""The settings of the adaptive method, and those of its fast variant."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from emmc_rig.model.settings import Settings
+from reconstruction.adaptive.joint import TextureSettings
+
+Length = Annotated[float, Field(gt=0)]
+
+
+class AdaptiveSettings(Settings):
+    """Settings of the adaptive method."""
+
+    furthest_px: float = Field(
+        default=24.0, gt=0, description="largest disparity searched, to both sides"
+    )
+    step_px: float = Field(default=0.125, gt=0, description="between disparities compared")
+    stride: int = Field(default=4, ge=1, description="pixels between patches that are compared")
+    lengths_px: tuple[Length, ...] = Field(
+        default=(3.0, 1.5), min_length=1, description="correlation lengths of a patch's texture"
+    )
+    slope_px: float = Field(
+        default=0.04, gt=0, description="mean change of the disparity per pixel on one surface"
+    )
+    jump: float = Field(
+        default=0.05, gt=0, lt=1, description="probability that neighbouring patches differ freely"
+    )
+    freedom: float = Field(
+        default=3.0, gt=0, description="of the Student t of the readings; large: Gaussian"
+    )
+    misfit: float = Field(
+        default=0.004, gt=0, description="deviation of readings that no disparity explains"
+    )
+    misfits: tuple[Length, ...] = Field(
+        default=(0.004, 0.0015),
+        min_length=1,
+        description="deviation of readings that no texture explains, one for each fit",
+    )
+    nearer: Literal["larger", "smaller"] = Field(
+        default="larger", description="disparity of what is in front; pictures may be flipped"
+    )
+    texture: TextureSettings = Field(default_factory=TextureSettings)
+    parsimony: bool = Field(
+        default=True, description="one plane, or no colour, where the whole scene needs no more"
+    )
+    start_steps: int = Field(
+        default=40, ge=1, description="of total variation, from which textures begin"
+    )
+    free: bool = Field(
+        default=True, description="average with total variation where it explains the frames"
+    )
+    rest: bool = Field(
+        default=True, description="add a light field of the residual, where held-out readings agree"
+    )
+    edges: tuple[Literal["top", "bottom", "left", "right"], ...] = Field(
+        default=("top", "bottom", "left", "right"),
+        description="sides that may be dark because views do not reach them",
+    )
+    brightness: float | None = Field(
+        default=None, gt=0, description="mean of the scene that this is a part of; None: its own"
+    )
+    plane: tuple[float, float, float] | None = Field(
+        default=None,
+        description="disparity, where parsimony is asked for and it is known to be one plane: in "
+        "the middle, px, and its change per pixel down and right",
+    )
+
+
+def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
+    """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
+    quick = settings.texture.model_copy(
+        update={"steps": 6, "refine_steps": 2, "block_step": 6, "sweeps": ()}
+    )
+    coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
+    fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
+    return settings.model_copy(update=coarser | fewer)

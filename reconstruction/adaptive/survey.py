@@ -1,0 +1,185 @@
+"""What is decided once for a whole scene: its brightness, disparities, weights, and models.
+
+All of it needs the whole picture, or is better known from it; a part of the picture is fitted with
+it as it stands (`fits`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.lightfield import centre_view
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive import search
+from reconstruction.adaptive.evidence import TexturePrior
+from reconstruction.adaptive.given import Given
+from reconstruction.adaptive.joint import TextureSettings, solve
+from reconstruction.adaptive.parsimony import (
+    Plane,
+    colour_is_needed,
+    grey_bound_db,
+    grey_psi,
+    may_be_grey,
+    one_plane,
+    plane_bound_db,
+)
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.uncertainty import held_out
+from reconstruction.choices import choose_mu, smooth_guess
+from reconstruction.flat import flat_psi
+from reconstruction.tv import TVSettings, reconstruct_tv
+
+Array = NDArray[np.floating]
+COARSE_PX = 8.0, 2.0
+"""Correlation lengths of the textures of the coarse search."""
+DIM, TINY = 0.25, 1e-12
+"""Mean brightness below which a scene is reconstructed as if it were so bright, since the settings
+are shares of a picture of order 1; 0.1 costs 0.03 dB on buttercup and 0.13 on occlusions (160x160,
+one shot, means of 0.13 and 0.17). And the least brightness that differs from none."""
+TRIAL_STEPS = 4
+"""Of the fits with colour and without that decide whether the scene has any."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What is fitted: Psi, of one colour or three; the centre view's disparity (y, x) and picture
+    (y, x, c) to begin with; the steps."""
+
+    psi: ImagingMatrix
+    centre: Array
+    picture: Array
+    texture: TextureSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """given: as it was. scale: the scene's brightness; bright: `given` over it. held: readings kept
+    from every fit. unexplained: residual of the smooth picture. volume: beliefs about disparities.
+    mu: weight of total variation, plain: its light field. model: what is fitted, left_out: in
+    words, what the scene does not need.
+    """
+
+    given: Given
+    scale: float
+    bright: Given
+    held: NDArray[np.bool_]
+    unexplained: Array
+    volume: search.Volume
+    mu: float
+    plain: Array
+    model: Model
+    left_out: tuple[str, ...]
+
+
+def surveyed(
+    given: Given,
+    settings: AdaptiveSettings,
+    disparity: Array | None,
+    on_searched: Callable[[int], None],
+) -> Survey:
+    """Return what is decided for the whole scene.
+
+    disparity: of the centre view (y, x) where it is known. on_searched: called with 1 and 2 after
+    the coarse and the fine search.
+    """
+    psi, k = given.psi, given.psi.binning
+    flat = flat_psi(psi)
+    picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
+    brightness = settings.brightness or float(picture.mean())
+    scale = min(1.0, max(brightness, TINY) / DIM)
+    bright = given.over(scale)
+    picture = picture / np.float32(scale)
+    grey = picture.mean(axis=-1)
+    data = search.Data(
+        psi,
+        (bright.frames - flat.forward(picture)).astype(np.float32),
+        bright.variance(settings.misfit),
+        given.usable,
+        grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3)),
+    )
+    volume = _searched(data, settings, on_searched)
+    centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
+    held = held_out(given.usable)
+    fitted = given.usable & ~held
+    mu = choose_mu(psi, given.frames[fitted], given.typical)
+    # The model that surfaces must beat on the held-out readings, and from which they begin.
+    start = TVSettings(
+        mu=mu, max_steps=settings.start_steps, objective_every=settings.start_steps + 1
+    )
+    plain = reconstruct_tv(psi, given.frames, given.typical, start, fitted).light_field
+    begun = centre_view(plain) / np.float32(scale)
+    model, left_out = Model(psi, centre, begun, settings.texture), ()
+    if settings.parsimony:
+        model, left_out = _needed(model, volume, bright, held, settings)
+    return Survey(
+        given, scale, bright, held, data.readings, volume, mu, plain, model, tuple(left_out)
+    )
+
+
+def _searched(
+    data: search.Data, settings: AdaptiveSettings, on_searched: Callable[[int], None]
+) -> search.Volume:
+    """Return the disparities that patches and their neighbours agree on, coarse to fine."""
+    coarse, fine = (
+        TexturePrior(length, tuple(finer), freedom=settings.freedom)
+        for length, *finer in (COARSE_PX, settings.lengths_px)
+    )
+    smooth = settings.slope_px, settings.jump
+    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
+    on_searched(1)
+    volume = search.fine(data, fine, rough, settings.stride, settings.step_px, *smooth)
+    on_searched(2)
+    return volume
+
+
+def _needed(
+    model: Model,
+    volume: search.Volume,
+    bright: Given,
+    held: NDArray[np.bool_],
+    settings: AdaptiveSettings,
+) -> tuple[Model, list[str]]:
+    """Return the smallest model that the whole scene needs, and what of the full one it lacks."""
+    left_out = []
+    psi = model.psi
+    pixels = psi.frames_shape[1:]
+    plane = one_plane(volume, pixels) if settings.plane is None else Plane(*settings.plane)
+    if plane is not None:
+        bound = plane_bound_db(plane, volume, pixels, model.picture)
+        kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
+        left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
+        still = model.texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
+        model = replace(model, centre=plane.over(psi.size, psi.binning), texture=still)
+    if may_be_grey(model.picture):
+        grey = replace(model, psi=grey_psi(psi), picture=model.picture.mean(axis=-1, keepdims=True))
+        residuals = [_trial(one, bright, held, settings)[held] for one in (model, grey)]
+        if not colour_is_needed(*residuals):
+            left_out.append(f"colour: one for all (at best {grey_bound_db(model.picture):.0f} dB)")
+            model = grey
+    return model, left_out
+
+
+def _trial(
+    model: Model, bright: Given, held: NDArray[np.bool_], settings: AdaptiveSettings
+) -> Array:
+    """Return the residual (shot, pixel_y, pixel_x) of a short fit of a model."""
+    quick = model.texture.model_copy(update={"steps": TRIAL_STEPS, "refine_steps": 0})
+    scene = solve(
+        model.psi,
+        model.centre,
+        in_front(settings),
+        bright.frames,
+        bright.precision(held, settings.misfits[-1]),
+        model.picture,
+        quick,
+    )
+    return bright.frames - scene.surfaces.forward(scene.texture)
+
+
+def in_front(settings: AdaptiveSettings) -> int:
+    """Return 1 where points of larger disparity are in front, -1 where they are behind."""
+    return 1 if settings.nearer == "larger" else -1

@@ -1,0 +1,158 @@
+"""The mask's place and the focus from live frames, against a ray caster that knows the truth."""
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.errors import CalibrationError
+from drivers.raw import RawFrame
+from emmc_rig.files.scenes import fine_scene
+from emmc_rig.live.alignment import MaskGauge, grid_direction
+from emmc_rig.live.focus import REMEMBERED_S, FocusMeter, sharpness
+from emmc_rig.model.camera import shipped_cameras
+from simulators.bench import Bench, MountingErrors
+
+SIZE = (72, 96)
+CAMERAS = shipped_cameras()
+WITH_SHADOW = sorted(
+    name
+    for name, camera in CAMERAS.items()
+    if any(mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values())
+)
+WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
+BLACK, WHITE = 256, 4095
+
+
+def frame_of(mosaic, cfa="mono", white=WHITE):
+    return RawFrame(
+        mosaic=mosaic.astype(np.uint16),
+        cfa=cfa,
+        black_level_dn=np.full(4, BLACK, np.float64),
+        white_level_dn=white,
+        exposure_s=0.01,
+        original=b"",
+        sha256="",
+    )
+
+
+def bench_frame(camera, target="whiteboard", exposure_s=0.05, lamp="white", **errors):
+    """A frame of a bench whose mask is misplaced by that much."""
+    fine = fine_scene("near-planar", 2, 2, size=SIZE, views=camera.views)
+    aperture_um = max(camera.views) * camera.lens.aperture_cell_um
+    standing = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 2 * aperture_um, "aperture_y": 0.0}
+    bench = Bench(
+        camera,
+        fine.samples,
+        SIZE,
+        lambda: standing,
+        2 * aperture_um,
+        np.random.default_rng(0),
+        MountingErrors(**errors),
+        rays_per_view=32,
+    )
+    bench.lamp, bench.target = lamp, target
+    noise = camera.sensor.noise
+    return frame_of(bench.expose(exposure_s), camera.sensor.cfa_name, noise.white_level_dn)
+
+
+@pytest.mark.parametrize("name", WITH_SHADOW)
+def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
+    camera = CAMERAS[name]
+    truth = {"offset_um": (11.0, -7.0), "rotation_deg": 0.7, "stretch": 0.9965}
+    frame = bench_frame(camera, **truth)
+    place = MaskGauge(camera, frame.mosaic.shape).measure(frame)
+    # The bench turns clockwise, seen in the picture.
+    turned, stretched = place.rotation_deg + 0.7, place.scale - 0.9965
+    assert abs(turned) < min(0.1, 4 * place.rotation_deviation_deg)
+    assert abs(stretched) < min(1e-3, 4 * place.scale_deviation)
+    if place.offset_um is None:
+        assert name == "dual-mask-sinusoids"
+    else:
+        assert np.abs(np.subtract(place.offset_um, (11.0, -7.0))).max() < 1.5
+
+
+@pytest.mark.parametrize("name", WITHOUT_SHADOW)
+def test_cameras_whose_masks_throw_no_shadow_say_so(name):
+    with pytest.raises(CalibrationError, match=r"lie at the lens|0 masks"):
+        MaskGauge(CAMERAS[name], SIZE)
+
+
+def test_a_mask_turned_by_five_degrees_is_found_by_its_edges():
+    camera = CAMERAS["rgbw-mono"]
+    frame = bench_frame(camera, rotation_deg=-5.0)
+    place = MaskGauge(camera, frame.mosaic.shape).measure(frame)
+    assert place.rotation_deg == pytest.approx(5.0, abs=0.1)
+
+
+def test_a_mask_that_moved_on_is_followed_and_one_that_went_is_not_shown():
+    camera = CAMERAS["rgbw-bayer-1shot"]
+    frame = bench_frame(camera, rotation_deg=0.1)
+    gauge = MaskGauge(camera, frame.mosaic.shape)
+    assert gauge.measure(frame).rotation_deg == pytest.approx(-0.1, abs=0.05)
+    later = gauge.measure(bench_frame(camera, rotation_deg=0.2))
+    assert later.rotation_deg == pytest.approx(-0.2, abs=0.05)
+    noise = np.random.default_rng(0).normal(2000, 200, SIZE)
+    with pytest.raises(CalibrationError, match="not seen"):
+        gauge.measure(frame_of(noise, "rggb"))
+
+
+def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters():
+    camera = CAMERAS["rgbw-bayer-1shot"]
+    gauge = MaskGauge(camera, SIZE)
+    with pytest.raises(CalibrationError, match="dark"):
+        gauge.measure(bench_frame(camera, lamp="off"))
+    with pytest.raises(CalibrationError, match="bggr"):
+        gauge.measure(frame_of(np.full(SIZE, 2000), "bggr"))
+    with pytest.raises(CalibrationError, match="72x96"):
+        gauge.measure(frame_of(np.full((8, 8), 2000), "rggb"))
+
+
+def test_edges_in_all_directions_have_no_straightness():
+    noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
+    assert grid_direction(noise)[1] < 0.1
+    assert grid_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
+
+
+def noisy(blur, seed, level=1500.0, sigma=40.0, shape=(120, 160)):
+    """A random picture, blurred by so much, with noise of its own."""
+    scene = np.random.default_rng(7).random(shape)
+    sharp = cv2.GaussianBlur(scene, (0, 0), blur) if blur else scene
+    noise = np.random.default_rng(seed).normal(0, sigma, shape)
+    return frame_of(np.clip(BLACK + level * sharp + noise, 0, WHITE))
+
+
+def test_sharpness_is_that_of_the_scene_without_its_noise():
+    clean, quiet = (
+        sharpness(noisy(1.0, 0, sigma=sigma), noisy(1.0, 1, sigma=sigma)) for sigma in (0.0, 40.0)
+    )
+    assert clean is not None
+    assert quiet is not None
+    assert abs(quiet.value - clean.value) < 4 * quiet.deviation
+    assert quiet.deviation < 0.2 * clean.value
+
+
+def test_dark_noise_has_no_sharpness_and_never_becomes_the_best():
+    rng = np.random.default_rng(0)
+    dark = [frame_of(BLACK + rng.normal(0, 5, (120, 160)).round()) for _ in range(4)]
+    assert sharpness(dark[0], dark[1]) is None
+    meter = FocusMeter()
+    assert [meter.add(frame, number) for number, frame in enumerate(dark)] == [None] * 4
+    assert meter.add(noisy(1.0, 0), 4.0) is None
+    best = meter.add(noisy(1.0, 1), 5.0)
+    assert best is not None
+    assert best["share"] == 1.0
+
+
+def test_a_blurred_picture_is_less_sharp_than_the_best_until_that_is_forgotten():
+    meter = FocusMeter()
+    for number in range(2):
+        meter.add(noisy(1.0, number), number)
+    meter.add(noisy(2.0, 2), 2.0)
+    soft = meter.add(noisy(2.0, 3), 3.0)
+    assert soft is not None
+    assert soft["share"] + 3 * soft["deviation"] < 0.5
+    later = meter.add(noisy(2.0, 4), REMEMBERED_S + 2.5)
+    assert later is not None
+    assert later["share"] > 0.8
+    meter.forget()
+    assert meter.add(noisy(2.0, 5), REMEMBERED_S + 3) is None

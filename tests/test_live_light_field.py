@@ -1,0 +1,263 @@
+"""The light field while the camera watches: coarse at once, `reconstruct`'s own once all stands."""
+
+import time
+
+import numpy as np
+import pytest
+from test_live_alignment import frame_of
+
+import emmc_rig as emmc
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.live.light_field import LiveLightField, disparity_of
+from emmc_rig.live.scale import designed_scale, open_scale
+from emmc_rig.model.lightfield import psnr_db, shifted
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.errors import ReconstructionError
+from reconstruction.preview import Preview, coarser
+
+SIZE = (48, 64)
+PATIENCE_S = 60.0
+
+
+class Seconds:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def blocks_of(coarse, factor):
+    """A light field that is constant over blocks, from one value of each."""
+    return coarse.repeat(factor, axis=2).repeat(factor, axis=3)
+
+
+def random_psi(binning, colours, seed=0, size=(8, 12), shots=2):
+    rng = np.random.default_rng(seed)
+    weights = rng.random((shots, 2, 3, size[0], colours, size[1])).astype(np.float32)
+    colour = None
+    if colours == 1:
+        pixels = rng.integers(0, 3, (shots, size[0] // binning, size[1] // binning))
+        colour = pixels.repeat(binning, axis=1).repeat(binning, axis=2).astype(np.uint8)
+    return ImagingMatrix(weights, colour, binning)
+
+
+@pytest.mark.parametrize(("binning", "colours"), [(1, 1), (1, 3), (2, 1), (2, 3)])
+def test_the_coarser_psi_reads_what_psi_reads_of_a_light_field_of_blocks(binning, colours):
+    psi = random_psi(binning, colours)
+    small = np.random.default_rng(1).random((2, 3, 2, 3, 3)).astype(np.float32)
+    read, part = psi @ blocks_of(small, 4), 4 // binning
+    coarse = coarser(psi, 4) @ small
+    for shot, y, x in np.ndindex(read.shape):
+        place = (shot * part + y % part) * part + x % part
+        assert coarse[place, y // part, x // part] == pytest.approx(read[shot, y, x], rel=1e-5)
+
+
+def test_a_block_that_cuts_pixels_is_refused():
+    with pytest.raises(ValueError, match="cut pixels"):
+        coarser(random_psi(2, 1), 3)
+
+
+def small_views(light_field, factor):
+    v, u, rows, columns, _ = light_field.shape
+    cut = light_field.reshape(v, u, rows // factor, factor, columns // factor, factor, 3)
+    return np.ascontiguousarray(cut.mean(axis=(3, 5)))
+
+
+@pytest.mark.parametrize("name", ["deep-occlusions", "wide-disparity"])
+def test_a_few_steps_give_views_nearer_than_the_copied_centre_view(name):
+    camera = emmc.camera("rgbw-bayer-3shots")
+    scene = open_scene(name, size=(96, 128), views=camera.views).light_field
+    psi = camera.psi((96, 128))
+    frames = camera.expose(scene, 0, psi)
+    preview = Preview(psi, 4, frames.readings, frames.noise_sigma)
+    for _ in range(3):
+        preview.follow(frames.readings, 3)
+    true = small_views(scene, 4)
+    copied = np.ascontiguousarray(np.broadcast_to(true[2, 2], true.shape))
+    assert psnr_db(preview.light_field, true) > psnr_db(copied, true) + 0.5
+
+
+def test_frames_of_a_changed_scene_take_the_preview_along():
+    camera = emmc.camera("rgbw-bayer-1shot")
+    psi = camera.psi(SIZE)
+    first, second = (
+        open_scene("deep-occlusions", size=SIZE, views=camera.views, seed=seed).light_field
+        for seed in (0, 1)
+    )
+    preview = Preview(psi, 4, psi @ first, 0.002)
+    preview.follow(psi @ first, 20)
+    before = psnr_db(preview.light_field, small_views(second, 4))
+    preview.follow(psi @ second, 20)
+    afresh = Preview(psi, 4, psi @ second, 0.002)
+    afresh.follow(psi @ second, 20)
+    after = psnr_db(preview.light_field, small_views(second, 4))
+    assert after > before + 3
+    assert after == pytest.approx(psnr_db(afresh.light_field, small_views(second, 4)), abs=1)
+
+
+def test_the_disparity_of_small_views_is_that_of_the_scene_and_unknown_where_it_is_plain():
+    rng = np.random.default_rng(0)
+    base = rng.random((40, 60, 3)).astype(np.float32)
+    base[:, 30:] = 0.5
+    views = np.stack(
+        [
+            np.stack([shifted(base, -0.3 * (v - 1), -0.3 * (u - 1)) for u in range(3)])
+            for v in range(3)
+        ]
+    )
+    views = np.stack([np.stack([_softened(one) for one in row]) for row in views])
+    found = disparity_of(views)
+    assert np.nanmedian(found[8:-8, 8:22]) == pytest.approx(0.3, abs=0.05)
+    assert np.isnan(found[:, 40:]).all()
+
+
+def _softened(view):
+    import cv2
+
+    return cv2.GaussianBlur(view, (0, 0), 1.5)
+
+
+def live_frames(camera, psi, scene, seed=0):
+    """Frames as the designed camera sends them, one for each shot."""
+    taken = camera.expose(scene, seed, psi)
+    exposure_s = camera.exposures_s()
+    made = []
+    for shot, mosaic in enumerate(taken.frames_dn):
+        frame = frame_of(mosaic, camera.sensor.cfa_name, camera.sensor.noise.white_level_dn)
+        made.append(frame.__class__(**{**vars(frame), "exposure_s": float(exposure_s[shot])}))
+    return made
+
+
+@pytest.fixture(scope="module")
+def one_shot():
+    camera = emmc.camera("rgbw-bayer-1shot")
+    psi = camera.psi(SIZE)
+    scene = open_scene("near-planar", size=SIZE, views=camera.views).light_field
+    return camera, psi, scene
+
+
+def until(holds):
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        found = holds()
+        if found:
+            return found
+        time.sleep(0.02)
+    raise AssertionError("never came")
+
+
+def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
+    camera, psi, scene = one_shot
+    first, second = (live_frames(camera, psi, scene, seed)[0] for seed in (0, 1))
+    clock = Seconds()
+    live = LiveLightField(designed_scale(psi), "tv", clock=clock)
+    assert live.update(first)["stage"] == "preview"
+    clock.now = 10.0
+    live.update(second)
+
+    def finished():
+        told = live.update(second)
+        return told if told["verdict"] else None
+
+    told = until(finished)
+    refined = live.refined()
+    assert refined is not None
+    noise = camera.sensor.noise
+    light, exposure_s = 1.0, first.exposure_s
+    expected = emmc.reconstruct(
+        psi,
+        noise.normalise(first.mosaic[None], exposure_s, light),
+        "tv",
+        noise_sigma=refined[0].parameters["noise_sigma"],
+    )
+    assert np.abs(refined[0].light_field - expected.light_field).max() < 1e-5
+    assert told["verdict"]["level"] == expected.verdict.level
+    assert "as `reconstruct`" in told["stage"]
+    shown = live.pictures()
+    assert shown is not None
+    assert shown.sheet.shape == (5 * SIZE[0], 5 * SIZE[1], 3)
+
+
+def test_noise_is_no_change_and_a_changed_scene_ends_the_reconstruction(one_shot):
+    camera, psi, scene = one_shot
+    other = open_scene("deep-occlusions", size=SIZE, views=camera.views).light_field
+    clock, given_up = Seconds(), []
+
+    def endless(method, psi, readings, noise, dictionary, settings, usable, on_step):
+        from reconstruction.result import Progress
+
+        try:
+            for step in range(10**6):
+                on_step(Progress(step, None, None))
+                time.sleep(0.001)
+        except Exception as fault:
+            given_up.append(fault)
+            raise
+        raise AssertionError
+
+    live = LiveLightField(designed_scale(psi), "tv", endless, clock)
+    frames = [live_frames(camera, psi, scene, seed)[0] for seed in range(4)]
+    for number, frame in enumerate(frames):
+        clock.now = float(number)
+        told = live.update(frame)
+    assert "at work" in told["stage"]
+    assert live.update(live_frames(camera, psi, other, 9)[0])["stage"] == "preview"
+    until(lambda: given_up)
+    live.close()
+
+
+def test_shots_are_held_until_the_scene_changes():
+    camera = emmc.camera("rgbw-bayer-3shots")
+    psi = camera.psi(SIZE)
+    scenes = [
+        open_scene("near-planar", size=SIZE, views=camera.views, seed=seed).light_field
+        for seed in (0, 1)
+    ]
+    live = LiveLightField(designed_scale(psi), "tv", clock=Seconds())
+    first, second = (live_frames(camera, psi, scene) for scene in scenes)
+    assert live.update(first[0], 0)["shots"] == [1, 3]
+    assert live.update(first[2], 2)["shots"] == [2, 3]
+    assert "no shot" in live.update(first[1], None)["why"]
+    assert live.update(first[1], 1)["shots"] == [3, 3]
+    assert live.update(second[1], 1)["shots"] == [1, 3]
+
+
+def test_frames_that_do_not_fit_and_dark_ones_are_refused_in_words(one_shot):
+    _, psi, _ = one_shot
+    live = LiveLightField(designed_scale(psi), "tv")
+    with pytest.raises(AppError, match="48x64"):
+        live.update(frame_of(np.full((16, 16), 900)))
+    dark = live.update(frame_of(np.full(SIZE, 256), "rggb"))
+    assert "dark" in dark["why"]
+    assert dark["pictures"] is None
+
+
+def test_a_psi_is_opened_with_what_lies_beside_it(tmp_path, one_shot):
+    _, psi, _ = one_shot
+    psi.save(tmp_path / "psi.h5")
+    assert open_scale(tmp_path).psi.checksum() == psi.checksum()
+    assert open_scale(tmp_path / "psi.h5").white_dn_per_s.shape == psi.frames_shape
+    with pytest.raises(AppError, match="no Psi"):
+        open_scale(tmp_path / "elsewhere")
+    nameless = ImagingMatrix(psi.weights, psi.colour)
+    nameless.save(tmp_path / "nameless.h5")
+    with pytest.raises(AppError, match="does not know its camera"):
+        open_scale(tmp_path / "nameless.h5")
+
+
+def test_a_solver_that_fails_is_reported(one_shot):
+    camera, psi, scene = one_shot
+
+    def failing(*_):
+        raise ReconstructionError("no luck")
+
+    clock = Seconds()
+    live = LiveLightField(designed_scale(psi), "tv", failing, clock)
+    frame = live_frames(camera, psi, scene)[0]
+    live.update(frame)
+    clock.now = 5.0
+    until(lambda: live.update(frame)["why"] == "no luck")

@@ -1,0 +1,102 @@
+"""Views between views: planes move as they must, near things hide far ones, light is averaged."""
+
+import cv2
+import numpy as np
+import pytest
+
+from emmc_rig.model.lightfield import centre_view, refocus
+from emmc_rig.model.novel_view import (
+    between,
+    estimated_disparity,
+    photograph,
+    view_disparities,
+)
+
+VIEWS, SIZE = (5, 5), (60, 80)
+INNER = np.s_[8:-8, 8:-8]
+
+
+def waves(y, x, seed=0):
+    """A smooth texture at any place, (y, x, 3)."""
+    phases = np.random.default_rng(seed).uniform(0, 6, 3)
+    return np.stack([0.5 + 0.4 * np.sin(0.35 * x + 0.2 * y + p) for p in phases], axis=-1)
+
+
+def layered(v, u, far_px=-1.0, near_px=2.0):
+    """A near square before a far plane, seen from (v, u): picture (y, x, 3), disparity (y, x)."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float32)
+    near_y, near_x = y - near_px * (v - 2), x - near_px * (u - 2)
+    near = (np.abs(near_y - 30) < 12) & (np.abs(near_x - 40) < 16)
+    far = waves(y - far_px * (v - 2), x - far_px * (u - 2))
+    picture = np.where(near[..., None], waves(near_y, near_x, 1) * [1, 0.3, 0.3], far)
+    return picture.astype(np.float32), np.where(near, near_px, far_px).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    seen = [[layered(v, u) for u in range(5)] for v in range(5)]
+    light_field = np.array([[one[0] for one in row] for row in seen])
+    disparities = np.array([[one[1] for one in row] for row in seen])
+    return light_field, disparities
+
+
+def test_a_view_that_there_is_comes_back_as_it_is(scene):
+    light_field, disparities = scene
+    np.testing.assert_allclose(
+        between(light_field, disparities, 3, 1), light_field[3, 1], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(("v", "u"), [(1.5, 2.5), (0.25, 3.0), (3.4, 3.9)])
+def test_a_view_between_has_near_before_far_where_they_truly_are(scene, v, u):
+    light_field, disparities = scene
+    drawn, (truth, depth) = between(light_field, disparities, v, u), layered(v, u)
+    # Along the square's outline a ray's nearest samples are of two surfaces.
+    outline = cv2.dilate(
+        cv2.Laplacian(depth, cv2.CV_32F).astype(bool).astype(np.uint8), np.ones((5, 5))
+    )
+    clear = outline[INNER] == 0
+    missed = np.abs(drawn - truth)[INNER][clear]
+    assert missed.max() < 0.01
+    nearest = light_field[round(v), round(u)]
+    assert missed.mean() < np.abs(nearest - truth)[INNER][clear].mean() / 3
+
+
+def test_what_every_view_sees_follows_from_the_centre(scene):
+    _, disparities = scene
+    made = view_disparities(centre_view(disparities[..., None])[..., 0], VIEWS)
+    agreed = np.abs(made - disparities)[:, :, *INNER] < 0.01
+    assert agreed.mean() > 0.99
+    assert np.isfinite(made).all()
+
+
+def test_a_plane_s_disparity_is_estimated():
+    light_field = np.array(
+        [
+            [
+                waves(
+                    *np.mgrid[: SIZE[0], : SIZE[1]] - 0.8 * np.array([v - 2, u - 2])[:, None, None]
+                )
+                for u in range(5)
+            ]
+            for v in range(5)
+        ],
+        np.float32,
+    )
+    assert np.median(np.abs(estimated_disparity(light_field) - 0.8)) < 0.1
+
+
+def test_a_full_aperture_is_the_mean_of_the_sheared_views(scene):
+    light_field, disparities = scene
+    opened = photograph(light_field, disparities, 2, 2, 2.0, aperture=10)
+    np.testing.assert_allclose(opened[INNER], refocus(light_field, 2.0)[INNER], atol=1e-5)
+
+
+def test_a_closed_aperture_is_a_view_and_light_not_codes_is_averaged(scene):
+    light_field, disparities = scene
+    pinhole = photograph(light_field, disparities, 1.5, 2, 0.0, aperture=0, gamma=2.2)
+    np.testing.assert_array_equal(pinhole, between(light_field, disparities, 1.5, 2))
+    flat = np.zeros((*VIEWS, 4, 4, 3), np.float32)
+    flat[0] = 1
+    mixed = photograph(flat, np.zeros((*VIEWS, 4, 4), np.float32), 2, 2, 0.0, 10, gamma=2.0)
+    np.testing.assert_allclose(mixed, np.sqrt(1 / 5), rtol=1e-5)

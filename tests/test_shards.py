@@ -1,0 +1,67 @@
+"""Zarr groups that workers write shard by shard: the numbers of the HDF5 files, and read again."""
+
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pools import Here
+
+from emmc_rig.commands.simulate import simulate_into
+from emmc_rig.errors import AppError
+from emmc_rig.files import shards
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.reconstruct.solve import reconstruct_folder
+from reconstruction.methods import BlockSettings, MethodSettings
+from reconstruction.tv import TVSettings
+
+CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
+SETTINGS = MethodSettings(
+    blocks=BlockSettings(whole=1000, side=32, blend=4), tv=TVSettings(max_steps=5)
+)
+
+
+def reconstructed(frames, out, **more):
+    with result_folder(out, "reconstruct", resumes=True) as new:
+        return reconstruct_folder(
+            frames, new, "tv", settings=SETTINGS, truth=SCENE, pool=Here(backwards=True), **more
+        )
+
+
+@pytest.fixture
+def frames(tmp_path):
+    (tmp_path / "frames").mkdir()
+    simulate_into(tmp_path / "frames", SCENE, CAMERA, find_camera(CAMERA), SIZE, 0)
+    return tmp_path / "frames"
+
+
+def test_shards_hold_what_the_file_holds_and_open_as_a_scene(frames, tmp_path, monkeypatch):
+    zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    monkeypatch.setattr(shards, "SHARD", 32)
+    monkeypatch.setattr(shards, "CHUNK", 16)
+    plain = reconstructed(frames, tmp_path / "plain")
+    sharded = reconstructed(frames, tmp_path / "sharded", as_zarr=True)
+    for figure in ("psnr_db", "ssim", "replicate_psnr_db"):
+        assert sharded[figure] == pytest.approx(plain[figure], rel=1e-12)
+    with h5py.File(tmp_path / "plain/light_field.h5") as file:
+        expected = np.asarray(file["light_field"])
+    group = tmp_path / "sharded/result.zarr"
+    stored = zarr.open_group(group, mode="r")["light_field"]
+    assert (stored.metadata.zarr_format, stored.shards[2:4], stored.chunks[:4]) == (
+        3, (32, 32), (1, 1, 16, 16),
+    )  # fmt: skip
+    np.testing.assert_array_equal(stored[...], expected)
+    np.testing.assert_array_equal(np.asarray(open_scene(str(group), views=(5, 5))), expected)
+    assert not (tmp_path / "sharded/light_field.h5").exists()
+
+
+def test_without_the_extra_or_without_the_array_one_line_says_so(tmp_path, monkeypatch):
+    pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    with pytest.raises(AppError, match="no array light_field"):
+        shards.load_light_field(tmp_path)
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(AppError, match=r"pip install 'emmc-rig\[zarr\]'"):
+        shards.created_group(Path(tmp_path / "new"))
