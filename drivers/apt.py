@@ -56,7 +56,7 @@ ACTUATORS = {
     "z825b": Actuator(34.55496, 25_000.0, 2_600.0),
 }
 """By stage: counts per millimetre from "Scaling parameters" of the protocol document, travel and
-maximum velocity from the data sheets. No controller tells which one is plugged in."""
+maximum velocity from the data sheets. No controller reports which one is plugged in."""
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class AptStage(HostStage):
 
 
 class _Link:
-    """Messages on one port; those that nobody asked for are kept until somebody does."""
+    """Messages on one port; unexpected ones are kept until they are requested."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.transport = transport

@@ -218,7 +218,7 @@ def data_length(header: bytes) -> int:
     if not 0 < message_id <= HIGHEST_ID:
         raise GarbledReplyError(header, f"no message has the id {message_id:#06x}")
     if destination & ~HAS_DATA not in PLACES or source not in PLACES:
-        raise GarbledReplyError(header, "nobody has that address")
+        raise GarbledReplyError(header, "no device has that address")
     if not destination & HAS_DATA:
         return 0
     if length > LONGEST_DATA:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -146,6 +147,33 @@ def check_frame(
             f"it was exposed for {frame.exposure_s:g} s instead of {exposure_s:g} s"
         )
     return frame
+
+
+class ShapeFromFrames(ABC):
+    """Base of cameras whose frames alone tell their shape and colours: `snap` keeps both."""
+
+    _shape: tuple[int, int] | None = None
+    _cfa: str | None = None
+
+    @abstractmethod
+    def snap(self) -> RawFrame:
+        """Expose and return one frame; raises a `DriverError`."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame; exposes one if there was none yet."""
+        if self._shape is None:
+            self.snap()
+        assert self._shape is not None
+        return self._shape
+
+    @property
+    def cfa(self) -> str:
+        """Colour phase or tile name of a frame; exposes one if there was none yet."""
+        if self._cfa is None:
+            self.snap()
+        assert self._cfa is not None
+        return self._cfa
 
 
 class CaptureTransport(Protocol):

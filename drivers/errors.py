@@ -66,7 +66,7 @@ class PortNotFoundError(PortError):
 
 
 class PortBusyError(PortError):
-    """The serial port exists, but somebody else holds it; `holder` is "" when nobody can tell."""
+    """The serial port exists, but another program holds it; `holder` is "" where it is unknown."""
 
     def __init__(self, port: str, reason: str, holder: str = "") -> None:
         what = f"is held by {holder}" if holder else f"cannot be opened ({reason})"

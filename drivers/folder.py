@@ -43,9 +43,9 @@ class FolderCamera:
         self._next: RawFrame | None = first
         self.shape: tuple[int, int] = first.mosaic.shape
         self.cfa = first.cfa
-        told = first.metadata
+        metadata = first.metadata
         self.identity = CameraIdentity(
-            told.get("maker", ""), told.get("model", ""), told.get("serial", "")
+            metadata.get("maker", ""), metadata.get("model", ""), metadata.get("serial", "")
         )
 
     @property

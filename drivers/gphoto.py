@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
+from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
@@ -48,7 +48,7 @@ def seconds_of(choice: str) -> float | None:
     return value if value > 0 else None
 
 
-class GphotoCamera:
+class GphotoCamera(ShapeFromFrames):
     """A still camera set to RAW and manual exposure, found by libgphoto2.
 
     address: a port such as `usb:001,007` or `ptpip:192.168.1.5`; "" takes the first camera found.
@@ -77,8 +77,6 @@ class GphotoCamera:
         self._clock = clock
         self._delete = delete
         self._lock = threading.RLock()
-        self._shape: tuple[int, int] | None = None
-        self._cfa: str | None = None
         self._closed = False
         with self._asking("open the camera"):
             self._camera: Any = self._gp.Camera()
@@ -93,22 +91,6 @@ class GphotoCamera:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame; exposes one if there was none yet."""
-        if self._shape is None:
-            self.snap()
-        assert self._shape is not None
-        return self._shape
-
-    @property
-    def cfa(self) -> str:
-        """Colour phase or tile name of a frame; exposes one if there was none yet."""
-        if self._cfa is None:
-            self.snap()
-        assert self._cfa is not None
-        return self._cfa
 
     @property
     def exposure_s(self) -> float:

@@ -28,7 +28,7 @@ EXCHANGE_LIMIT_S = 2.0
 BOOT_S = 4.0
 """Opening the port resets an Arduino, which answers after its boot loader."""
 REPORTS_UNTIL_OFFSET = 40
-"""Grbl tells the work offset in every 30th report at the latest ("Interface", WCO)."""
+"""Grbl reports the work offset in every 30th report at the latest ("Interface", WCO)."""
 POLL_S = 0.05
 AXIS_LETTERS = "XYZABC"
 REPORT_STEP_UM = 1.0
@@ -324,7 +324,7 @@ class _Controller:
         raise AssertionError("unreachable")
 
     def machine_position_mm(self) -> tuple[codec.Status, tuple[float, ...]]:
-        """Return a report and MPos, from WPos and the work offset where that is all it tells."""
+        """Return a report and MPos, from WPos and the work offset where a report has only these."""
         unit = codec.MM_PER_INCH if self.settings.get(codec.REPORT_INCHES) else 1.0
         for _ in range(REPORTS_UNTIL_OFFSET):
             status = self.status()
@@ -335,7 +335,7 @@ class _Controller:
             if status.work is not None and self._offset_mm is not None:
                 pairs = zip(status.work, self._offset_mm, strict=False)
                 return status, tuple(work * unit + offset for work, offset in pairs)
-        raise GarbledReplyError(b"", "no report tells the work offset").about(command="?")
+        raise GarbledReplyError(b"", "no report states the work offset").about(command="?")
 
     def command(self, line: str, axis: str = "the controller") -> dict[str, str]:
         """Send a line once and return the feedback before its `ok`, by kind."""
@@ -384,8 +384,7 @@ class _Controller:
         """Wait for the next line, and return whether homing goes on.
 
         It ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
-        of rest that no `ok` follows means that homing never began, or that nobody knows how it
-        ended.
+        of rest that no `ok` follows means that homing never began, or that its end is unknown.
         """
         if not self._homing_lines:
             return False
@@ -553,8 +552,8 @@ def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK, boot_s: float = 
     """
     controller = _Controller(transport, clock, _log.info)
     controller.wait_for_status(boot_s)
-    told = controller.command("$I")
-    return f"version {told.get('VER', 'unknown')}, options {told.get('OPT', 'unknown')}"
+    options = controller.command("$I")
+    return f"version {options.get('VER', 'unknown')}, options {options.get('OPT', 'unknown')}"
 
 
 def _refused(line: str, refusal: codec.Refusal, axis: str) -> CommandRefusedError:

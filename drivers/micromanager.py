@@ -52,7 +52,7 @@ BAYER_ROWS = {
     "bggr": ("bg", "gr"),
 }
 SPEED_UM_S = 100.0
-"""Of a stage that does not tell: slow, so that no time limit is too short."""
+"""Of a stage that does not state its own: slow, so that no time limit is too short."""
 
 PropertyValue = str | int | float
 
@@ -214,9 +214,9 @@ class MicroManagerCamera:
 
     @property
     def identity(self) -> CameraIdentity:
-        """The adapter, the camera's name and number as far as it tells them."""
+        """The adapter, the camera's name and number as far as it states them."""
         core = self._loaded.core
-        with calling("tell about the camera"):
+        with calling("describe the camera"):
             known = {
                 name: core.getProperty(self.label, name)
                 for name in ("CameraName", "CameraID")
@@ -229,14 +229,14 @@ class MicroManagerCamera:
     @property
     def exposure_s(self) -> float:
         """Exposure of the next frame, read from the core."""
-        with calling("tell the exposure"):
+        with calling("read the exposure"):
             return self._loaded.core.getExposure(self.label) / 1e3
 
     @property
     def exposure_limits_s(self) -> Limits:
         """Shortest and longest exposure: of the property Exposure where it has limits."""
         core = self._loaded.core
-        with calling("tell the limits of the exposure"):
+        with calling("read the limits of the exposure"):
             has = core.hasProperty(self.label, "Exposure")
             if not (has and core.hasPropertyLimits(self.label, "Exposure")):
                 return SHORTEST_S, LONGEST_S
@@ -247,7 +247,7 @@ class MicroManagerCamera:
     def details(self) -> dict[str, str]:
         """Return every property of the camera, by name."""
         core = self._loaded.core
-        with calling("tell the properties"):
+        with calling("list the properties"):
             return {
                 name: core.getProperty(self.label, name)
                 for name in core.getDevicePropertyNames(self.label)
@@ -367,7 +367,7 @@ class MicroManagerCamera:
 
     @contextmanager
     def _alone(self) -> Iterator[CMMCorePlus]:
-        """Yield the core, made to use this camera, which nobody else exposes meanwhile."""
+        """Yield the core, made to use this camera; others wait until it is released."""
         if self._closed:
             raise CameraClosedError(self.label)
         with self._loaded.lock:
@@ -438,7 +438,7 @@ class StageSetup:
 class MicroManagerStage(HostStage):
     """Stages of a loaded core, which it closes; raises `MicroManagerError` for a wrong axis.
 
-    An adapter tells neither whether it was homed nor how far it may go: homing is done once after
+    An adapter states neither whether it was homed nor its travel: homing is done once after
     every connection, and the limits are those of the configuration.
     """
 
@@ -465,7 +465,7 @@ class MicroManagerStage(HostStage):
                     )
                 if axis not in setup.travel_um:
                     raise MicroManagerError(
-                        f"Micro-Manager does not tell how far {axis} may go",
+                        f"Micro-Manager does not state the travel of {axis}",
                         f"state travel_um: {{{axis}: [LOWEST, HIGHEST]}} in a YAML file",
                     )
             self._start_up()
@@ -484,7 +484,7 @@ class MicroManagerStage(HostStage):
         self._require_axis(axis)
         label, coordinate = self._place(axis)
         core = self._loaded.core
-        with calling("tell about hardware sequences"):
+        with calling("describe hardware sequences"):
             if coordinate is None and core.isStageSequenceable(label):
                 return core.getStageSequenceMaxLength(label)
             if coordinate is not None and core.isXYStageSequenceable(label):

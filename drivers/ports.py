@@ -32,7 +32,7 @@ COMMAND_LINE_SHOWN = 60
 
 @dataclass(frozen=True)
 class PortInfo:
-    """One serial port of this computer; what its USB adapter does not tell is None or ""."""
+    """One serial port of this computer; what its USB adapter does not state is None or ""."""
 
     device: str
     description: str
@@ -96,7 +96,7 @@ def usb_serial_number(device: str) -> str:
 
 
 def holder_of(device: str) -> str:
-    """Return "program (pid N)" of a process that has the device open, "" when nobody can be seen.
+    """Return "program (pid N)" of a process that has the device open, "" where none is visible.
 
     Looks for a lock on the device in /proc/locks, which shows those of every user, then for the
     device among the open files of the processes that this user may inspect. Linux only.

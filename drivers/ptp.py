@@ -17,7 +17,7 @@ from pathlib import PurePosixPath
 from typing import Protocol
 
 from drivers import ptp_codec as codec
-from drivers.camera import CameraIdentity, Limits, check_frame, check_setting
+from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
@@ -294,7 +294,7 @@ class PtpSession:
             if response.code == Code.BUSY and not last:
                 self.clock.sleep(self.settings.busy_poll_s)
             elif response.code == Code.SESSION_ALREADY_OPEN and not last:
-                _log.info("%s: closing the session that somebody left open", self.name)
+                _log.info("%s: closing a session that was left open", self.name)
                 self._end_foreign_session()
             else:
                 raise _refused(Operation.OPEN_SESSION, response.code)
@@ -411,7 +411,7 @@ class PtpSession:
             wanted = min(self.settings.part_bytes, info.size - done)
             reason = "the camera sent nothing"
             try:
-                told = self.request(
+                answered = self.request(
                     Operation.GET_PARTIAL_OBJECT,
                     handle,
                     done,
@@ -420,8 +420,8 @@ class PtpSession:
                     most=wanted,
                 )
                 came = received.tell() - done
-                if told and told[0] != came:
-                    reason = f"{came} bytes came of the {told[0]} that it says it sent"
+                if answered and answered[0] != came:
+                    reason = f"{came} bytes came of the {answered[0]} that it says it sent"
                     received.seek(done)
             except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
                 # Nobody knows whether what came before the fault is in its place.
@@ -479,10 +479,10 @@ def is_raw(info: ObjectInfo) -> bool:
     return info.format == Format.DNG or suffix in RAW_SUFFIXES
 
 
-class PtpCamera:
+class PtpCamera(ShapeFromFrames):
     """A still camera set to RAW (or RAW with JPEG) and manual exposure.
 
-    PTP does not tell how large a RAW frame is: where `shape` is not given, asking for it before
+    PTP does not state how large a RAW frame is: where `shape` is not given, asking for it before
     the first frame exposes one. Every frame must have that shape and its colours. `from_card`:
     delete each picture from the card once it has arrived; otherwise the card fills up.
     `on_progress` gets the bytes of a picture done and in all.
@@ -520,27 +520,11 @@ class PtpCamera:
         self.close()
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame; exposes one if there was none yet."""
-        if self._shape is None:
-            self.snap()
-        assert self._shape is not None
-        return self._shape
-
-    @property
-    def cfa(self) -> str:
-        """Colour phase or tile name of a frame; exposes one if there was none yet."""
-        if self._cfa is None:
-            self.snap()
-        assert self._cfa is not None
-        return self._cfa
-
-    @property
     def exposure_s(self) -> float:
         """Exposure of the next frame, as the camera states it."""
         exposure_s = self._exposure.value
         if exposure_s is None:
-            raise CameraSettingError("exposure", "is not told over PTP: see the frames' own")
+            raise CameraSettingError("exposure", "is not reported over PTP: see the frames' own")
         return exposure_s
 
     @property
@@ -576,7 +560,7 @@ class PtpCamera:
             for card in self.session.storages()
         )
         return {
-            "battery": "not told" if battery is None else f"{battery:g} %",
+            "battery": "not reported" if battery is None else f"{battery:g} %",
             "cards": cards or "none",
             "downloads": "in parts" if self.session.can(Operation.GET_PARTIAL_OBJECT) else "whole",
         }

@@ -164,7 +164,7 @@ class EosBody:
         self._ask()
 
     def _ask(self) -> None:
-        """Take what the camera has to tell: settings are kept, new objects become events."""
+        """Read the camera's pending events: settings are kept, new objects become events."""
         data = self._session.fetch(EosOperation.GET_EVENT)
         for kind, payload in records(data):
             if len(payload) < 4:

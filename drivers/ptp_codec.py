@@ -84,7 +84,7 @@ class Code(IntEnum):
 
 
 class EventCode(IntEnum):
-    """What a camera tells unasked."""
+    """Events that a camera sends on its own."""
 
     OBJECT_ADDED = 0x4002
     OBJECT_REMOVED = 0x4003

@@ -120,7 +120,7 @@ class StandardDial:
 
 
 class CodedDial:
-    """A property whose values are a maker's codes; `codes` and `read` tell what it can be and is.
+    """A property whose values are a maker's codes; `codes`: its values; `read`: its present one.
 
     meaning: of a code, None for those that are no numbers. write: sets a code.
     """

@@ -248,4 +248,4 @@ class PtpUsb:
 
 
 def _forget(piece: memoryview) -> None:
-    """Take data that nobody waits for."""
+    """Discard data that no request expects."""

@@ -32,9 +32,8 @@ PANASONIC = b"IIU\x00"
 EXPOSURE_TIME_TAG = 33434
 EXIF_TAG = 34665
 IMAGE_DESCRIPTION_TAG = 270
-SUB_IFDS_TAG = 330
 CFA_TILE_PREFIX = "cfa_tile="
-"""An ImageDescription that begins so names a colour tile that LibRaw's 2x2 phase cannot tell."""
+"""An ImageDescription that begins so names a colour tile larger than LibRaw's 2x2 phase."""
 
 RAW_SUFFIXES = frozenset(
     (
@@ -102,7 +101,7 @@ class RawFrame:
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
     `exposure_s`: None where neither the file nor the camera says.
     `original`: the camera's own bytes, `sha256` their digest in hexadecimal.
-    `gain`: linear, 1 at the camera's base sensitivity; None where nobody says.
+    `gain`: linear, 1 at the camera's base sensitivity; None where it is unknown.
     `camera_time_s`: the camera's own timestamp, from an origin of its own.
     `host_time_s`: when the frame had arrived, on the clock that the camera was given.
     `metadata`: what else the camera said of the frame.
@@ -130,13 +129,13 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
     picture, or a mosaic whose `(y, x)` is not `expected_shape`. LibRaw reports most damage, but
     fills what is missing of a plain DNG, of an empty tile or of a Panasonic's RW2 with zeros: the
     table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked first. A
-    flipped bit that still decodes cannot be told from light: keep `sha256`.
+    flipped bit that still decodes cannot be distinguished from light: keep `sha256`.
     """
     if not data:
         raise RawFrameError("it is empty")
-    told = _read_tiff(data) if data[:4] in TIFF_MAGICS else _Told()
+    tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
     with hashed(data) as digest:
-        mosaic, black_level_dn, white_level_dn, cfa = told.pixels or decode_by_libraw(data)
+        mosaic, black_level_dn, white_level_dn, cfa = tags.pixels or decode_by_libraw(data)
     if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
         raise RawFrameError("it holds colour or floating-point pixels, not one mosaic of 16 bits")
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
@@ -149,16 +148,16 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
         mosaic=mosaic,
         black_level_dn=black_level_dn,
         white_level_dn=white_level_dn,
-        cfa=told.tile or cfa,
-        exposure_s=told.exposure_s,
+        cfa=tags.tile or cfa,
+        exposure_s=tags.exposure_s,
         original=data,
         sha256=digest.hexdigest(),
-        metadata=told.metadata,
+        metadata=tags.metadata,
     )
 
 
 @dataclass(frozen=True)
-class _Told:
+class _TiffTags:
     """What the file says besides its pixels."""
 
     exposure_s: float | None = None
@@ -217,7 +216,7 @@ def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
     return by_colour[np.array(colours)], "".join(letters[c] for pair in colours for c in pair)
 
 
-def _read_tiff(data: bytes) -> _Told:
+def _read_tiff(data: bytes) -> _TiffTags:
     """Return what the tags say, having checked that every strip lies inside the file."""
     try:
         magic = data[:4]
@@ -244,7 +243,7 @@ def _read_tiff(data: bytes) -> _Told:
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
     tile = description.removeprefix(CFA_TILE_PREFIX)
-    return _Told(
+    return _TiffTags(
         exposure_s,
         tile if tile != description else None,
         {name: _shown(value) for name, value in metadata.items() if value is not None},

@@ -284,7 +284,7 @@ class HostStage(ABC):
         return False
 
     def _why_short(self, axis: str) -> DriverError | None:
-        """Return why the axis stands away from its target, where the device tells."""
+        """Return why the axis stands away from its target, where the device reports it."""
         return None
 
     @property
@@ -422,7 +422,7 @@ class HostStage(ABC):
         """Stop the given axes (all by default) at once, and return when they stand.
 
         Every axis is tried before the first error is raised. An axis that reports a fault counts
-        as standing: the next move tells about it.
+        as standing: the next move reports it.
         """
         chosen = self._choose(axes)
         errors: list[DriverError] = []
@@ -514,12 +514,12 @@ class HostStage(ABC):
             return False
 
     def _send_once(self, axes: Iterable[str], send: Callable[[], None]) -> None:
-        """Send a command that must not be repeated; the position tells later if it arrived."""
+        """Send a command that must not be repeated; the position shows later if it arrived."""
         try:
             send()
         except (TransportTimeoutError, GarbledReplyError) as error:
             _log.warning(
-                "%s: no answer to a motion command, the position will tell: %s",
+                "%s: no answer to a motion command, the position will show it: %s",
                 ", ".join(axes),
                 error,
             )
@@ -599,7 +599,7 @@ class HostStage(ABC):
     def _stopped_on_error(self, axes: Iterable[str]) -> Iterator[None]:
         """Stop every axis when anything goes wrong, Ctrl-C included, and note what is now unknown.
 
-        Nothing, a second Ctrl-C neither, keeps an axis from being told to stop.
+        Nothing, a second Ctrl-C neither, keeps an axis from being stopped.
         """
         try:
             yield

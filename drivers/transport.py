@@ -241,7 +241,7 @@ class SerialTransport:
         self._heard |= not IN_USE.startswith(self._unread[: len(IN_USE)])
 
     def _gone(self) -> PortError:
-        """Return why the port failed; a network port that never spoke is somebody else's."""
+        """Return why the port failed; a network port that never answered is in use."""
         if "://" in self.port and not self._heard:
             return PortBusyError(self.port, "it hung up at once", NETWORK_HOLDER)
         return PortGoneError(self.port)

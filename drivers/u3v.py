@@ -258,7 +258,7 @@ class U3vCamera:
                 self._stop()
             raise
         except BaseException:
-            # The first fault is the one to tell; a camera that is gone cannot be stopped.
+            # The first fault is reported; a camera that is gone cannot be stopped.
             with suppress(DriverError):
                 self._stop()
             raise

@@ -147,7 +147,7 @@ class UsbDevice:
             raise UsbNotFoundError(f"interface of class {_shown(kind)} on {self.name}")
         number = found.bInterfaceNumber
         with self._faults():
-            # Not every system can tell or detach; the claim below then decides.
+            # Not every system can query or detach; the claim below then decides.
             with suppress(NotImplementedError):
                 if self._device.is_kernel_driver_active(number):
                     self._device.detach_kernel_driver(number)
@@ -185,7 +185,7 @@ class UsbDevice:
         if self._closed:
             return
         self._closed = True
-        # Nothing can be mended here: whatever fails is what the device's absence makes fail.
+        # Nothing to repair: the device is gone, so that its requests fail.
         for number in self._detached:
             with suppress(usb.core.USBError, NotImplementedError):
                 usb.util.release_interface(self._device, number)
@@ -303,7 +303,7 @@ class UsbPipe:
         """Send all of `data`, going on after partial writes.
 
         `end`: mark the end by an empty packet where the last one is full. Raises as `read_into`;
-        `UsbTimeoutError.done` tells how much went out.
+        `UsbTimeoutError.done` is how much went out.
         """
         device = self._device
         device._require_open()

@@ -147,7 +147,7 @@ class ZaberStage(HostStage):
             return self._move_without_settling({axis: target_um})[axis]
         finally:
             self._signal = None
-            with suppress(DriverError):  # of a move that failed, the first fault is the one to tell
+            with suppress(DriverError):  # of a move that failed, the first fault is reported
                 self._chain.query(device, 0, f"trigger {TRIGGER} disable", axis)
 
     def _arm_signal(self, axis: str, target_um: float, start_um: float) -> None:
@@ -278,7 +278,7 @@ class ZaberStage(HostStage):
         return known_um
 
     def _is_modified(self, axis: str, peripheral_id: int | None) -> bool:
-        """Return whether the maker fitted other mechanics than the ids tell."""
+        """Return whether the maker fitted other mechanics than the ids state."""
         if peripheral_id:
             return self._optional(axis, "peripheral.hw.modified") == 1
         return self._optional(axis, "device.hw.modified", whole_device=True) == 1
@@ -385,7 +385,7 @@ class _Chain:
         return message
 
     def broadcast(self, data: str) -> list[codec.Reply]:
-        """Send a command to every device and return the replies, until nobody says any more."""
+        """Send a command to every device and return the replies, until none comes any more."""
         message_id = next(self._message_ids)
         replies = []
         with self._transport.lock:
@@ -425,7 +425,7 @@ class _Chain:
 
 
 def find_devices(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> list[ZaberDevice]:
-    """Return the devices on a chain by address, an empty list when nobody answers; moves nothing.
+    """Return the devices on a chain by address, an empty list where none answers; moves nothing.
 
     Raises `GarbledReplyError` for bytes that are not the protocol's, or two devices that share
     an address.

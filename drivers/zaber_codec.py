@@ -41,7 +41,7 @@ FLAG_MEANINGS = {
     "WP": "calibration of the wrong type",
     "WR": "no reference position",
     "WH": "not homed",
-    "NC": "somebody turns its knob",
+    "NC": "its knob is being turned",
     "NI": "movement interrupted",
 }
 """Warning flags, the most severe first: a reply shows the first one that is raised."""

@@ -1,4 +1,4 @@
-"""Who watches a long run: its stages and steps, shown by whoever cares, or by nobody."""
+"""What shows the stages and steps of a long run: the interface, and one that shows nothing."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Protocol
 
 
 class Watcher(Protocol):
-    """Whoever shows the progress of a long run."""
+    """Shows the progress of a long run."""
 
     def begin(self, stage: str, steps: int | None) -> None:
-        """A stage begins; steps is None where it is not known how many there will be."""
+        """Begin a stage; steps: how many it will have, None where that is not known."""
         ...
 
     def step(self, detail: str) -> None:
-        """One step of the current stage is done."""
+        """Show that one step of the current stage is done."""
         ...
 
 

@@ -26,7 +26,7 @@ Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
 MINIMISERS = ("admm", "lars", "ista", "fista")
 SL0_RIDGE = 1e-5
 LARS_GAP = 0.05
-"""A path that ends further from the minimiser went wrong by rounding: told as not converged."""
+"""A path that ends further from the minimiser went wrong by rounding: status not converged."""
 
 
 class BPDNSettings(Settings):
@@ -170,7 +170,7 @@ def prepared(
         elif settings.method == "lars":
             steps = kernels.lars(atoms, one, eta, settings.max_steps, weights)
             correlation = np.empty(count, dtype=np.float32)
-            gap = kernels.judge(atoms, one, np.float32(eta), weights, correlation)[1]
+            gap = kernels.objective_and_gap(atoms, one, np.float32(eta), weights, correlation)[1]
             if steps != kernels.NONE:
                 return Code(weights, eta, gap, np.nan, steps, gap <= LARS_GAP)
             steps = settings.max_steps

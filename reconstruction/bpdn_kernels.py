@@ -184,7 +184,7 @@ def norms(atoms, out):
 
 
 @njit(cache=True, nogil=True)
-def judge(atoms, data, eta, code, correlation):
+def objective_and_gap(atoms, data, eta, code, correlation):
     """Return the objective of eq. 8 and its relative duality gap; set the correlations.
 
     The dual point is the residual, shrunk until no atom correlates with it more than eta.

@@ -96,10 +96,10 @@ class Dictionary:
             (f"{has_y}x{has_x} pixels", f"{patch[0]}x{patch[1]}", (has_y, has_x) != tuple(patch)),
             (f"{has_c} colour(s)", f"{colours}", has_c != colours),
         ]
-        told = [f"{has}, not {needs}" for has, needs, differs in faults if differs]
-        if told:
+        differences = [f"{has}, not {needs}" for has, needs, differs in faults if differs]
+        if differences:
             raise DictionaryError(
-                f"the dictionary's patches have {'; '.join(told)}: "
+                f"the dictionary's patches have {'; '.join(differences)}: "
                 "train or choose a dictionary for these patches"
             )
         return self

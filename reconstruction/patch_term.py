@@ -24,7 +24,7 @@ Array = NDArray[np.floating]
 class PatchTerm:
     """target: M, (v, u, y, x, c) float32. weight: W, (y, x) float32, 0 where nothing is known.
 
-    The factor rho stays outside, in the settings of whoever minimises.
+    The factor rho stays outside, in the settings of the solver.
     """
 
     target: NDArray[np.float32]
@@ -155,7 +155,7 @@ def _mean(total: Array, weight: Array) -> NDArray[np.float32]:
 def from_estimate(light_field: Array, weight: float | Array = 1.0) -> PatchTerm:
     """Return the term of a whole estimate (v, u, y, x, c): one patch as large as the light field.
 
-    weight: one for all, or (y, x); where it is 0 the estimate is not looked at.
+    weight: one for all, or (y, x); where it is 0 the estimate is ignored.
     """
     spread = np.broadcast_to(np.asarray(weight, dtype=np.float32), light_field.shape[2:4]).copy()
     seen = (spread > 0)[..., None]

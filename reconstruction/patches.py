@@ -133,7 +133,7 @@ def pixel_of_sample(shape: tuple[int, int], binning: int) -> NDArray[np.int64]:
 def selected_atoms(
     atoms: NDArray[np.float32], colours: NDArray[np.uint8] | None
 ) -> NDArray[np.float32]:
-    """Return the atoms as a pixel of known colour meets them: (atom, part, padded sample).
+    """Return the atoms as a pixel of known colour sees them: (atom, part, padded sample).
 
     atoms: (atom, v, u, y, x, c). colours: (sample,), or None: all three, as parts.
     """

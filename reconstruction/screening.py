@@ -1,8 +1,8 @@
-"""Frames before they are reconstructed: what does not fit the others is left out or evened.
+"""Screening of frames before any method: bad shots and pixels are left out, flicker is evened.
 
-Needs no more than Psi and the frames: a smooth picture that explains their local means predicts
-every reading but for the scene's fine texture, which is alike in all shots and in neighbouring
-pixels. A dark shot, a shot that is another one again, a lamp that flickers and a bad pixel are not.
+Only Psi and the frames are needed. A smooth picture that explains their local means predicts every
+reading except for the scene's fine texture, which is alike in all shots and in neighbouring pixels.
+Dark shots, repeated shots, flicker and bad pixels are not.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
 GAIN_STEPS = 4
 WELL_LIT, FEWEST_LIT = 0.2, 100
-"""Share of the mean prediction that a pixel must reach to judge a shot's brightness; how many."""
+"""Share of the mean prediction that a pixel needs to count for a shot's brightness; how many."""
 ALIKE_PX = 5
-"""Side of the patch whose readings err alike."""
+"""Side of the patch whose readings have correlated errors."""
 NEIGHBOURS_PX, TAIL, FEWEST = 3, 0.1, 6
 BAD_WIDTHS, LEAST_WIDTHS = 3.0, 0.5
 """Of the neighbours' range beyond it, from which on a pixel is called bad."""
@@ -46,7 +46,7 @@ LEAST = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """frames, usable: (shot, pixel_y, pixel_x), for any method. told: what was done, in words.
+    """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
 
     dark, double: shots left out. gains: (shot,), by which the frames were divided, mean 1. bad:
     (pixel_y, pixel_x), pixels left out.
@@ -54,7 +54,7 @@ class Screened:
 
     frames: Array
     usable: NDArray[np.bool_]
-    told: tuple[str, ...]
+    notes: tuple[str, ...]
     dark: tuple[int, ...]
     double: tuple[int, ...]
     gains: Array
@@ -67,15 +67,15 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     frames, usable: (shot, pixel_y, pixel_x), finite where usable. Where nothing is found they
     come back as they are.
     """
-    told, flat = [], flat_psi(psi)
+    notes, flat = [], flat_psi(psi)
     dark = dark_shots(flat, frames, usable)
     usable = _without(usable, dark)
     double = double_shots(flat, frames, usable)
     usable = _without(usable, double)
     if dark:
-        told.append(f"left out {_shots(dark)}: dark, while the others are not")
+        notes.append(f"left out {_shots(dark)}: dark, while the others are not")
     if double:
-        told.append(
+        notes.append(
             f"left out {_shots(double)}: the same as another, although by Psi the masks moved; "
             "look at the stage, or measure Psi again"
         )
@@ -83,14 +83,14 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
-        told.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
+        notes.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
     bad = bad_pixels(flat, frames, usable)
     if bad.any():
         usable = usable & ~bad
-        told.append(
+        notes.append(
             f"left out {int(bad.sum())} pixels ({bad.mean():.2%}) that differ from their neighbours"
         )
-    return Screened(frames, usable, tuple(told), dark, double, gains, bad)
+    return Screened(frames, usable, tuple(notes), dark, double, gains, bad)
 
 
 def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
@@ -135,7 +135,7 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
     """Return the brightness of the light in every shot, mean 1; all 1 where none is sure.
 
     What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
-    every shot: the scene's texture is in all of them. The median over the pixels tells the light.
+    every shot: the scene's texture is in all of them. The median over the pixels is the light.
     """
     even = np.ones(len(frames))
     kept = np.flatnonzero(usable.any(axis=(1, 2)))

@@ -65,7 +65,7 @@ def favoured(atoms: NDArray[np.float32], favour: float) -> NDArray[np.float32]:
 
     A longer atom needs a smaller coefficient, so |beta|_1 hardly counts it. Every patch has a
     mean colour; to penalise it as if it were rare draws all patches towards grey and black, most
-    where the frames tell colours apart but weakly (monochrome sensors).
+    where the frames separate colours weakly (monochrome sensors).
     """
     spread = np.ptp(atoms.reshape(len(atoms), -1, atoms.shape[-1]), axis=1).max(axis=1)
     flat = spread < FLAT * np.abs(atoms).max(axis=(1, 2, 3, 4, 5))

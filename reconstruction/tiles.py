@@ -440,7 +440,7 @@ def surveyed(
         left_out = tuple(sorted((*found.dark, *found.double)))
         gains = tuple(float(gain) for gain in found.gains)
         # Single bad pixels are left to the blocks.
-        words = found.told[: len(found.told) - bool(found.bad.any())]
+        words = found.notes[: len(found.notes) - bool(found.bad.any())]
         read, use = found.frames, found.usable
     halo, largest = REACH, 0.0
     if method.settings is AdaptiveSettings:

@@ -1,1 +1,1 @@
-"""Simulated devices that speak the real bytes, and the bench and scenes that they look at."""
+"""Simulated devices that exchange the real bytes, and the bench and scenes that they look at."""

@@ -182,7 +182,7 @@ class AptController(SimulatedController):
             self._say_status(address, bay, Id.MOT_MOVE_COMPLETED)
 
     def _update(self) -> None:
-        """Send the status that was subscribed to, as long as somebody acknowledges it."""
+        """Send the status that was subscribed to, as long as the client acknowledges it."""
         now_s = self._clock.now_s()
         while self._updates_s is not None and self._updates_s <= now_s:
             if self._updates_left == 0:

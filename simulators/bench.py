@@ -2,7 +2,7 @@
 
 This is an independent account of the physics in `emmc_rig.model.camera`: it follows single rays
 from points inside every pixel to points inside every aperture cell, looks each mask up where the
-ray meets it (misplaced, turned and stretched by errors that nobody is told), and takes the light
+ray meets it (misplaced, turned and stretched by errors unknown to the program), and takes the light
 from a scene sampled finer than the light field that will be reconstructed. Nothing here uses the
 imaging matrix, so that no reconstruction is tested on data made by the operator it inverts.
 
@@ -50,7 +50,7 @@ KEPT_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class MountingErrors:
-    """How the masks really sit and look, which the program is not told.
+    """The true placement and look of the masks, unknown to the program.
 
     skew: tangent of the angle by which a mask's columns lean. distance_share: relative error of
     their distance. distortion_um: third-order radial displacement of the rays at the corner of

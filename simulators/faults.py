@@ -1,6 +1,5 @@
 """Faults of simulated devices: armed by name, each strikes a stated number of times."""
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 from drivers.clock import Clock
 
 Condition = Callable[[Any], bool]
-ALWAYS = math.inf
 
 
 @dataclass

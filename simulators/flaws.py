@@ -1,4 +1,4 @@
-"""What is wrong with a simulated bench beyond where its masks sit, which the program is not told.
+"""Faults of a simulated bench beyond the placement of its masks, unknown to the program.
 
 Vignetting here is the natural law, the fourth power of the cosine of each ray's slope, raised to a
 strength; dust, blur and diffraction are drawn on the mask finer than its cells; the sensor's flaws

@@ -84,7 +84,7 @@ class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
-    `lost_bytes` counts what came while the receive buffer was full. `on_output` is told of every
+    `lost_bytes` counts what came while the receive buffer was full. `on_output` is called for every
     pin that changes: coolant, mist or spindle, its level and when.
     """
 

@@ -520,7 +520,7 @@ class PtpUsbFunction(UsbFunction):
     def control(
         self, request_type: int, request: int, value: int, index: int, data: bytes
     ) -> bytes:
-        """Cancel, reset or tell the status."""
+        """Cancel, reset or return the status."""
         if request in (CANCEL_REQUEST, DEVICE_RESET):
             self._clear()
             if request == DEVICE_RESET:

@@ -101,8 +101,8 @@ class EosCameraSimulator(PtpCameraSimulator):
             for one in EosProperty:
                 self._tell_property(one)
         elif code == EosOperation.GET_EVENT:
-            told, self._records = self._records, []
-            return Answer(data=b"".join((*told, RECORD.pack(RECORD.size, 0))))
+            records, self._records = self._records, []
+            return Answer(data=b"".join((*records, RECORD.pack(RECORD.size, 0))))
         elif code == EosOperation.SET_PROPERTY:
             return self._set(data)
         elif not self._remote:

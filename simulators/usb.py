@@ -49,7 +49,7 @@ class InterfaceSpec:
 
 @dataclass(frozen=True)
 class DeviceSpec:
-    """A device as its descriptors tell."""
+    """A device, described by its descriptors."""
 
     vendor: int
     product: int
@@ -157,7 +157,7 @@ class SimulatedUsb(usb.backend.IBackend):
         return plug
 
     def unplug(self, function: UsbFunction) -> None:
-        """Pull the device's cable: whoever has it open finds it gone."""
+        """Pull the device's cable: a program that has it open gets errors."""
         with self._lock:
             self._find(function).present = False
             self._plugs = [plug for plug in self._plugs if plug.function is not function]
@@ -306,7 +306,7 @@ class SimulatedUsb(usb.backend.IBackend):
         _plug(dev_handle)
 
     def claim_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Claim an interface that nobody else, the kernel included, holds."""
+        """Claim an interface that neither a program nor the kernel holds."""
         plug = _plug(dev_handle)
         with self._lock:
             if plug.kernel_driver or plug.claims.get(intf, dev_handle) is not dev_handle:

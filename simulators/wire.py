@@ -285,7 +285,7 @@ class PtyServer(_Server):
 class TcpServer(_Server):
     """Serves firmware on TCP, to one client at a time; `port` is a URL that pyserial opens.
 
-    A second client is told that the port is in use, as ser2net does, and let go.
+    A second client gets a line that the port is in use, as ser2net does, and is closed.
     """
 
     def __init__(self, firmware: Firmware, host: str = "127.0.0.1", number: int = 0) -> None:

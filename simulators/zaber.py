@@ -23,7 +23,7 @@ __all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
 ACCELERATION_SCALE = SPEED_SCALE / 1e4
 PACKET_SIZE = 80
 NO_MODEL = 65_535
-"""A device id that no table has: whoever drives it must be told its scale."""
+"""A device id that no table has: a driver needs its scale in the settings."""
 FIRMWARE = "7.38"
 FIRST_SERIAL_NUMBER = 73_001
 DRIVER_OFF = "FH"
@@ -218,10 +218,10 @@ class ZaberChain(SimulatedController):
     """Devices on one chain, keyed by (device address, axis number).
 
     `models`: device ids by address; `peripherals`: peripheral ids of the axes of controllers.
-    `modified`: addresses of devices that have other mechanics than their id tells. The microstep
+    `modified`: addresses of devices that have other mechanics than their id states. The microstep
     of an axis is its specification's at the default resolution, whatever its ids.
     Faults as `SimulatedController`'s, and `emergency_stop`: the power of every motor is cut at
-    the next command. `on_output` is told of every digital output that changes: device, output,
+    the next command. `on_output` is called for every digital output that changes: device, output,
     level and when. Of triggers only `when AXIS pos >= VALUE` (or <=) and `io set do` are modelled.
     """
 

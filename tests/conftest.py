@@ -1,6 +1,7 @@
 """What all tests share: options, and which optional checks this machine can run."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,15 @@ def peer_files():
     if not (folder and Path(folder).is_dir()):
         pytest.skip("EMMC_PEER_FILES does not name a folder of files of real devices")
     return Path(folder)
+
+
+@pytest.fixture(scope="module")
+def memory_folder():
+    """A folder in memory where there is one: a kill loses no bytes that a disk was given."""
+    memory = Path("/dev/shm")
+    where = memory if os.access(memory, os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=where) as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

@@ -1,8 +1,10 @@
-"""The program, run in this process as the shell would."""
+"""The program, run in this process as the shell would, and servers that answer line by line."""
 
 import io
+import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
 
 import pytest
 
@@ -27,3 +29,20 @@ def program(*arguments):
     with redirect_stdout(out), redirect_stderr(err):
         code = exit_code(*arguments)
     return code, out.getvalue(), err.getvalue()
+
+
+@contextmanager
+def line_server(script):
+    """Start a script beside this file; yield what writes a line to it and returns its answer."""
+    program = [sys.executable, str(Path(__file__).with_name(script))]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
+        lines, answers = one.stdin, one.stdout
+        assert lines is not None
+        assert answers is not None
+
+        def call(line):
+            print(line, file=lines, flush=True)
+            return answers.readline()
+
+        yield call
+        lines.close()

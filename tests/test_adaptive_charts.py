@@ -16,12 +16,12 @@ from simulators.scenes import render
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
 
 
-def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch):
+def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch, tmp_path):
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
-    camera = find_camera(CAMERA)
-    rows = list(ablation.ablations("deep-occlusions", camera, SIZE, 0))
+    given = ablation.Exposure("deep-occlusions", find_camera(CAMERA), SIZE, 0)
+    rows = ablation.ablations(given, tmp_path, Silent())
     assert [row.name for row in rows] == [
         "adaptive",
         "without sharpening",
@@ -31,6 +31,8 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkey
     ]
     for row in rows:
         assert row.buys_db == pytest.approx(rows[0].psnr_db - row.psnr_db)
+    monkeypatch.setattr(ablation, "_reconstructed", None)
+    assert ablation.ablations(given, tmp_path, Silent()) == rows
 
 
 def test_the_oracle_matches_the_disparity_that_a_scene_was_rendered_with():

@@ -20,8 +20,9 @@ from emmc_rig.files.results import save_frames
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
-from emmc_rig.study.checks.command import CHECKS, run_checks
-from emmc_rig.study.checks.rows import judged
+from emmc_rig.progress import Silent
+from emmc_rig.study.checks.check_sweep import CHECKS, run_checks
+from emmc_rig.study.checks.rows import target_row
 from emmc_rig.study.checks.scenes import moved_truth
 
 SIZE = ["--size", "32x40", "--rays", "64"]
@@ -111,14 +112,21 @@ def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
     assert not out.exists()
 
 
-def test_a_missed_target_of_a_check_is_exit_code_1(run, monkeypatch, tmp_path):
-    rows = [judged("reached", 1.0, 2.0, ".1f"), judged("not reached", 3.0, 2.0, ".1f")]
+def test_a_missed_target_of_a_check_is_exit_code_1_and_kept(run, monkeypatch, tmp_path):
+    rows = [target_row("reached", 1.0, 2.0, ".1f"), target_row("not reached", 3.0, 2.0, ".1f")]
     monkeypatch.setitem(CHECKS, "psi", lambda settings: (rows, {}))
     code, said, error = run("calibrate", "--check", "psi", "--out", tmp_path / "check")
     assert code == 1
     assert "1 of 2 missed: not reached" in " ".join(error.split())
     assert "reached" in said
-    assert json.loads((tmp_path / "check" / "metrics.json").read_text())["rows"]
+    metrics = (tmp_path / "check" / "metrics.json").read_text()
+    assert json.loads(metrics)["rows"]
+    monkeypatch.setitem(CHECKS, "psi", None)
+    assert run("calibrate", "--check", "psi", "--out", tmp_path / "check")[0] == 1
+    assert (
+        json.loads((tmp_path / "check" / "metrics.json").read_text())["rows"]
+        == (json.loads(metrics)["rows"])
+    )
 
 
 @pytest.mark.parametrize("effect", ["shipped", "together"])
@@ -180,14 +188,14 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, mess
 
 def test_the_sensor_check_measures_what_the_simulated_sensor_is(tmp_path):
     settings = CalibrateSettings("rgbw-bayer-1shot", find_camera("rgbw-bayer-1shot"), (96, 96))
-    metrics = run_checks(settings, "sensor", tmp_path)
+    metrics = run_checks(settings, "sensor", tmp_path, Silent())
     figures = metrics["details"]["sensor"]
     assert isinstance(figures, dict)
     for name, limit in (("gain_dn_per_electron", 0.03), ("dark_current_electrons_per_s", 0.05)):
         found, truth = figures[name]
         assert found == pytest.approx(truth, rel=limit)
     with pytest.raises(AppError, match="use all, or some of"):
-        run_checks(settings, "nothing", tmp_path)
+        run_checks(settings, "nothing", tmp_path, Silent())
 
 
 def test_the_error_of_psi_leaves_bad_pixels_out_and_counts_colours_not_stored(coded_psi):

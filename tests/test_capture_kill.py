@@ -3,14 +3,11 @@
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_kills import capture_into
+from programs import line_server
 
 from emmc_rig.session.session import FRAMES, LOCK, Session
 from emmc_rig.session.verify import verify
@@ -22,37 +19,20 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are f
 
 
 @pytest.fixture(scope="module")
-def place():
-    """A folder in memory where there is one: a kill loses no bytes that a disk was given."""
-    memory = Path("/dev/shm")
-    where = memory if os.access(memory, os.W_OK) else None
-    with tempfile.TemporaryDirectory(dir=where) as folder:
-        yield Path(folder)
-
-
-@pytest.fixture(scope="module")
 def killed():
     """Run a capture that kills itself at an event; returns its exit code and their number."""
-    program = [sys.executable, str(Path(__file__).with_name("capture_kills.py"))]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
-        assert one.stdin is not None
-        assert one.stdout is not None
+    with line_server("capture_kills.py") as answer:
 
         def call(kind, number, folder):
-            assert one.stdin is not None
-            assert one.stdout is not None
-            one.stdin.write(f"{kind} {number} {folder}\n")
-            one.stdin.flush()
-            code, count = one.stdout.readline().split()
+            code, count = answer(f"{kind} {number} {folder}").split()
             return int(code), int(count)
 
         yield call
-        one.stdin.close()
 
 
 @pytest.fixture(scope="module")
-def undisturbed(place):
-    session = capture_into(place / "undisturbed")
+def undisturbed(memory_folder):
+    session = capture_into(memory_folder / "undisturbed")
     return contents(session)
 
 
@@ -75,36 +55,36 @@ def assert_made_whole(folder, expected):
     assert len(opened.stored) == len(expected)
 
 
-def check(killed, place, kind, numbers, expected):
+def check(killed, memory_folder, kind, numbers, expected):
     for number in numbers:
-        folder = place / f"{kind}-{number}"
+        folder = memory_folder / f"{kind}-{number}"
         code, _ = killed(kind, number, folder)
         assert code == -signal.SIGKILL, number
         assert_made_whole(folder, expected)
         shutil.rmtree(folder)
 
 
-def test_a_capture_killed_at_any_step_is_made_whole(killed, place, undisturbed):
-    code, steps = killed("step", 0, place / "all-steps")
+def test_a_capture_killed_at_any_step_is_made_whole(killed, memory_folder, undisturbed):
+    code, steps = killed("step", 0, memory_folder / "all-steps")
     assert code == 0
     assert steps >= 9 * len(undisturbed)
-    check(killed, place, "step", range(1, steps + 1), undisturbed)
+    check(killed, memory_folder, "step", range(1, steps + 1), undisturbed)
 
 
 @pytest.mark.parametrize("chunk", range(CHUNKS))
 def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
-    killed, place, undisturbed, chunk
+    killed, memory_folder, undisturbed, chunk
 ):
-    code, lines = killed("line", 0, place / f"all-lines-{chunk}")
+    code, lines = killed("line", 0, memory_folder / f"all-lines-{chunk}")
     assert code == 0
     rng = np.random.default_rng(chunk)
     chosen = rng.choice(np.arange(1, lines - 20), RANDOM_LINES // CHUNKS, replace=False)
-    check(killed, place, "line", chosen.tolist(), undisturbed)
+    check(killed, memory_folder, "line", chosen.tolist(), undisturbed)
 
 
-def test_a_capture_killed_again_and_again_is_made_whole(killed, place, undisturbed):
+def test_a_capture_killed_again_and_again_is_made_whole(killed, memory_folder, undisturbed):
     rng = np.random.default_rng(5)
-    folder = place / "again"
+    folder = memory_folder / "again"
     for _ in range(100):
         code, _ = killed("line", int(rng.integers(50, 700)), folder)
         if code == 0:

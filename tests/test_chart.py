@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
 from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
 from emmc_rig.study.chart.lock import timing_lock
-from emmc_rig.study.chart.peers import PEERS, Given
+from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import (
     ChartSettings,
     Configuration,
@@ -184,11 +185,11 @@ def test_a_capture_is_made_once_and_its_truth_kept_apart(tmp_path):
     assert kept_capture(capture, 0, tmp_path) == (path, digest)
     assert path.stat().st_mtime_ns == before
     assert kept_capture(capture, 1, tmp_path)[1] != digest
-    frames, (truth, disparity) = read_frames(path), read_truth(path)
-    assert truth.shape == frames.psi.light_field_shape == (5, 5, 20, 24, 3)
+    (psi, frames), (truth, disparity) = read_frames(path), read_truth(path)
+    assert truth.shape == psi.light_field_shape == (5, 5, 20, 24, 3)
     rendered = render("wide-disparity", size=(40, 48))
     np.testing.assert_array_equal(disparity, rendered.disparity_px[10:30, 12:36])
-    kept = frames.readings[frames.usable] - frames.psi.forward(truth)[frames.usable]
+    kept = frames.readings[frames.usable] - psi.forward(truth)[frames.usable]
     assert kept.std() == pytest.approx(frames.noise_sigma, rel=0.2)
 
 
@@ -200,29 +201,29 @@ def given(size=(20, 24)):
     psi = build_imaging_matrix(capture.described(), size)
     usable = np.random.default_rng(0).random(psi.frames_shape) < 0.9
     frames = np.where(usable, psi.forward(truth), 9).astype(np.float32)
-    return Given(psi, frames, usable, 1e-3)
+    return psi, Frames(frames, np.full(frames.shape, 1e-3), usable)
 
 
 def test_scikit_learn_codes_as_we_do():
     pytest.importorskip("sklearn")
-    problem, dictionary = given(), dct_dictionary((5, 5), (8, 8), (2, 2, 3, 3), (1, 1, 1, 1))
-    theirs = PEERS["sklearn-omp"].solve(problem, dictionary)
+    (psi, frames), dictionary = given(), dct_dictionary((5, 5), (8, 8), (2, 2, 3, 3), (1, 1, 1, 1))
+    theirs = PEERS["sklearn-omp"].solve(psi, frames, dictionary)
     solver = {"method": "omp", "atoms": 20, "tolerance_factor": 0}
     settings = {"sparse": {"flat_favour": 1, "solver": solver}}
     ours = reconstruct(
-        "dict-omp", problem.psi, problem.readings, 1e-3, dictionary,
-        MethodSettings.model_validate(settings), problem.usable,
+        "dict-omp", psi, frames.readings, 1e-3, dictionary,
+        MethodSettings.model_validate(settings), frames.usable,
     )  # fmt: skip
     assert np.abs(ours.light_field - theirs.light_field).mean() < 2e-3
 
 
 def test_pyproximal_leaves_out_what_is_not_usable():
     pytest.importorskip("pyproximal")
-    problem = given()
-    theirs = PEERS["pyproximal-tv"].solve(problem, None)
+    psi, frames = given()
+    theirs = PEERS["pyproximal-tv"].solve(psi, frames, None)
     settings = {"tv": {"chroma_weight": 1, "relaxation": 1, "max_steps": 100, "rtol": 1e-12}}
     ours = reconstruct(
-        "tv", problem.psi, problem.readings, 1e-3, None,
-        MethodSettings.model_validate(settings), problem.usable,
+        "tv", psi, frames.readings, 1e-3, None,
+        MethodSettings.model_validate(settings), frames.usable,
     )  # fmt: skip
     assert np.abs(ours.light_field - theirs.light_field).mean() < 2e-3

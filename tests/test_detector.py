@@ -14,12 +14,12 @@ from emmc_rig.study.stability import detector
 from emmc_rig.study.stability.detector import (
     ALL,
     Case,
+    case_results,
+    case_words,
     cases,
     detector_settings,
-    judged_rows,
     run_detector,
     tables,
-    told,
     wrong,
 )
 from reconstruction.result import Reconstruction, Status
@@ -66,15 +66,15 @@ def test_results_are_broken_between_good_or_poor_by_what_they_lost(evidence):
         case(0, "adaptive-fast"): row(27, evidence),
         case(0.5, "adaptive-fast"): row(26.5, evidence, displaced_px=0.5),
     }
-    results = judged_rows(rows)
+    results = case_results(rows)
     kinds = [one.kind for one in results]
     assert kinds == ["good", "good", "between", "broken", "broken", "poor", "poor"]
     missed = wrong(results)
     assert [one.case for one in missed] == [case(1)]
-    assert "lost 10.0 dB, trust (nothing against it)" in told(missed[0])
+    assert "lost 10.0 dB, trust (nothing against it)" in case_words(missed[0])
     tally = tables(results)["mask-shift", "tv"]
     assert (tally.broken, tally.broken_flagged, tally.good, tally.between) == (2, 1, 1, 1)
-    assert tally.found == 0.5
+    assert tally.detected == 0.5
     assert tally.false_alarms == 0
     everything = tables(results)[ALL, ALL]
     assert (everything.poor, everything.poor_flagged) == (2, 1)
@@ -82,7 +82,7 @@ def test_results_are_broken_between_good_or_poor_by_what_they_lost(evidence):
 
 def test_a_result_near_one_even_colour_is_poor_from_the_start(evidence):
     rows = {case(0): row(19, evidence), case(0.5): row(18.5, evidence)}
-    assert {one.kind for one in judged_rows(rows)} == {"poor"}
+    assert {one.kind for one in case_results(rows)} == {"poor"}
 
 
 def test_every_case_has_its_harmless_end_and_none_is_done_twice():

@@ -69,6 +69,8 @@ READERS = {
     "session prune", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
+    "calibrate --check": "checks.jsonl",
+    "chart --ablation": "ablation.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
     "design": "simulations.jsonl",

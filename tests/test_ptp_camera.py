@@ -368,7 +368,7 @@ def test_a_frame_of_other_colours_or_exposure_is_refused(bench):
 def test_a_setting_that_the_camera_lacks_is_said_to_be_set_by_hand(bench):
     bench.simulator._values = {}
     camera = bench.open()
-    with pytest.raises(CameraSettingError, match="not told over PTP"):
+    with pytest.raises(CameraSettingError, match="not reported over PTP"):
         camera.set_exposure_s(0.1)
     assert camera.gain_limits == (1.0, 1.0)
 

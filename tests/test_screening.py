@@ -76,7 +76,7 @@ def test_dark_and_double_shots_are_left_out(count):
         assert getattr(seen, kind) == last
         assert not seen.usable[list(last)].any()
         assert seen.usable[0].mean() > 0.99
-        assert seen.told[0].startswith("left out shot")
+        assert seen.notes[0].startswith("left out shot")
 
 
 def test_a_mask_that_is_to_stand_still_repeats_its_shots():
@@ -167,7 +167,7 @@ def test_frames_of_a_few_photons_pass_as_they_are():
 def test_nothing_is_found_where_nothing_is_to_be_seen():
     one = made("flicker", 0)
     dark = dataclasses.replace(one, readings=np.zeros_like(one.readings))
-    assert screen(dark).told == ()
+    assert screen(dark).notes == ()
 
 
 def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():

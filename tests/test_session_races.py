@@ -7,16 +7,13 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from capture_rigs import frame_bytes
+from programs import line_server
 
 from emmc_rig.session.session import FRAMES, Session
 from emmc_rig.session.storage import part_of
@@ -52,37 +49,21 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are f
 
 
 @pytest.fixture(scope="module")
-def place():
-    """A folder in memory where there is one."""
-    memory = Path("/dev/shm")
-    where = memory if os.access(memory, os.W_OK) else None
-    with tempfile.TemporaryDirectory(dir=where) as folder:
-        yield Path(folder)
-
-
-@pytest.fixture(scope="module")
 def meet():
     """Run command lines in a folder at an offset; returns what the server answers."""
-    program = [sys.executable, str(Path(__file__).with_name("session_races.py"))]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
+    with line_server("session_races.py") as answer:
 
         def call(folder, offset_s, *commands):
-            assert one.stdin is not None
-            assert one.stdout is not None
             (folder / "commands.json").write_text(json.dumps(commands))
-            one.stdin.write(f"{offset_s} {folder}\n")
-            one.stdin.flush()
-            return json.loads(one.stdout.readline())
+            return json.loads(answer(f"{offset_s} {folder}"))
 
         yield call
-        assert one.stdin is not None
-        one.stdin.close()
 
 
 @pytest.fixture(scope="module")
-def prepared(place, meet):
+def prepared(memory_folder, meet):
     """Folders to copy: with a plan alone, a session that was killed, and a complete one."""
-    folders = {name: place / name for name in (NOTHING, PARTLY, COMPLETE)}
+    folders = {name: memory_folder / name for name in (NOTHING, PARTLY, COMPLETE)}
     folders[NOTHING].mkdir()
     (folders[NOTHING] / "plan.yaml").write_text(PLAN)
     shutil.copytree(folders[NOTHING], folders[COMPLETE])
@@ -146,16 +127,16 @@ def assert_nothing_is_doubled_or_torn(folder, meet):
 
 
 @pytest.mark.parametrize("meeting", MEETINGS)
-def test_two_programs_that_meet_at_a_session_spoil_nothing(place, meet, prepared, meeting):
+def test_two_programs_that_meet_at_a_session_spoil_nothing(memory_folder, meet, prepared, meeting):
     before, *commands, longest = MEETINGS[meeting]
-    alone = place / "alone"
+    alone = memory_folder / "alone"
     shutil.copytree(prepared[before], alone)
     alone_s = meet(alone, 0, commands[0])["seconds"]
     shutil.rmtree(alone)
     rng = np.random.default_rng(0)
     refused = 0
     for number in range(OFFSETS):
-        folder = place / f"{meeting.replace('/', '-')}-{number}"
+        folder = memory_folder / f"{meeting.replace('/', '-')}-{number}"
         shutil.copytree(prepared[before], folder)
         answer = meet(folder, rng.uniform(0, longest * alone_s), *commands)
         assert_loser_knows(folder, answer, commands)

@@ -15,7 +15,14 @@ from emmc_rig.pages import drawing
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Silent
 from emmc_rig.study.stability import fault_sweep, sweeping
-from emmc_rig.study.stability.breaking import Span, below_best, below_view, span, strength_at, told
+from emmc_rig.study.stability.breaking import (
+    Span,
+    below_best,
+    below_view,
+    span,
+    span_words,
+    strength_at,
+)
 from emmc_rig.study.stability.curves import POOLED, breaking_rows, curves
 from emmc_rig.study.stability.fault_points import Point, planned, stability_settings
 from emmc_rig.study.stability.fault_sweep import StabilitySweep
@@ -91,11 +98,11 @@ def test_strengths_are_interpolated_in_ratios_but_from_zero(strengths, place, ex
 
 def test_breaking_points_in_words():
     strengths = (0.1, 1, 10, 1000)
-    assert told(None, strengths) == "already at the mildest"
-    assert told(Span(None, None), strengths) == "never"
-    assert told(Span(None, 2.5), strengths) == "100"
-    assert told(Span(0.5, None), strengths) == "before 0.32"
-    assert told(Span(1.0, 2.0), strengths) == "before 1, from 10"
+    assert span_words(None, strengths) == "already at the mildest"
+    assert span_words(Span(None, None), strengths) == "never"
+    assert span_words(Span(None, 2.5), strengths) == "100"
+    assert span_words(Span(0.5, None), strengths) == "before 0.32"
+    assert span_words(Span(1.0, 2.0), strengths) == "before 1, from 10"
 
 
 def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
@@ -198,7 +205,7 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
     outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)
-    assert told(curve.below_best(), curve.strengths) == "1"
+    assert span_words(curve.below_best(), curve.strengths) == "1"
     assert any("no light in shot 3" in line for line in outcome.left_out)
 
 

@@ -1,4 +1,4 @@
-"""The mismatch protocol on a tiny capture: what a moved mask costs, and what mending gives back."""
+"""The mismatch protocol on a tiny capture: what a moved mask costs, what correction recovers."""
 
 import math
 from dataclasses import replace
@@ -11,7 +11,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.study.stability import mismatch
 from emmc_rig.study.stability.fault_points import stability_settings
 from emmc_rig.study.stability.faults import FAULTS, trial
-from emmc_rig.study.stability.mismatch import Mismatch, measure_mismatch, mended
+from emmc_rig.study.stability.mismatch import Mismatch, corrected, measure_mismatch
 from emmc_rig.study.stability.mismatch_section import mismatch_sections, recovered_share
 from emmc_rig.study.sweep import NotApplicableError
 
@@ -38,11 +38,11 @@ def camera(tmp_path):
     return str(path)
 
 
-def test_a_moved_mask_is_told_and_psi_mended_without_being_told():
+def test_a_moved_mask_is_detected_and_psi_corrected_from_the_readings_alone():
     camera = find_camera("rgbw-bayer-1shot").model_copy(update={"views": (3, 3)})
     moved = trial(FAULTS["mask-shift"], 0.5, "deep-occlusions", camera, SIZE, 0, 3)
-    psi, told = mended(moved, DRIFT)
-    assert told
+    psi, detected = corrected(moved, DRIFT)
+    assert detected
     before = moved.psi.relative_difference(moved.true_psi)
     assert psi.relative_difference(moved.true_psi) < 0.2 * before
 
@@ -51,7 +51,7 @@ def test_a_sensor_without_colours_is_refused_in_words():
     camera = find_camera("rgbw-mono").with_shots(1).model_copy(update={"views": (3, 3)})
     moved = trial(FAULTS["mask-shift"], 0.5, "deep-occlusions", camera, SIZE, 0, 3)
     with pytest.raises(NotApplicableError, match="colour filter"):
-        mended(moved, DRIFT)
+        corrected(moved, DRIFT)
 
 
 def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera, monkeypatch):

@@ -11,10 +11,10 @@ from emmc_rig.study.stability.checks import (
     BROKEN,
     SOUND,
     WEAK,
+    Attempt,
     Finding,
-    Outcome,
+    attempted,
     example,
-    outcome_of,
     solved,
 )
 from emmc_rig.study.stability.numerics import identical, measure_numerics
@@ -94,15 +94,15 @@ def test_results_that_differ_in_a_bit_are_not_identical(capture):
 @pytest.mark.parametrize("method", ["tv", "dict-omp"])
 @pytest.mark.parametrize("factor", [1e-6, 1e-2])
 def test_a_dimmer_scene_gives_the_same_light_field_but_dimmer(capture, method, factor):
-    usual = outcome_of(capture, method).db
-    dim = outcome_of(conditions.scaled(capture, factor), method, factor)
+    usual = attempted(capture, method).db
+    dim = attempted(conditions.scaled(capture, factor), method, factor)
     assert dim.db == pytest.approx(usual, abs=0.1)
 
 
 def test_how_dim_a_scene_is_does_not_matter_to_the_adaptive_method(capture):
-    usual = outcome_of(capture, "adaptive-fast").db
+    usual = attempted(capture, "adaptive-fast").db
     dim, dimmer = (
-        outcome_of(conditions.scaled(capture, factor), "adaptive-fast", factor).db
+        attempted(conditions.scaled(capture, factor), "adaptive-fast", factor).db
         for factor in (1e-2, 1e-6)
     )
     assert dimmer == pytest.approx(dim, abs=0.05)
@@ -111,9 +111,9 @@ def test_how_dim_a_scene_is_does_not_matter_to_the_adaptive_method(capture):
 
 
 def test_how_dark_a_mask_is_does_not_matter_to_the_adaptive_method(capture):
-    usual = outcome_of(capture, "adaptive-fast").db
+    usual = attempted(capture, "adaptive-fast").db
     for factor in (1e-2, 1e-6):
-        dark = outcome_of(conditions.dimmed(capture, factor), "adaptive-fast").db
+        dark = attempted(conditions.dimmed(capture, factor), "adaptive-fast").db
         assert dark == pytest.approx(usual, abs=0.3)
 
 
@@ -128,7 +128,7 @@ def test_a_deviation_is_as_dim_as_its_scene():
 
 @pytest.mark.parametrize("method", ["tv", "dict-omp", "adaptive-fast"])
 def test_readings_brighter_than_white_are_refused_in_one_line(capture, method):
-    found = outcome_of(conditions.scaled(capture, 1e6), method, 1e6)
+    found = attempted(conditions.scaled(capture, 1e6), method, 1e6)
     assert "normalise" in found.refused
     assert "\n" not in found.refused
 
@@ -136,10 +136,10 @@ def test_readings_brighter_than_white_are_refused_in_one_line(capture, method):
 @pytest.mark.parametrize("condition", conditions.CONDITIONS, ids=lambda one: one.name)
 def test_no_condition_of_psi_breaks_total_variation(capture, condition):
     trial = condition.change(capture if condition.shots == 1 else example(shots=condition.shots))
-    found = outcome_of(trial, "tv")
+    found = attempted(trial, "tv")
     if condition.same:
         # Not the same to the last: mu was fitted at masks that pass half the light.
-        assert found.db > outcome_of(capture, "tv").db - 2
+        assert found.db > attempted(capture, "tv").db - 2
     else:
         assert found.db > numerics.card_db(capture)
 
@@ -152,13 +152,13 @@ def test_absurd_steps_stay_finite_and_are_told(capture):
 
 
 def test_the_worst_method_is_named():
-    outcomes = {"tv": Outcome(20.0), "adaptive": Outcome(17.5), "dict-omp": Outcome(np.nan, "no")}
+    outcomes = {"tv": Attempt(20.0), "adaptive": Attempt(17.5), "dict-omp": Attempt(np.nan, "no")}
     wanted = dict.fromkeys(outcomes, 20.0)
-    figure, verdict = numerics.told(outcomes, wanted, True)
+    figure, verdict = numerics.condition_verdict(outcomes, wanted, True)
     assert figure == "refused: dict-omp; at most 2.5 dB apart (adaptive)"
     assert verdict == WEAK
-    outcomes["tv"] = Outcome(np.nan)
-    figure, verdict = numerics.told(outcomes, wanted, True)
+    outcomes["tv"] = Attempt(np.nan)
+    figure, verdict = numerics.condition_verdict(outcomes, wanted, True)
     assert figure.startswith("not finite: tv")
     assert verdict == BROKEN
     assert relative(np.ones(3, np.float32), np.ones(3)) == 0

@@ -22,8 +22,8 @@ from emmc_rig.study.stability.theory import (
 )
 from emmc_rig.study.stability.theory_section import (
     Compared,
+    agreement,
     compared,
-    judged,
     rank_correlation,
     theory_sections,
 )
@@ -119,14 +119,14 @@ def curve(levels, bound, whole=False):
 
 def test_a_break_is_predicted_missed_early_or_late():
     falls = (30.0, 29.0, 24.0, 20.0)
-    assert judged(curve(falls, falls), "tv").startswith("predicted (factor 1.0)")
-    assert judged(curve((30, 26, 25, 24), falls), "tv").startswith("method sooner (factor ")
-    assert judged(curve((30, 30, 30, 20), falls), "tv").startswith("method later")
-    assert judged(curve(falls, (30, 30, 29, 28)), "tv") == "method only"
-    assert judged(curve((30, 30, 29, 28), falls), "tv") == "theory only"
-    assert judged(curve((30, 30, 29, 28), (31, 30, 29, 29)), "tv") == "neither breaks"
-    assert judged(curve((None,) * 4, falls), "tv") == "not measured"
-    assert judged(curve(falls, falls, whole=True), "tv") == "predicted"
+    assert agreement(curve(falls, falls), "tv").startswith("predicted (factor 1.0)")
+    assert agreement(curve((30, 26, 25, 24), falls), "tv").startswith("method sooner (factor ")
+    assert agreement(curve((30, 30, 30, 20), falls), "tv").startswith("method later")
+    assert agreement(curve(falls, (30, 30, 29, 28)), "tv") == "method only"
+    assert agreement(curve((30, 30, 29, 28), falls), "tv") == "theory only"
+    assert agreement(curve((30, 30, 29, 28), (31, 30, 29, 29)), "tv") == "neither breaks"
+    assert agreement(curve((None,) * 4, falls), "tv") == "not measured"
+    assert agreement(curve(falls, falls, whole=True), "tv") == "predicted"
 
 
 def test_rank_correlation_takes_infinity_as_largest():
@@ -165,7 +165,7 @@ def test_parts_are_measured_into_the_folder_of_the_sweeps(tmp_path, monkeypatch)
     settings = stability_settings(True, ["near-planar"], None)
     found = beside.measure_beside(settings, ["theory"], tmp_path / "out", Counted())
     assert [section.key for section in found.sections] == ["theory-near-planar"]
-    assert "in 2 of 2 curves" in found.told[0]
+    assert "in 2 of 2 curves" in found.lines[0]
     metrics = found.metrics["theory"]
     assert isinstance(metrics, dict)
     assert metrics["oracle_less_bound_db"]["mean"] == pytest.approx(-0.5)
@@ -187,7 +187,7 @@ def test_a_part_that_does_not_apply_is_left_out_in_words(tmp_path):
     settings = stability_settings(True, ["near-planar"], (32, 40), camera="rgbw-mono")
     found = beside.measure_beside(settings, ["mismatch"], tmp_path / "out", Counted())
     assert found.sections == []
-    assert "colour filter" in found.told[0]
+    assert "colour filter" in found.lines[0]
 
 
 def test_the_command_has_a_switch_for_each_part():

@@ -75,7 +75,7 @@ def test_the_error_expected_is_that_of_draws(patch):
     expected = patch.expected(DISPARITY, TEXTURE, VARIANCE)
     assert abs(errors.mean() - expected.error) < 4 * errors.std() / 20
     assert 0 < expected.error < expected.prior
-    assert 0 < expected.told < patch.readings
+    assert 0 < expected.degrees_of_freedom < patch.readings
 
 
 def test_the_noise_gain_is_the_slope_of_the_error_and_what_noise_alone_does(patch):

@@ -21,7 +21,7 @@ from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
 from reconstruction.verdict.kept import foretold, kept_readings
 from reconstruction.verdict.pixels import judged_pixels
-from reconstruction.verdict.rules import LEVELS, judged
+from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
 from reconstruction.verdict.shots import compared
@@ -244,9 +244,9 @@ def test_evidence_survives_json(three):
 
 def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
     evidence = clean_evidence(three)
-    assert judged(evidence).level == "trust"
+    assert verdict_from(evidence).level == "trust"
     worse = dataclasses.replace(evidence, off=0.03, displaced_px=2.0)
-    verdict = judged(worse)
+    verdict = verdict_from(worse)
     assert verdict.level == "do not use"
     assert [LEVELS.index(one.level) for one in verdict.reasons] == [2, 1]
 
@@ -255,7 +255,7 @@ def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
     clean = clean_evidence(three)
     for times, level in ((4.0, "trust"), (9.0, "doubt")):
         missed = {"misfit": times, "misfit_row": 12.0, "misfit_column": 30.0}
-        verdict = judged(dataclasses.replace(clean, parameters=missed))
+        verdict = verdict_from(dataclasses.replace(clean, parameters=missed))
         assert verdict.level == level
     assert "row 12, column 30" in verdict.words
 
@@ -274,7 +274,7 @@ def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
 def test_what_misleads_one_method_may_leave_another_unharmed(three, found, by_tv, by_adaptive):
     clean = clean_evidence(three)
     for method, level in (("tv", by_tv), ("adaptive-fast", by_adaptive)):
-        verdict = judged(dataclasses.replace(clean, method=method, **found))
+        verdict = verdict_from(dataclasses.replace(clean, method=method, **found))
         assert verdict.level == level, verdict.words
 
 

@@ -29,10 +29,10 @@ from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.sequencer import Outcome, Sequencer
+from emmc_rig.capture.sequencer import RunEnd, Sequencer
 from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -240,12 +240,12 @@ def way_on_told(wish: Wish, session: Session) -> Iterator[None]:
 
 def run_capture(
     wish: Wish,
-    watcher: Watcher,
+    watcher: CaptureWatcher,
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
     suspend: Suspend | None = None,
-) -> tuple[Session, Outcome] | None:
+) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
     agreed: is told what it will take, once nothing speaks against it. Raises AppError or a
@@ -325,12 +325,12 @@ def capture_session(
     rig: Mapping[str, Any] | None,
     out: Path | None,
     until_db: float | None,
-    watcher: Watcher,
+    watcher: CaptureWatcher,
     ask: Ask,
     agreed: Callable[[Estimate], bool] = lambda expected: True,
     control: Control | None = None,
     suspend: Suspend | None = None,
-) -> tuple[Session, Outcome] | None:
+) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
     See `asked_for` and `run_capture`. None where `agreed` says no. Raises StoppedError when
@@ -375,7 +375,7 @@ def capture(
     *,
     out: str | Path | None = None,
     until_db: float | None = None,
-    watcher: Watcher | None = None,
+    watcher: CaptureWatcher | None = None,
     on_event: OnEvent | None = None,
     suspend: Suspend | None = None,
     ask: Ask = ask_at_prompt,

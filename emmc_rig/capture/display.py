@@ -37,7 +37,7 @@ PAUSE_KEY, STOP_KEY = "p", "q"
 
 
 class CaptureDisplay(Unwatched):
-    """A `Watcher` of the sequencer."""
+    """A `CaptureWatcher` of the sequencer."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control

@@ -25,13 +25,13 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
-from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.sequencer import Outcome
+    from emmc_rig.capture.sequencer import RunEnd
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ OnEvent = Callable[[Event], None]
 
 
 class EventWatcher(Unwatched):
-    """A `Watcher` that makes events of what it is told, and tells another watcher too.
+    """A `CaptureWatcher` that makes events of what it is told, and tells another watcher too.
 
     on_event: called from the thread in which it happens, one call at a time. One that raises is
     not called again: a capture does not end for that.
     """
 
-    def __init__(self, on_event: OnEvent, other: Watcher | None = None) -> None:
+    def __init__(self, on_event: OnEvent, other: CaptureWatcher | None = None) -> None:
         self._on_event: OnEvent | None = on_event
         self._other = other or Unwatched()
         self._began_s = time.perf_counter()
@@ -122,7 +122,7 @@ class EventWatcher(Unwatched):
         self._other.tell(message)
         self._emit("message", text=message)
 
-    def ended(self, session: Session, outcome: Outcome) -> None:
+    def ended(self, session: Session, outcome: RunEnd) -> None:
         """A run is over."""
         reasons = exposure_reasons(shot_exposures(session))
         level = reasons[0].level if reasons else "trust"

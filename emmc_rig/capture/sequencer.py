@@ -42,7 +42,7 @@ from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
 from emmc_rig.capture.suspend import Suspend
-from emmc_rig.capture.watcher import Unwatched, Watcher
+from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -65,7 +65,7 @@ LARGEST_EXPOSURE_RATIO = 1.5
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunEnd:
     """How a run ended: complete, or stopped by whoever controls it."""
 
     complete: bool
@@ -103,7 +103,7 @@ class Sequencer:
         session: Session,
         plan: Plan,
         rig: Rig,
-        watcher: Watcher | None = None,
+        watcher: CaptureWatcher | None = None,
         control: Control | None = None,
         choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
@@ -134,7 +134,7 @@ class Sequencer:
         self._handed: dict[str, list[float]] = {}
         self._may_saturate = _may_saturate(session.frames)
 
-    def run(self) -> Outcome:
+    def run(self) -> RunEnd:
         """Take what is missing.
 
         Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
@@ -167,7 +167,7 @@ class Sequencer:
             left = len(session.missing())
             if not left and not session.is_complete:
                 session.note("complete", frames=len(session.needed), wall=self._wall())
-        return Outcome(
+        return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from calibration.shadow import shadow_mask
 from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan
-from emmc_rig.capture.watcher import Watcher
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.session.decisions import decided_words, decisions, ended
@@ -66,7 +66,7 @@ def refuse_without_choice(plan: Plan, camera: Camera) -> None:
 class Until:
     """Says what a `Sequencer` takes next, of a session with a target; use it within one run."""
 
-    def __init__(self, session: Session, watcher: Watcher) -> None:
+    def __init__(self, session: Session, watcher: CaptureWatcher) -> None:
         self._session, self._watcher = session, watcher
         self._scale: Scale | None = None
 

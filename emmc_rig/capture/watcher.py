@@ -1,4 +1,4 @@
-"""Whoever shows a capture: what the sequencer tells him, and one who shows nothing."""
+"""What shows a capture: the interface that the sequencer calls, and one that shows nothing."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from emmc_rig.capture.checks import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.sequencer import Outcome
+    from emmc_rig.capture.sequencer import RunEnd
     from emmc_rig.session.session import Session
 
 STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
 
 
-class Watcher(Protocol):
+class CaptureWatcher(Protocol):
     """Whoever shows a capture; `step` and `stored` may be called from the writer's thread."""
 
     def begin(self, done: int, planned: int) -> None:
@@ -58,7 +58,7 @@ class Watcher(Protocol):
         """Something that people should know."""
         ...
 
-    def ended(self, session: Session, outcome: Outcome) -> None:
+    def ended(self, session: Session, outcome: RunEnd) -> None:
         """A run is over, complete or not."""
         ...
 
@@ -96,5 +96,5 @@ class Unwatched:
     def tell(self, message: str) -> None:
         """Ignore it."""
 
-    def ended(self, session: Session, outcome: Outcome) -> None:
+    def ended(self, session: Session, outcome: RunEnd) -> None:
         """Ignore it."""

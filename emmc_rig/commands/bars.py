@@ -1,4 +1,4 @@
-"""How far a long command is: progress bars on a terminal, plain lines elsewhere."""
+"""Progress of a long command: bars on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

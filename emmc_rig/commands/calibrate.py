@@ -128,11 +128,11 @@ def calibrate(
         from rich.console import Console
         from rich.table import Table
 
-        from emmc_rig.study.checks.command import run_checks
+        from emmc_rig.study.checks.check_sweep import run_checks
 
         out = out or Path("emmc-checks")
-        with result_folder(out, "calibrate --check") as folder:
-            metrics = run_checks(settings, check, folder)
+        with shown_bars() as bars:
+            metrics = run_checks(settings, check, out, bars)
         table = Table("target", "measured", "asked", "")
         for row in metrics["rows"]:
             table.add_row(row["what"], row["measured"], row["asked"], row["verdict"])

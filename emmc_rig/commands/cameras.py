@@ -27,7 +27,7 @@ def cameras(
 
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.pages.camera_sheet import (
         camera_figures,
         camera_rows,
@@ -52,7 +52,7 @@ def cameras(
     folder_name = out or Path(f"camera-{Path(name).stem}")
     with result_folder(folder_name, "cameras") as folder:
         draw_camera(camera, folder / "camera.png")
-        write_metrics(folder, {**figures, "command": command_line(), "versions": versions()})
+        write_metrics(folder, figures)
     table = Table("figure", "value", title=camera.title)
     for key, value in figures.items():
         if isinstance(value, dict):

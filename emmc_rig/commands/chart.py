@@ -55,7 +55,7 @@ def chart(
         bool, typer.Option("--peers", help="instead: the primal-dual step, and pyproximal's")
     ] = False,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="instead: what each piece of `adaptive` buys")
+        bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
     ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")

@@ -16,7 +16,7 @@ def chart_guard(
     from rich.table import Table
 
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.model.files import write_text
     from emmc_rig.study import guard
 
@@ -32,12 +32,12 @@ def chart_guard(
         fallen = [row.case.key for row in rows if row.fell]
         write_text(folder / guard.STORED, guard.merged_text(rows, stored))
         metrics = {"psnr_db": {row.case.key: row.psnr_db for row in rows}, "fell": fallen}
-        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+        write_metrics(folder, metrics)
     Console().print(table)
     if fallen:
         typer.echo(
             f"{len(fallen)} figure(s) fell by more than {guard.MOST_FALL_DB} dB: "
-            f"{'; '.join(fallen)}: mend the method, or store {out / guard.STORED} if it is meant",
+            f"{'; '.join(fallen)}: fix the method, or store {out / guard.STORED} where intended",
             err=True,
         )
         raise typer.Exit(1)

@@ -14,7 +14,7 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
 
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.imports import start_timings
     from emmc_rig.study.benchmarks.kernels import kernel_timings, reconstruction_memory
 
@@ -40,8 +40,6 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
             "starts": [start.as_dict() for start in starts],
             "reconstruction_seconds": seconds,
             "reconstruction_peak_gib": peak_gib,
-            "command": command_line(),
-            "versions": versions(),
         }
         write_metrics(folder, metrics)
     Console().print(table)

@@ -19,7 +19,7 @@ def chart_next_shot(
     import emmc_rig as emmc
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.next_shot import ROWS, next_shots, savings, total_savings
     from emmc_rig.study.sweep import open_folder
 
@@ -48,8 +48,6 @@ def chart_next_shot(
         "seed": seed,
         "rows": [row.as_dict() for row in rows],
         "scenes": [asdict(scene) for scene in found],
-        "command": command_line(),
-        "versions": versions(),
     }
     with result_folder(folder, "chart --next-shot", adds=True) as results:
         write_metrics(results, metrics)

@@ -12,7 +12,7 @@ def chart_peers(camera: str, size: tuple[int, int], repeats: int, out: Path) -> 
 
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.variational import variational_timings
 
     described = emmc.camera(camera)
@@ -23,5 +23,5 @@ def chart_peers(camera: str, size: tuple[int, int], repeats: int, out: Path) -> 
             rows.append(timing.as_dict())
             table.add_row(timing.name, f"{timing.seconds * 1e3:.1f}", f"{timing.times_ours:.1f}")
         metrics = {"camera": camera, "size": list(size), "steps": rows}
-        write_metrics(folder, {**metrics, "command": command_line(), "versions": versions()})
+        write_metrics(folder, metrics)
     Console().print(table)

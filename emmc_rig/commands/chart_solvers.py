@@ -17,7 +17,7 @@ def chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
     from emmc_rig.errors import AppError
     from emmc_rig.files.dictionaries import open_dictionary
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.sparse import TIMED_SIZE, peer_timings, solver_timings
 
     described = emmc.camera(camera)
@@ -47,8 +47,6 @@ def chart_solvers(camera: str, dictionary: str | None, out: Path) -> None:
             "atoms": atoms.size,
             "solvers": rows,
             "peers": peers,
-            "command": command_line(),
-            "versions": versions(),
         }
         write_metrics(folder, metrics)
     for peer in peers:

@@ -151,7 +151,7 @@ def camera_rows(device: Camera) -> Iterator[tuple[str, str]]:
     """Yield name and value of what a camera says of itself, without exposing a frame."""
     identity = device.identity
     for name in ("maker", "model", "serial", "firmware"):
-        yield name, getattr(identity, name) or "not told"
+        yield name, getattr(identity, name) or "not stated"
     low_s, high_s = device.exposure_limits_s
     yield "exposure", f"{device.exposure_s:g} s, from {low_s:g} to {high_s:g} s"
     low, high = device.gain_limits
@@ -237,7 +237,7 @@ def _frames(device: Camera) -> Generator[RawFrame, None, None]:
 
 @contextmanager
 def _progress(device: Any) -> Iterator[None]:
-    """Show how a picture comes over the wire, where the camera tells and somebody looks."""
+    """Show how a picture comes over the wire, on a terminal, where the camera reports it."""
     console = Console(stderr=True)
     if not console.is_terminal or not hasattr(device, "on_progress"):
         yield

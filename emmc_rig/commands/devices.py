@@ -133,7 +133,7 @@ def probe(
     if not chosen:
         raise AppError("no port with a known adapter: name the ports to ask")
     for port in chosen:
-        typer.echo(f"{port}: {probe_port(port) or 'nobody answers in Zaber ASCII, Grbl or APT'}")
+        typer.echo(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
 
 
 @app.command()
@@ -239,7 +239,7 @@ def bench(
 ) -> None:
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.ptp import picture_timing
     from emmc_rig.study.benchmarks.stages import stage_timings
     from emmc_rig.study.benchmarks.trigger import capture_timing, trigger_timing
@@ -286,8 +286,6 @@ def bench(
                 "trigger": trigger.as_dict(),
                 "triggered_session": session.as_dict(),
                 "usb3_vision": [one.as_dict() for one in streams],
-                "command": command_line(),
-                "versions": versions(),
             }
             write_metrics(folder, metrics)
 
@@ -307,7 +305,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
         try:
             yield opened
         except KeyboardInterrupt as stop:
-            notes = getattr(stop, "__notes__", ["the stage was told to stop"])
+            notes = getattr(stop, "__notes__", ["the stage was stopped"])
             _told.print("; ".join(notes), highlight=False, soft_wrap=True)
             raise
         except DriverError as fault:

@@ -176,7 +176,7 @@ def _light_field(
 
 
 def _nobody(what: str) -> None:
-    """Ask nobody: a page that only shows and jogs needs no lamp changed."""
+    """Ask for nothing: a page that only shows and jogs needs no lamp changed."""
 
 
 def _serve(app: object, listening: socket.socket, begin: Callable[[], None]) -> None:

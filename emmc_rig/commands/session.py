@@ -120,12 +120,12 @@ def show(session: Folder) -> None:
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
-    told, opened = summary(session), Session(session)
-    typer.echo(f"{told.name}: {told.title}")
-    typer.echo(f"  {'state':<12} {told.state} after {opened.runs} run(s)")
-    typer.echo(f"  {'begun':<12} {told.created}")
-    typer.echo(f"  {'size':<12} {shown_bytes(told.bytes)}")
-    typer.echo(f"  {'frames':<12} {told.stored} of {told.planned}")
+    listed, opened = summary(session), Session(session)
+    typer.echo(f"{listed.name}: {listed.title}")
+    typer.echo(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
+    typer.echo(f"  {'begun':<12} {listed.created}")
+    typer.echo(f"  {'size':<12} {shown_bytes(listed.bytes)}")
+    typer.echo(f"  {'frames':<12} {listed.stored} of {listed.planned}")
     for kind, (done, planned) in counts(opened).items():
         typer.echo(f"  {kind:<12} {done} of {planned}")
     if opened.amendments:
@@ -232,7 +232,7 @@ def bench(
 ) -> None:
     """Time what capturing costs beside the devices, and verifying and listing sessions."""
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import command_line, versions, write_metrics
+    from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
 
     with nullcontext() if out is None else result_folder(out, "session bench") as results:
@@ -258,8 +258,6 @@ def bench(
                 "overhead": [one.as_dict() for one in measured],
                 "verification": rates.as_dict(),
                 "listing": {"shots": listed, "seconds": listing_s},
-                "command": command_line(),
-                "versions": versions(),
             }
             write_metrics(results, metrics)
 

@@ -61,7 +61,7 @@ def simulate_into(
     """
     import emmc_rig as emmc
     from emmc_rig.files.frames import FRAMES, PSI
-    from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
+    from emmc_rig.files.results import save_frames, write_metrics
     from emmc_rig.model.lightfield import psnr_db
 
     scene = emmc.scene(scene_name, size=size, views=camera.views, seed=seed)
@@ -89,8 +89,6 @@ def simulate_into(
         "light_efficiency": psi.light_efficiency(),
         "seed": seed,
         "warnings": camera.warnings(),
-        "command": command_line(),
-        "versions": versions(),
     }
     write_metrics(folder, metrics)
     return metrics

@@ -48,10 +48,10 @@ def stability(
     ] = False,
     mismatch: Annotated[
         bool,
-        typer.Option("--mismatch", help="beside it: a wrong Psi, mended with and without help"),
+        typer.Option("--mismatch", help="beside it: a wrong Psi, corrected blindly or exactly"),
     ] = False,
     verdicts: Annotated[
-        bool, typer.Option("--verdicts", help="instead: how well verdicts tell broken results")
+        bool, typer.Option("--verdicts", help="instead: how often verdicts flag broken results")
     ] = False,
     worst: Annotated[
         bool,
@@ -113,7 +113,7 @@ def stability(
     for row in rows:
         table.add_row(f"{row.title}, {row.unit}", *row.cells)
     Console().print(table)
-    for line in beside.told:
+    for line in beside.lines:
         typer.echo(line)
     for line in outcome.left_out:
         say("left out", line)

@@ -1,4 +1,4 @@
-"""`emmc-rig stability --verdicts`: how well verdicts tell broken results from good ones."""
+"""`emmc-rig stability --verdicts`: how often verdicts flag broken results and pass good ones."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def stability_verdicts(
     seed: int,
     out: Path,
 ) -> None:
-    """Measure how well verdicts tell results that a fault broke from good ones."""
+    """Measure how often verdicts flag results that a fault broke, and good ones."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.study.stability.detector import (
+        case_words,
         detector_settings,
         run_detector,
         tables,
-        told,
         wrong,
     )
 
@@ -41,7 +41,7 @@ def stability_verdicts(
             results = run_detector(settings, out, bars)
     except KeyboardInterrupt as stop:
         raise StoppedError(
-            f"stopped by Ctrl-C; what is judged is kept in {out}: run it again"
+            f"stopped by Ctrl-C; what is measured is kept in {out}: run it again"
         ) from stop
     table = Table(
         "fault", "method", "broken: flagged", "good: flagged", "between", "poor", box=SIMPLE
@@ -58,5 +58,5 @@ def stability_verdicts(
     Console().print(table)
     for one in wrong(results):
         kind = "missed" if one.kind == "broken" else "false alarm"
-        say(kind, told(one))
+        say(kind, case_words(one))
     typer.echo(f"open {out / 'verdicts.csv'}")

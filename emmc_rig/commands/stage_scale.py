@@ -89,7 +89,7 @@ def scale(
                     reader = shadow_reader(device, um_per_pixel or 0.0)
                     steps, readings = measure(opened, axis, counts, places, reader)
             found = fit_step_length(steps, readings)
-            told = scale_settings(config, opened, axis, found.um_per_step)
+            settings = scale_settings(config, opened, axis, found.um_per_step)
     except (DriverError, CalibrationError) as fault:
         raise AppError("; ".join([str(fault), *getattr(fault, "__notes__", [])])) from fault
     share = found.deviation_um / found.um_per_step
@@ -98,9 +98,9 @@ def scale(
         f"{found.worst_um:.3g} um off the line" + (", counting downwards" * found.reversed)
     )
     typer.echo("take the data sheet's own figure if it is within that; for the stage's file:")
-    typer.echo(yaml.safe_dump(told, sort_keys=False), nl=False)
+    typer.echo(yaml.safe_dump(settings, sort_keys=False), nl=False)
     if out is not None:
-        whole = _merged(config.model_dump(mode="json", exclude_defaults=True), told)
+        whole = _merged(config.model_dump(mode="json", exclude_defaults=True), settings)
         with out.open("x", encoding="utf-8") as file:
             yaml.safe_dump({"protocol": config.protocol} | whole, file, sort_keys=False)
 

@@ -1,4 +1,4 @@
-"""How a command ends that reconstructs: with the verdict."""
+"""The verdict at the end of a command that reconstructs, with a line for each reason."""
 
 from __future__ import annotations
 
@@ -16,6 +16,6 @@ def show_verdict(verdict: dict) -> None:
     """Print a verdict, a line for each reason."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
-        typer.secho("trust: nothing in frames, Psi and light field speaks against it", fg=colour)
+        typer.secho("trust: frames, Psi and light field agree", fg=colour)
     for reason in verdict["reasons"]:
         show_reason(**reason)

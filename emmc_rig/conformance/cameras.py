@@ -1,4 +1,4 @@
-"""What every camera does, simulated or real.
+"""Conformance suite of cameras, simulated or real.
 
 A test module that imports all of this defines the fixture `camera`: opened, and closed after the
 test.

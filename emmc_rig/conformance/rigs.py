@@ -1,4 +1,4 @@
-"""What the conformance suites drive: a stage opened by name, or one over simulated firmware."""
+"""Stages for the conformance suite: a stage opened by name, or one over simulated firmware."""
 
 from __future__ import annotations
 

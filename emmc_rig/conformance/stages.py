@@ -1,4 +1,4 @@
-"""What every stage does, whatever its protocol and wire, simulated or real.
+"""Conformance suite of stages of any protocol and wire, simulated or real.
 
 A test module that imports all of this defines the fixture `rig`, whose `make_stage(**settings)`
 opens the stage, not homed; and, for a stage with simulated firmware, `simulated` (a

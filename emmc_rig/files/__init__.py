@@ -1,1 +1,1 @@
-"""What is read and written by name: cameras, scenes, captures, results."""
+"""Files read and written by name: cameras, scenes, captures, results."""

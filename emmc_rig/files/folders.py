@@ -43,7 +43,7 @@ class Listing:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def text(self) -> str:
-        """Return files.json: the digest at its end tells whether somebody edited it."""
+        """Return files.json: the digest at its end shows whether it was edited."""
         body = {"command": self.command, "files": dict(sorted(self.files.items()))}
         digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
         return json.dumps({**body, "sha256": digest}, indent=1) + "\n"
@@ -66,7 +66,7 @@ class Listing:
             whole = False
         if not whole:
             raise AppError(
-                f"{path}: was edited, so it does not tell which files may be replaced; choose "
+                f"{path}: was edited, so it does not state which files may be replaced; choose "
                 "another folder"
             )
         return listing

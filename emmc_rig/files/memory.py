@@ -1,4 +1,4 @@
-"""How much memory this process has held at most, since it began or was told to forget."""
+"""Peak memory of this process, since its start or since `forget_peak`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def peak_memory_mib() -> float:
     """Return the peak of resident memory, in MiB.
 
     On Linux from /proc: there getrusage starts a new program with the peak of the one that
-    started it, and would tell the parent's memory for the child's.
+    started it, and would count the parent's memory as the child's.
     """
     try:
         status = Path("/proc/self/status").read_text("ascii", errors="replace")

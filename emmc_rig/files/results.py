@@ -1,4 +1,4 @@
-"""What results say of themselves: metrics, versions, and figures for people."""
+"""metrics.json of a result: figures, command and versions; and figures formatted for people."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ def parse_psnr(text: str, option: str) -> float:
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
-    """Write metrics.json, see `metrics_text`."""
-    (folder / METRICS).write_text(metrics_text(metrics), encoding="utf-8")
+    """Write metrics.json, with the command and the versions; see `metrics_text`."""
+    text = metrics_text({**metrics, "command": command_line(), "versions": versions()})
+    (folder / METRICS).write_text(text, encoding="utf-8")
 
 
 def metrics_text(metrics: Mapping[str, object]) -> str:

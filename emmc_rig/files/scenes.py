@@ -1,4 +1,4 @@
-"""Open a scene by what the user calls it: a folder of views, an HDF5 file or a built-in name.
+"""Scenes opened by name: a folder of views, an HDF5 file or a built-in name.
 
 A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
@@ -149,7 +149,7 @@ def fine_scene(
     """Open a scene for simulating a capture.
 
     A built-in scene is rendered on the finer grid, and its truth is the box average. A measured
-    scene tells nothing of what lies between its views: they are held over the aperture cell, so
+    scene has nothing between its views: each is held constant over the aperture cell, so
     `aperture_factor` comes back 1 whatever was asked (one view stands for all a x a of a cell);
     its pixels are interpolated by a cubic whose p x p block means are the measured samples.
 

@@ -477,7 +477,7 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     """
     k = camera.sensor.binning
     tile = cfa_tile(camera.sensor.cfa)
-    # One period of the filters tells whether pixels see one colour, and which.
+    # One period of the filters shows whether pixels see one colour, and which.
     period = sensor_response(camera, (tile.shape[0] * k, tile.shape[1] * k))
     single = bool((period.sum(axis=-1) <= 1).all())
     if size[0] % k or size[1] % k:

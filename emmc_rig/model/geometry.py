@@ -1,4 +1,4 @@
-"""Where a ray meets a mask, and how much of each mask cell a pixel and an aperture cell see.
+"""The geometry of rays and masks: where a ray crosses a mask, and the footprint of a pixel there.
 
 A ray through the sensor point x and the lens point u (lens at distance D from the sensor) meets
 a mask at distance d from the sensor at xi = (1 - d/D) x + (d/D) u (paper, eq. 2). A pixel of

@@ -1,4 +1,4 @@
-"""A light field is a float32 array (v, u, y, x, c): read it, write it, look into it, compare two.
+"""Light fields, float32 arrays (v, u, y, x, c): reading, writing, views of them, comparison.
 
 Views come first, rows of views before columns; colours are linear RGB in [0, 1]. The centre view
 is view (V // 2, U // 2). Disparity is signed, in pixels per view step: a point at x in the centre

@@ -188,6 +188,6 @@ def check_png_size(content: bytes, source: str, error: type[Exception]) -> None:
 
 
 def one_line(fault: object) -> str:
-    """Return what a fault says on one line, cut where it goes on and on."""
+    """Return an error's message on one line, cut to a length."""
     text = fault.args[0] if isinstance(fault, KeyError) and fault.args else fault
     return " ".join(str(text).split())[:300]

@@ -1,4 +1,4 @@
-"""What a camera is and measures: in figures, as a row of a table, as a drawing."""
+"""A camera in figures, as a row of a table, and as a drawing."""
 
 from __future__ import annotations
 

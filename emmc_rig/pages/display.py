@@ -64,7 +64,7 @@ def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
 
 
 def png_of(image: NDArray[np.uint8]) -> str:
-    """A lossless picture as an address that holds it."""
+    """A lossless picture as a data URL."""
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 

@@ -1,4 +1,4 @@
-"""What a frame looks like: figures, a preview, a histogram for the terminal; nothing is written."""
+"""Views of a frame: figures, a preview, and a histogram for the terminal."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def srgb_codes(linear: Array) -> NDArray[np.uint8]:
 
 
 def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:
-    """Return about so many pixels of a mosaic: whole 2x2 tiles, evenly spread."""
+    """Return a subset of a mosaic's pixels: whole 2x2 tiles, evenly spread."""
     step = max(1, int(np.sqrt(mosaic.size / pixels)))
     if step == 1:
         return mosaic

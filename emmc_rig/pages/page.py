@@ -45,7 +45,7 @@ class Card:
 
 
 def number(value: float | None, form: str) -> str:
-    """Return a number by its format, a dash for None and for what is not finite."""
+    """Return a number by its format, a dash for None and for values that are not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)
 
 
@@ -99,7 +99,7 @@ def provenance_section(provenance: Mapping[str, object]) -> Section:
 
 
 def data_address(data: bytes, kind: str) -> str:
-    """Return bytes as an address that holds them. kind: the ending of a file of such."""
+    """Return bytes as a data URL. kind: the suffix of such a file."""
     return f"data:{KINDS[kind]};base64,{base64.b64encode(data).decode()}"
 
 

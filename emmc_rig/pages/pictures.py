@@ -1,4 +1,4 @@
-"""What a figure needs of a light field, small enough to keep: two views and two epipolar images."""
+"""Small pictures of a light field for figures: two views and two epipolar images."""
 
 from __future__ import annotations
 

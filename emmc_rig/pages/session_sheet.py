@@ -221,14 +221,14 @@ def _timeline(session: Session) -> str:
 def events(session: Session) -> Iterator[tuple[str, str]]:
     """Yield kind and text of what happened, besides frames that were taken."""
     for entry in session.journal.entries:
-        told = _told(entry)
-        if told:
-            yield entry["kind"], told
+        text = _event_text(entry)
+        if text:
+            yield entry["kind"], text
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
 
 
-def _told(entry: Entry) -> str:
+def _event_text(entry: Entry) -> str:
     """Return what an entry that is no frame says, "" for a frame."""
     kind = entry["kind"]
     if kind == "run":

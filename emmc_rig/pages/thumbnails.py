@@ -1,4 +1,4 @@
-"""What a point of a chart shows: a small picture of a light field, kept as WebP."""
+"""Small pictures of light fields for the points of a chart, stored as WebP."""
 
 from __future__ import annotations
 

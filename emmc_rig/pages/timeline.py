@@ -1,4 +1,4 @@
-"""When the bench worked and when the disk did: from the journal's spans to figures and a chart."""
+"""The timeline of a capture, bench and disk, from the journal's spans: figures and a chart."""
 
 from __future__ import annotations
 
@@ -104,9 +104,9 @@ def session_metrics(session: Session) -> dict[str, object]:
         "exposures": [asdict(one) for one in shot_exposures(session)],
         "retries": sum(entry["kind"] == "retry" for entry in entries),
         "runs": [
-            {"frames": len(run), **asdict(told), "hidden_share": told.hidden_share}
+            {"frames": len(run), **asdict(one), "hidden_share": one.hidden_share}
             for run in run_entries(entries)
-            for told in (overlap(run),)
+            for one in (overlap(run),)
         ],
         "command": session.header["command"],
         "versions": session.header["versions"],

@@ -63,7 +63,7 @@ def reconstruct(
         usable: which readings to use (default: those of the frames, all of an array).
         dictionary: for methods that need one: itself, its file, or the name of a built-in one.
         settings: of the methods.
-        on_step: is told the progress after each step.
+        on_step: is called with the progress after each step.
 
     Raises:
         AppError: an array without `noise_sigma`, where Psi does not know its camera.

@@ -55,7 +55,7 @@ from reconstruction.tiles import (
 )
 from reconstruction.verdict.blocks import judged_together
 from reconstruction.verdict.evidence import Evidence
-from reconstruction.verdict.rules import Verdict, judged
+from reconstruction.verdict.rules import Verdict, verdict_from
 
 FRAMES, JOB = "frames.h5", "job.json"
 AGAIN = "the same command computes it again"
@@ -236,22 +236,24 @@ class DoneBlock:
 
 def done_block(task: BlockTask) -> DoneBlock | None:
     """Return a block that is done and whole on the disk, else None."""
-    told = _read_json(task.path("json"))
-    if told is None or told.get("fingerprint") != task.capture.fingerprint:
+    kept = _read_json(task.path("json"))
+    if kept is None or kept.get("fingerprint") != task.capture.fingerprint:
         return None
-    if told.get("sha256") != _sha256(task.path("h5")):
+    if kept.get("sha256") != _sha256(task.path("h5")):
         return None
-    figures = {**told["result"], "left_out": tuple(told["result"]["left_out"])}
+    figures = {**kept["result"], "left_out": tuple(kept["result"]["left_out"])}
     figures["status"] = Status(figures["status"])
     result = Reconstruction(
         method=task.capture.method,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         objective=(),
-        seconds=told["seconds"],
+        seconds=kept["seconds"],
         **figures,
     )
-    verdict = None if told["evidence"] is None else judged(Evidence.from_dict(told["evidence"]))
-    return DoneBlock(result, verdict, told["seconds"], told["peak_mib"])
+    verdict = (
+        None if kept["evidence"] is None else verdict_from(Evidence.from_dict(kept["evidence"]))
+    )
+    return DoneBlock(result, verdict, kept["seconds"], kept["peak_mib"])
 
 
 def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey:

@@ -233,15 +233,15 @@ def train(
         final = learn(rows, shape, settings.learning, start, on_step)
     except KeyboardInterrupt:
         if state is None:
-            told = "before the first step; nothing was written"
+            outcome = "before the first step; nothing was written"
         else:
             if saved_steps < len(state.history):
                 save_checkpoint(kept, state, purpose)
-            told = (
+            outcome = (
                 f"after step {len(state.history)} of {settings.learning.iterations}, which {kept} "
                 "keeps; the same command with --resume goes on"
             )
-        raise StoppedError(f"stopped by Ctrl-C {told}") from None
+        raise StoppedError(f"stopped by Ctrl-C {outcome}") from None
     provenance = {
         **{key: purpose[key] for key in ("kind", "scenes", "patches", "data")},
         "sources": [f"{s.spec}, seed {s.seed}" if s.spec in SCENES else s.spec for s in sources],

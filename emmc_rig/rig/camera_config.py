@@ -1,4 +1,4 @@
-"""Which camera is meant: a short `KIND:ADDRESS`, or a YAML file with more settings."""
+"""The configuration of a camera: a short `KIND:ADDRESS`, or a YAML file with more settings."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ SIMULATED_SCALES = {
 
 
 class Attendant(Protocol):
-    """What somebody, or a relay, does at the bench between exposures."""
+    """What a person, or a relay, does at the bench between exposures."""
 
     def set_lamp(self, colour: str) -> None:
         """Light the scene or the board: off, white, red, green or blue."""
@@ -119,7 +119,7 @@ class Rig:
     zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
-    about_to_expose: told the name of each frame before its exposure. trigger: the line by which
+    about_to_expose: called with a frame's name before its exposure. trigger: the line by which
     the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
     of that square window, to put its edges between views; None: not known.
     """
@@ -380,7 +380,7 @@ def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
 def probe_port(port: str) -> str:
     """Return what answers on a port, in words, "" when nothing does; nothing moves.
 
-    A port whose USB adapter tells what it is is asked in that protocol alone: bytes of another
+    A port whose USB adapter states its protocol is asked in that one alone: bytes of another
     may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
     """
     device = find_port(port)
@@ -484,7 +484,7 @@ def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]
 
 
 def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
-    """Open the camera that `spec` names: a kind, a colon and what tells it from others.
+    """Open the camera that `spec` names: a kind, a colon and its address.
 
     `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `mm:CONFIG.cfg`, `folder:DIR`, `simulated`,
     that of a plug-in, or a YAML file (`emmc_rig.rig.camera_config`). `backend`: of pyusb, for a

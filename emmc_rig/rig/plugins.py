@@ -1,4 +1,4 @@
-"""Stages and cameras that other packages bring, by entry point: `docs/plugins.md` tells how.
+"""Stages and cameras that other packages bring, by entry point; see `docs/plugins.md`.
 
 A package names a factory in the group `emmc_rig.stages` or `emmc_rig.cameras`; its name then goes
 wherever ours do: `NAME:ADDRESS`, or a YAML file with more settings.

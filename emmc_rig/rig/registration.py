@@ -1,7 +1,7 @@
-"""How one frame lies over another: the shift to a fraction of a pixel, and how alike they then are.
+"""Registration of two frames: the shift to a fraction of a pixel, and their correlation after it.
 
 Colour tiles are averaged first: their pattern stands still whatever moves, and the pixels of one
-colour lie too far apart to tell where between them an edge is.
+colour lie too far apart to locate an edge between them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which stage is meant: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes.
+"""The configuration of a stage: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes.
 
 Single settings may follow the port: `zaber:/dev/ttyUSB0,microstep_um=0.49609375`.
 """
@@ -23,7 +23,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class _Common(Settings):
-    """What every stage can be told; see `drivers.stage.StageSettings`."""
+    """Settings of every stage; see `drivers.stage.StageSettings`."""
 
     approach_um: Annotated[float, Field(ge=0)] = 10.0
     tolerance_um: Positive = 1.0
@@ -160,7 +160,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
 
 def _require_actuators(axes: Any, source: str) -> None:
-    """Raise AppError for an axis without an actuator: no controller tells what is plugged in."""
+    """Raise AppError for an axis without an actuator: no controller reports what is plugged in."""
     known = ", ".join(ACTUATORS)
     for axis, one in axes.items() if isinstance(axes, dict) else ():
         if isinstance(one, dict) and "actuator" not in one:

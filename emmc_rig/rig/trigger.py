@@ -67,7 +67,7 @@ def signalling(stage: Stage) -> SignallingStage:
 
 def triggered(camera: CameraDevice) -> TriggeredCamera:
     """Return the camera as one that waits for a line; AppError for one that cannot."""
-    # Not isinstance: that would ask for every property, and some cameras expose to tell theirs.
+    # Not isinstance: that would ask for every property, and some cameras expose a frame for theirs.
     if not hasattr(camera, "armed"):
         raise AppError("trigger: this camera waits for no line; USB3 Vision cameras (u3v:) do")
     return cast(TriggeredCamera, camera)

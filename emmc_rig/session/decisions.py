@@ -1,4 +1,4 @@
-"""What a session decided about its shots, from journal lines: which come next, which are spared.
+"""Decisions about a session's shots, from journal lines: the next ones, and those left out.
 
 A capture that ends when the scene needs no more shots writes two kinds of line. `until`: from now
 on the wanted PSNR is `target_db`. `decided`: of the `shots` taken the PSNR stated is `stated_db`;

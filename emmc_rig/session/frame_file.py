@@ -15,9 +15,9 @@ STREAMED = ".bin"
 
 def suffix_of(frame: RawFrame) -> str:
     """Return the kind of file that the camera's bytes are."""
-    told = Path(frame.metadata.get("name", "")).suffix.lower()
-    if told in RAW_SUFFIXES:
-        return told
+    suffix = Path(frame.metadata.get("name", "")).suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return suffix
     return ".dng" if frame.original[:4] in TIFF_MAGICS else STREAMED
 
 

@@ -1,7 +1,7 @@
 """The journal of a session: one checked JSON line for each thing that happened, only ever appended.
 
 A line is on the disk when `append` returns. A line that a crash tore, or whose checksum is wrong,
-counts as never written: what it told of is done again.
+counts as never written: its step is done again.
 """
 
 from __future__ import annotations

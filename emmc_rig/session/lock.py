@@ -1,4 +1,4 @@
-"""Who may write a session: one program at a time, and one that comes second is told which.
+"""The lock of a session: one program writes at a time, and a second one names it in its error.
 
 A session is locked by `session.lock` in it; one that is yet to be made by `.NAME.lock` beside it.
 The lock is the operating system's and goes with the program, however that ends; the file says who
@@ -113,7 +113,7 @@ def _acquired(path: Path, folder: Path) -> int | None:
                 os.write(descriptor, _own_name())
             return descriptor
         if named:
-            # Left by a killed program: whoever comes now must not read its name.
+            # Left by a killed program: its name must not be read any more.
             os.unlink(path)
         os.close(descriptor)
     raise HeldError(folder, "another program")

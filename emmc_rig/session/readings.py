@@ -1,4 +1,4 @@
-"""From a session to what a reconstruction takes: whiteboards, Psi, and normalised readings.
+"""Psi and normalised readings from the whiteboards and shots of a session.
 
 Frames are decoded one at a time and averaged or fused as they come.
 """
@@ -46,8 +46,8 @@ class SessionReadings:
     @property
     def noise_sigma(self) -> float:
         """Root mean variance of the usable readings, which solvers take as their typical noise."""
-        judged = self.variance[self.usable]
-        return float(np.sqrt(np.mean(judged, dtype=np.float64))) if judged.size else 0.0
+        usable = self.variance[self.usable]
+        return float(np.sqrt(np.mean(usable, dtype=np.float64))) if usable.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ def fused_shot(
 def session_calibration(session: Session) -> Calibration:
     """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError.
 
-    Whiteboards of the open aperture are fitted, and judged by those held out; where there are
+    Whiteboards of the open aperture are fitted, and tested on those held out; where there are
     none, every coefficient is measured through the pinhole.
     """
     if any(frame.kind == "open" for frame in session.frames):
@@ -371,7 +371,7 @@ def camera_json_of(session: Session, shots: Sequence[int]) -> str:
 
 
 def session_scale(session: Session) -> Scale:
-    """Return what the session's whiteboards and darks tell.
+    """Return the calibration by the session's whiteboards and darks.
 
     Without whiteboards it is the designed Psi and the camera's own noise model, which is coarser.
     Raises AppError or CalibrationError.

@@ -20,7 +20,7 @@ count as not planned (see `decisions`).
 The first journal line holds the SHA-256 of the frozen files, an `amended` line that of the files
 of an amendment: a frame that is taken stays what it was planned to be, and its line says by which
 plan it was taken. A frame counts when its journal line
-is readable and its file has the bytes that the line tells of; a frame that was taken twice counts
+is readable and its file has the bytes that the line states; a frame that was taken twice counts
 by its last line. A file without a line is what a crash left between the two: it is taken again,
 under the same name. So nothing is lost that was counted, and nothing is there twice.
 
@@ -73,7 +73,7 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Frozen:
-    """What a session keeps of how it was begun: texts, and the frames to be taken."""
+    """The frozen start of a session: texts, and the frames to be taken."""
 
     plan_yaml: str
     camera: Mapping[str, Any]
@@ -153,7 +153,7 @@ class Session:
         return Session(self.folder, self.disk)
 
     def forget(self) -> None:
-        """Remove a session in which no frame was ever stored, unless it holds somebody's files."""
+        """Remove a session in which no frame was ever stored, unless it holds other files."""
         if any(entry["kind"] == "frame" for entry in self.journal.entries) or self.strangers()[1]:
             return
         with suppress(OSError):
@@ -190,7 +190,7 @@ class Session:
         return found
 
     def frozen_file(self, name: str) -> bytes:
-        """Return a frozen file's bytes; raises AppError when it is not what it was."""
+        """Return a frozen file's bytes; raises AppError when it was changed."""
         path = self.folder / name
         try:
             data = read_whole(self.disk, path)
@@ -292,7 +292,7 @@ class Session:
     def read(self, frame_id: str) -> bytes:
         """Return the bytes of a stored frame.
 
-        Raises AppError when it is missing, or not what the journal tells of.
+        Raises AppError when it is missing, or not what the journal states.
         """
         entry = self.stored.get(frame_id)
         if entry is None:
@@ -336,7 +336,7 @@ class Session:
         _count(self.stored, entry)
 
     def make_ready(self) -> None:
-        """Make what a capture needs and somebody may have removed; raises `OSError`.
+        """Make the folders that a capture needs and that may be missing; raises `OSError`.
 
         Parts that a killed program left go.
         """
@@ -357,13 +357,13 @@ class Session:
             if size >= 0 and is_abandoned(name)
         ]
         with suppress(FileNotFoundError):
-            # Frames are only written by whoever holds the session.
+            # Frames are only written by the holder of the lock.
             sizes = self.disk.sizes(self.folder / FRAMES)
             found += [f"{FRAMES}/{name}" for name in sizes if is_part(name) and sizes[name] >= 0]
         return found
 
     def strangers(self) -> tuple[list[str], list[str]]:
-        """Return (leftovers of a crash, files of somebody else), relative to the folder."""
+        """Return (leftovers of a crash, files of other programs), relative to the folder."""
         ours = {entry["file"] for entry in self.stored.values()}
         known = {*KNOWN, *self.digests}
         unfinished = {amended_name(name, self.amendments + 1) for name in AMENDED}
@@ -425,7 +425,7 @@ def amended_name(name: str, number: int) -> str:
 
 
 def wall_time() -> str:
-    """Return the time of day for people; nothing is reckoned with it."""
+    """Return the time of day for people; nothing is computed from it."""
     return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
 
 

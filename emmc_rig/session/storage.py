@@ -71,7 +71,7 @@ class Disk(Protocol):
         ...
 
     def sizes(self, folder: Path) -> dict[str, int]:
-        """Return the size of everything in a folder by name, -1 for what is no plain file."""
+        """Return the size of everything in a folder by name, -1 for anything but a plain file."""
         ...
 
     def free_bytes(self, folder: Path) -> int:
@@ -141,7 +141,7 @@ class SystemDisk:
             os.close(descriptor)
 
     def sizes(self, folder: Path) -> dict[str, int]:
-        """Return the size of everything in a folder by name, -1 for what is no plain file."""
+        """Return the size of everything in a folder by name, -1 for anything but a plain file."""
         with os.scandir(folder) as entries:
             return {
                 entry.name: entry.stat().st_size if entry.is_file(follow_symlinks=False) else -1
@@ -180,7 +180,7 @@ def is_part(name: str) -> bool:
 
 
 def is_abandoned(name: str) -> bool:
-    """Return whether nobody on this computer writes a part any more."""
+    """Return whether no program on this computer writes a part any more."""
     writer = re.search(rf"\.(\d+)-[0-9a-f]+{re.escape(PART)}$", name)
     return is_part(name) and (writer is None or not _is_running(int(writer[1])))
 

@@ -1,4 +1,4 @@
-"""Whether a session is what its journal says: every file hashed, nothing repaired.
+"""Verification of a session against its journal: every file is hashed, nothing is repaired.
 
 Files are read in large pieces by a few threads: reading and SHA-256 both let others run, so the
 slower of disk and processor sets the pace.
@@ -21,7 +21,6 @@ from emmc_rig.session.storage import Disk
 
 PIECE_BYTES = 1 << 20
 THREADS = min(8, os.cpu_count() or 1)
-GOOD = "good"
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,29 @@
-"""What each piece of the adaptive method buys in dB and costs in seconds, on one scene's shot.
+"""Gain in dB and cost in seconds of each part of the adaptive method, on one scene's shot.
 
-Every row leaves one piece out of the whole; the rows after them are what else there is to compare
-with, on the same frames.
+Every row leaves one part out. The rows after them are other methods, the true disparity and the
+copied centre view, on the same frames.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
 
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
+from emmc_rig.study.sweep import Results, Sweep, machine
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.methods import MethodSettings, reconstruct
@@ -35,8 +43,10 @@ LEFT_OUT = {
     "a second fit, of more misfit": {"misfits": (0.0015,)},
     "disparity (all at 0)": {"furthest_px": 0.01},
 }
-"""Pieces of the method, and the settings without them."""
+"""Parts of the method, and the settings without them."""
+WITHOUT = "without "
 ORACLE = "true disparity in place of the searched one"
+COPIED = "copied true centre view"
 RIVALS = ("adaptive-fast", "tv", "tv-dict")
 
 
@@ -51,47 +61,107 @@ class Ablation(Figures):
     costs_s: float
 
 
-def ablations(scene: str, camera: Camera, size: tuple[int, int], seed: int) -> Iterator[Ablation]:
-    """Yield the whole method, then the method without each piece, its rivals, and the oracle.
+@dataclass(frozen=True)
+class Exposure:
+    """The frames of an ablation. scene: what `open_scene` takes. size: rows and columns."""
 
-    The frames are exposed once. The whole runs twice, so that compiling is not counted.
-    """
-    truth = open_scene(scene, size=size, views=camera.views, seed=seed).light_field
-    psi = camera.psi(size)
-    frames = camera.expose(truth, seed, psi)
-    dictionary = open_dictionary(None, camera.views, psi.binning)
+    scene: str
+    camera: Camera
+    size: tuple[int, int]
+    seed: int
 
-    def run(method: str, settings: MethodSettings) -> tuple[float, float]:
-        result = reconstruct(
-            method,
-            psi,
-            frames.readings,
-            frames.noise_sigma,
-            dictionary,
-            settings,
-            frames.usable,
+    @cached_property
+    def truth(self) -> np.ndarray:
+        """The light field, (v, u, y, x, c)."""
+        scene = open_scene(self.scene, size=self.size, views=self.camera.views, seed=self.seed)
+        return scene.light_field
+
+    @cached_property
+    def psi(self) -> ImagingMatrix:
+        """The camera's imaging matrix."""
+        return self.camera.psi(self.size)
+
+    @cached_property
+    def frames(self) -> Frames:
+        """What every row reconstructs from."""
+        return self.camera.expose(self.truth, self.seed, self.psi)
+
+
+@dataclass
+class AblationSweep(Sweep[str]):
+    """The rows of an ablation by name; settings: Exposure."""
+
+    journal = "ablation.jsonl"
+    noun = "rows"
+    stage = "reconstruct"
+    revision = 1
+
+    def inputs(self, point: str) -> dict[str, object]:
+        """Return everything that a row depends on, as plain data."""
+        given = self.settings
+        return {
+            "row": point,
+            "settings": _settings(point).model_dump(mode="json"),
+            "machine": machine(),
+            "camera": given.camera.model_dump(mode="json"),
+            "scene": given.scene,
+            "sum": float(np.sum(given.truth, dtype=np.float64)),
+            "size": given.size,
+            "seed": given.seed,
+        }
+
+    def prepare(self, points: Sequence[str], watcher: Watcher) -> None:
+        """Run the method once, so that no row's seconds count its compiling."""
+        if points:
+            watcher.begin("compile", None)
+            _reconstructed(self.settings, WHOLE)
+
+    def measured(self, points: Sequence[str], watcher: Watcher) -> Results:
+        """Yield the PSNR and the seconds of each row."""
+        for point in points:
+            light_field, seconds = _reconstructed(self.settings, point)
+            yield {"psnr_db": psnr_db(light_field, self.settings.truth), "seconds": seconds}
+
+
+def _settings(row: str) -> MethodSettings:
+    changed = LEFT_OUT.get(row.removeprefix(WITHOUT), {})
+    return MethodSettings(adaptive=AdaptiveSettings.model_validate(changed))
+
+
+def _reconstructed(given: Exposure, row: str) -> tuple[np.ndarray, float]:
+    """Return the light field of a row and the seconds that it took."""
+    frames, psi = given.frames, given.psi
+    if row == COPIED:
+        return replicate_centre(given.truth), 0.0
+    if row == ORACLE:
+        started = time.perf_counter()
+        disparity = matched_disparity(given.truth)
+        result = reconstruct_adaptive(
+            psi, frames.readings, frames.noise_sigma, usable=frames.usable, disparity=disparity
         )
-        return psnr_db(result.light_field, truth), result.seconds
-
-    run(WHOLE, MethodSettings())
-    best, took = run(WHOLE, MethodSettings())
-    yield Ablation(WHOLE, best, took, 0.0, 0.0)
-    for name, without in LEFT_OUT.items():
-        settings = MethodSettings(adaptive=AdaptiveSettings.model_validate(without))
-        decibels, seconds = run(WHOLE, settings)
-        yield Ablation(f"without {name}", decibels, seconds, best - decibels, took - seconds)
-    for method in RIVALS:
-        decibels, seconds = run(method, MethodSettings())
-        yield Ablation(method, decibels, seconds, best - decibels, took - seconds)
-    started = time.perf_counter()
-    known = reconstruct_adaptive(
+        return result.light_field, time.perf_counter() - started
+    dictionary = open_dictionary(None, given.camera.views, psi.binning)
+    result = reconstruct(
+        row if row in RIVALS else WHOLE,
         psi,
         frames.readings,
         frames.noise_sigma,
-        usable=frames.usable,
-        disparity=matched_disparity(truth),
+        dictionary,
+        _settings(row),
+        frames.usable,
     )
-    decibels, seconds = psnr_db(known.light_field, truth), time.perf_counter() - started
-    yield Ablation(ORACLE, decibels, seconds, best - decibels, took - seconds)
-    copied = psnr_db(replicate_centre(truth), truth)
-    yield Ablation("copied true centre view", copied, 0.0, best - copied, took)
+    return result.light_field, result.seconds
+
+
+def ablations(given: Exposure, folder: Path, watcher: Watcher) -> list[Ablation]:
+    """Return the whole method, then it without each part, its rivals, the oracle and the copy.
+
+    Rows that the folder holds are not measured again; see `Sweep.run`.
+    """
+    names = [WHOLE, *(WITHOUT + name for name in LEFT_OUT), *RIVALS, ORACLE, COPIED]
+    results = AblationSweep(given, folder).run(names, watcher)
+    best, took = results[WHOLE]["psnr_db"], results[WHOLE]["seconds"]
+    return [
+        Ablation(name, **one, buys_db=best - one["psnr_db"], costs_s=took - one["seconds"])
+        for name, one in results.items()
+    ]

@@ -1,4 +1,4 @@
-"""PSNR of the default method on fixed captures, against stored figures: what CI runs to see a fall.
+"""PSNR of the default method on fixed captures, against stored figures: CI fails where it falls.
 
 Frames are Psi of the scene plus white noise of a known deviation: an inverse crime, the same in
 every version. Built-in scenes are always there; real light fields are measured where
@@ -68,7 +68,7 @@ class Row:
 
     @property
     def fell(self) -> bool:
-        """Whether the figure lies further below the stored one than chance puts it."""
+        """Whether the figure is more than MOST_FALL_DB below the stored one."""
         return self.stored_db is not None and self.psnr_db < self.stored_db - MOST_FALL_DB
 
 

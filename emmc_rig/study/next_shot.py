@@ -1,4 +1,4 @@
-"""How many shots scenes need, and what choosing them saves: sessions judged after every shot.
+"""How many shots scenes need, and what choosing them saves: sessions assessed after every shot.
 
 A session with every planned shot of a scene is captured on the simulated rig, which traces rays.
 The whiteboards of the first give Psi to all: the bench is the same. Shots are then chosen from it
@@ -99,7 +99,7 @@ class Saving(Figures):
 
 
 def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> Plan:
-    """Return a plan of PLANNED shots and the whiteboards that tell Psi of all of them.
+    """Return a plan of PLANNED shots and the whiteboards that measure Psi of all of them.
 
     Every shot is exposed as the camera's first. Raises CameraError where the camera does not say
     how masks move on, CalibrationError where its mask cannot be fitted.
@@ -132,7 +132,7 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
 
 
 def _nobody(what: str) -> None:
-    raise AppError(f"nobody is there to {what}")
+    raise AppError(f"the study needs a person to {what}: use a rig that needs none")
 
 
 def after(session: Session, scale: Scale, shots: Sequence[int]) -> tuple[Reconstruction, float]:

@@ -1,4 +1,4 @@
-"""The oracle of an ablation: the disparity that the true views match at, which no method can see.
+"""The oracle of an ablation: the disparity estimated from the true views.
 
 A plane sweep: every view is carried to the centre view at each disparity and compared. A point that
 some views do not see is still seen by those of one side, so that the mean is taken over the views

@@ -1,7 +1,7 @@
-"""The engine of every study: points measured one by one, each kept, and gone on with after a stop.
+"""The engine of every study: points are measured one by one, stored, and resumed after a stop.
 
-A point is found again by a digest of everything that it depends on, so changed settings never meet
-old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
+A point is identified by a digest of everything that it depends on, so that changed settings never
+reuse old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import refuse_edited, refuse_inside_session
+from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
@@ -55,14 +55,15 @@ def open_folder(out: Path, journal: str, command: str) -> Path:
     command: as typed, such as "chart". What is drawn and written of the points is replaced later by
     `result_folder`; what that would refuse is refused here, before anything is measured.
 
-    Raises AppError when the folder holds something else, or results that somebody edited, and
+    Raises AppError when the folder holds something else, or results that were edited, and
     where a session is.
     """
     refuse_inside_session(out)
     out = Path(os.path.abspath(out))
     if out.is_file():
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / journal).is_file():
+    known = (out / journal).is_file() or Listing.read(out) is not None
+    if out.is_dir() and any(out.iterdir()) and not known:
         raise AppError(
             f"--out {out}: the folder holds something else than an earlier `emmc-rig {command}`; "
             "choose another folder or empty it"
@@ -80,7 +81,7 @@ def open_folder(out: Path, journal: str, command: str) -> Path:
 def kept_when_stopped(
     out: Path, folder: Path, what: Callable[[], str] = lambda: "every point that was done is"
 ) -> Iterator[None]:
-    """Say what is kept when Ctrl-C or a full disk ends the block.
+    """Add to the error what is kept when Ctrl-C or a full disk ends the block.
 
     out: the folder as asked for, folder: where it is. what: such as "3 of 10 points are". Raises
     SweepStopped and AppError.
@@ -201,7 +202,7 @@ class Sweep(Generic[P]):
         return {"version": __version__, **revision, **self.inputs(point)}
 
     def digest(self, point: P) -> str:
-        """Return the digest by which a point is found again."""
+        """Return the digest that identifies a point."""
         if point not in self._digests:
             self._digests[point] = digest_of(self.all_inputs(point))
         return self._digests[point]
@@ -277,7 +278,7 @@ class Sweep(Generic[P]):
 
 
 def plain(result: Mapping[str, object]) -> dict:
-    """Return a result as JSON gives it back: None for what is not finite, lists for tuples."""
+    """Return a result as read back from JSON: None for what is not finite, lists for tuples."""
     return json.loads(metrics_text(result))
 
 
@@ -301,15 +302,6 @@ def csv_text(
     writer.writeheader()
     writer.writerows({name: written(name, value) for name, value in row.items()} for row in rows)
     return text.getvalue()
-
-
-def recorded(settings: Settings) -> dict[str, object]:
-    """Return what metrics.json says of how its figures were made."""
-    return {
-        "settings": settings.model_dump(mode="json"),
-        "command": command_line(),
-        "versions": versions(),
-    }
 
 
 def provenance(settings: Settings, seconds: float, **more: str) -> dict[str, str]:
@@ -351,7 +343,7 @@ def machine() -> str:
 
 
 def dictionary_identity(dictionary: str | None) -> str:
-    """Return what tells a dictionary from another: its name, and of a file its size and time."""
+    """Return what identifies a dictionary: its name, and of a file its size and time."""
     if dictionary is None or not Path(dictionary).is_file():
         return dictionary or "lambertian"
     seen = Path(dictionary).stat()

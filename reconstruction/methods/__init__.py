@@ -126,4 +126,4 @@ def reconstruct(
     took = clock() - started
     given = dataclasses.replace(given, frames=seen.frames, usable=seen.usable)
     result = method.solve(given, settings)
-    return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.told)
+    return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.notes)

@@ -1,4 +1,4 @@
-"""How well any estimator can tell the disparity of a patch from its readings.
+"""Lower bounds on the error of any estimator of a patch's disparity from its readings.
 
 The readings are N(0, S_d) (see `patch`), the texture integrated out. About a disparity the Fisher
 information of d is 1/2 trace(S^-1 S' S^-1 S'), S' = dS/dd (Kay 1993, Estimation Theory, eq. 3.32);

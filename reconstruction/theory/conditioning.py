@@ -38,7 +38,7 @@ SAME_DIRECTION = 0.1
 def ray_coherence(psi: ImagingMatrix) -> float:
     """Return the mean cosine between columns of one sample and colour in neighbouring views.
 
-    Over pairs of which both are seen. 1 says that views are not told apart by columns alone: from
+    Over pairs of which both are seen. 1 says that columns alone do not separate the views: from
     one shot, always. NaN where no such pair is seen.
     """
     weights = psi.weights.astype(np.float64)
@@ -144,7 +144,7 @@ def unexplained(patch: PatchModel, one: Subspace, other: Subspace) -> float:
     """Return the share of what patches of `one` read that no patch of `other` explains, 0 to 1.
 
     The mean squared sine of the principal angles between the two in the space of the readings
-    (Bjorck & Golub 1973): 0 where the disparities cannot be told apart.
+    (Bjorck & Golub 1973): 0 where the disparities cannot be separated.
     """
     first, second = (np.linalg.qr(sensed(patch, space))[0] for space in (one, other))
     cosines = np.linalg.svd(second.T @ first, compute_uv=False)

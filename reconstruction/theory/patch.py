@@ -35,7 +35,7 @@ TARGETS = 4
 class Texture:
     """amplitude: variance of luminance. chroma: that of a chrominance over it.
 
-    mean_known: what is told of a patch then is how it departs from its own mean colour.
+    mean_known: the patch's mean colour is known; its deviation from it is modelled.
     """
 
     amplitude: float
@@ -54,14 +54,14 @@ class Expected:
     """What the posterior mean of a patch's middle does; all per value of the light field.
 
     error: its mean squared error. prior: that of knowing no reading. noise_gain: root mean square
-    error per deviation of a reading's noise. told: degrees of freedom that the readings tell,
+    error per deviation of a reading's noise. degrees_of_freedom: those that the readings determine,
     trace(Psi K Psi^T S^-1), of as many as there are readings.
     """
 
     error: float
     prior: float
     noise_gain: float
-    told: float
+    degrees_of_freedom: float
 
 
 @lru_cache(maxsize=8)
@@ -192,8 +192,8 @@ class PatchModel:
             explained += float(np.mean(np.sum(cross * weights, axis=0)))
             gain += float(np.mean(np.sum(np.square(weights), axis=0)))
         prior = float(texture.variances.sum() * np.diag(alike)[self.middle].mean())
-        told = float(np.trace(cho_solve(factor, signal)))
-        return Expected((prior - explained) / 3, prior / 3, (gain / 3) ** 0.5, told)
+        degrees = float(np.trace(cho_solve(factor, signal)))
+        return Expected((prior - explained) / 3, prior / 3, (gain / 3) ** 0.5, degrees)
 
     def estimate(
         self, disparity: float, texture: Texture, variance: Array | float, readings: Array

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction.verdict.evidence import Evidence
-from reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, judged
+from reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, verdict_from
 
 Combine = Callable[[Sequence[float], Sequence[float]], float]
 DOUBTED_SHARE = Limits(0.25, 1.0)
@@ -126,7 +126,7 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
 
     blocks: at least one.
     """
-    whole = judged(combined(blocks))
+    whole = verdict_from(combined(blocks))
     reasons = list(whole.reasons)
     for level, limits in (("do not use", REFUSED_SHARE), ("doubt", DOUBTED_SHARE)):
         bad = [block for block in blocks if _rank(block.verdict.level) >= _rank(level)]

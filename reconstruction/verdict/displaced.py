@@ -1,7 +1,7 @@
-"""Where the masks' shadow really falls: displacements from the readings, by the camera's design.
+"""Displacements of the masks' shadow, estimated from the readings and the camera's design.
 
-The design tells how the relief of the masks changes when they move or their distance differs. What
-the readings do beyond Psi's own relief is regressed on these changes, tile by tile.
+The design predicts how the masks' modulation changes when they move or their distance differs. The
+residual of the readings beyond Psi's own modulation is regressed on these changes, tile by tile.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from reconstruction.verdict.shadow import LEAST_RELIEF, Relief, relief_of, tiles
 
 Array = NDArray[np.floating]
 STEP_PX = 0.25
-"""Of the differences that stand for derivatives."""
+"""Step of the finite differences."""
 DISTANCE_STEP = 0.1
 VIGNETTING_STEP = 0.3
 ALIKE = 0.5
@@ -87,7 +87,7 @@ def _design(psi: ImagingMatrix) -> Camera | None:
 
 
 def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
-    """Return by how much the masks lie off; None where the design cannot tell."""
+    """Return by how much the masks lie off; None where the design does not determine it."""
     camera = _design(psi)
     if camera is None:
         return None
@@ -131,7 +131,7 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
     weight = 1 / np.square(deviation)
     mean = np.average(moved, axis=0, weights=weight)
     beyond = np.average(np.square(moved) - np.square(deviation), axis=0, weights=weight)
-    # One at a time: they look so much alike that together none could be told.
+    # One at a time: they are so correlated that together none could be estimated.
     beyond_psi = found.seen - found.masks
     alone = {
         name: _regressed([one, shift_y, shift_x], beyond_psi, found.weight)
@@ -170,7 +170,7 @@ class _Fit:
 
 
 def _regressed(base: Sequence[Array], seen: Array, weight: Array) -> _Fit | None:
-    """Return the weighted regression of what is seen on the base; None where it is not told."""
+    """Return the weighted regression of the observed on the base; None where it is undetermined."""
     good = weight > 0
     if good.sum() < 20 * len(base):
         return None

@@ -1,4 +1,4 @@
-"""Everything that speaks for or against a light field, as plain figures."""
+"""The figures of a capture and its light field from which a verdict follows."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ Array = NDArray[np.floating]
 class Evidence:
     """Figures of a capture and of a light field found from it; None where there is nothing to say.
 
-    method: that found it; status: what it said. left_out: shots that screening left out. bad: share
-    of the pixels that it did. noise: the readings' deviation over their mean.
+    method: its name; status: its status. left_out: shots that screening left out. bad: share of
+    the pixels that screening left out. noise: the readings' deviation over their mean.
     """
 
     method: str

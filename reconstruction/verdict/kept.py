@@ -27,10 +27,12 @@ def kept_readings(usable: NDArray[np.bool_], seed: int = SEED) -> NDArray[np.boo
 
 @dataclass(frozen=True)
 class Kept:
-    """readings: so many. missed: their root mean square miss, over the mean reading. plain: that of
-    the smooth picture. explained: share of the smooth picture's squared miss that is gone, beyond
-    noise. noise: share of what is missed that noise alone makes. beyond: share of the readings
-    missed by more than five times the typical miss.
+    """How well a light field predicts held-out readings.
+
+    readings: their number. missed: root mean square residual, over the mean reading. plain: that of
+    the smooth picture. explained: share of the smooth picture's squared residual, less noise, that
+    the light field removes. noise: share of the squared residual that is noise. beyond: share of
+    the readings whose residual is more than five times the typical one.
     """
 
     readings: int

@@ -14,9 +14,9 @@ from reconstruction.verdict.shadow import Relief
 Array = NDArray[np.floating]
 BLIND_PX = 1.9
 SMOOTH = 0.5
-"""Of the neighbours' typical value: they must lie within so much for a pixel to be judged."""
+"""Largest spread of the neighbours with which a pixel is compared, over their typical value."""
 DIMMEST = 0.2
-"""Of the light expected without masks: pixels behind dark cells tell nothing of others."""
+"""Of the light expected without masks: pixels behind dark cells are not compared."""
 ENOUGH = 6
 """Neighbours, of eight, that must be usable."""
 SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
@@ -48,7 +48,7 @@ def judged_pixels(
 ) -> Pixels:
     """Return what is wrong with single pixels. excluded: what unusable pixels read."""
     step = 1 if psi.colour is None else 2
-    off, told = 0, 0
+    off, compared = 0, 0
     for shot in range(psi.shots):
         passed = 1 + found.masks[shot]
         detail = (1 + found.read[shot]) / np.maximum(passed, DIMMEST)
@@ -62,13 +62,13 @@ def judged_pixels(
         wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
         wild &= apart > LEAST * typical
         off += int((wild & smooth).sum())
-        told += int(smooth.sum())
+        compared += int(smooth.sum())
     seen = usable.any(axis=0)
     unseen = np.asarray(~seen, dtype=np.uint8)
     radius = cv2.distanceTransform(unseen, cv2.DIST_L2, 3)
     hole = np.unravel_index(int(radius.argmax()), radius.shape)
     return Pixels(
-        off / max(told, 1),
+        off / max(compared, 1),
         float(1 - usable.mean()),
         _saturated(excluded, found, usable),
         float((radius >= BLIND_PX).mean()),

@@ -16,13 +16,13 @@ LEVELS: tuple[Level, ...] = ("trust", "doubt", "do not use")
 
 @dataclass(frozen=True)
 class Limits:
-    """Of a figure: beyond the first a result is doubted, beyond the second not to be used."""
+    """Limits of a figure: above `doubt` the verdict is doubt, above `refuse` it is do not use."""
 
     doubt: float
     refuse: float
 
     def level(self, figure: float) -> Level:
-        """Return what a figure speaks for; larger is worse."""
+        """Return the verdict that a figure alone leads to; larger is worse."""
         return LEVELS[(figure > self.doubt) + (figure > self.refuse)]
 
     def times(self, factor: float) -> Limits:
@@ -32,46 +32,49 @@ class Limits:
 
 DISPLACED_PX = Limits(0.28, 0.6)
 STRENGTH_LOST = Limits(0.19, 0.35)
-"""Of the masks' shadow, as a share of what Psi says."""
+"""Contrast of the masks' shadow that is missing, as a share of what Psi predicts."""
 VIGNETTING = Limits(0.2, 0.5)
 FLICKER = Limits(0.05, 0.15)
 MOTION = Limits(0.075, 0.3)
-"""What motion between shots changes, over the mean reading."""
+"""Change of the readings by motion between shots, over the mean reading."""
 LEAST_MOTION_PX = 0.35
-"""Below it bright spots at rest pass for motion, as the masks of each shot show them otherwise."""
+"""Displacements below this are ignored: bright spots at rest look shifted, because the masks differ
+from shot to shot."""
 OFF = Limits(0.0215, 0.05)
-"""Fine soil and leaves leave up to 2 % of a clean frame's readings far off all around them."""
+"""Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
+it is up to 2 %."""
 BAD = Limits(0.02, 0.1)
-"""Of the pixels, found bad by screening: where there are so many, others were not found."""
+"""Share of pixels that screening calls bad: where it is large, screening overlooks others."""
 SATURATED = Limits(0.14, 0.35)
 BLIND = Limits(0.05, 0.25)
 NOISE_SHARE = Limits(0.5, 0.9)
 LEAST_NOISE = 0.13
-"""Of an even scene noise is all there is to miss, and does no harm."""
+"""Noise over the mean reading below which NOISE_SHARE is not applied: in a featureless scene the
+residual is noise alone, which does no harm."""
 NOISE = Limits(0.3, 0.8)
-"""Deviation of the readings over their mean."""
+"""Standard deviation of the readings over their mean."""
 UNEXPLAINED = Limits(0.75, 1.1)
-"""Beyond 1: the smooth picture alone foretells the readings better."""
+"""One minus the explained share; above 1 the smooth picture alone predicts the readings better."""
 UNDECIDED = Limits(0.75, 1.0)
 AT_END = Limits(0.01, 1.0)
 MISFIT = Limits(8.0, float("inf"))
-"""Times their noise that readings are missed by. Nearly without noise (0.0005), one clean
-shot of the fish is missed by 4 times it."""
+"""Residual of the readings over their noise. In one clean shot of the scene fish, almost without
+noise (0.0005), it is 4."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
-"""For methods to which one shot nearly does."""
+"""For methods that lose little with one shot."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 ANOTHERS = 0.5
 """Strength of another shot's masks above which, and of its own below which, shots are confused."""
 LEAST_STRENGTH = 0.25
-"""Displacements are told by first differences, which fade with the shadow: divided by its strength,
-but not by less than this."""
+"""Displacements are measured by first differences, which scale with the shadow's strength: they are
+divided by it, but not by less than this."""
 
 
 @dataclass(frozen=True)
 class Reason:
-    """what: in words. figure: behind it. remedy: what to do. level: what it alone speaks for."""
+    """what: in words. figure: behind it. remedy: what to do. level: the verdict by it alone."""
 
     what: str
     figure: float
@@ -107,7 +110,7 @@ class Verdict:
         }
 
 
-def judged(evidence: Evidence) -> Verdict:
+def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     found = [
         reason
@@ -183,12 +186,12 @@ def _shots(e: Evidence) -> Iterator[Reason]:
 
 def _strength(e: Evidence) -> tuple[float, float] | None:
     """Return the masks' weakest strength among the shots, and its deviation; None if untold."""
-    told = [
+    known = [
         (one, error)
         for one, error in zip(e.strengths, e.strength_errors, strict=True)
         if one is not None and error is not None
     ]
-    return min(told) if told else None
+    return min(known) if known else None
 
 
 def _masks_fit(e: Evidence) -> bool:
@@ -239,15 +242,15 @@ def _masks(e: Evidence) -> Iterator[Reason]:
 
 
 def _weakness(strength: float, likeliest: str, changes: Mapping[str, Sequence]) -> str:
-    told = f"the masks show at {strength:.0%} of the strength that Psi says"
+    words = f"the masks show at {strength:.0%} of the strength that Psi says"
     if strength < LEAST_STRENGTH:
-        return told + ", as if they were others"
+        return words + ", as if they were others"
     if not likeliest or changes[likeliest][0] <= 0:
-        return told
+        return words
     value = changes[likeliest][0]
     if likeliest == "distance":
-        return told + f", as if they stood {value:.0%} further from the sensor"
-    return told + f", as if their edges were blurred by {value**0.5:.1f} pixels more"
+        return words + f", as if they stood {value:.0%} further from the sensor"
+    return words + f", as if their edges were blurred by {value**0.5:.1f} pixels more"
 
 
 def _pixels(e: Evidence) -> Iterator[Reason]:
@@ -291,7 +294,7 @@ def _noise(e: Evidence) -> Iterator[Reason]:
         )
     elif e.noise_share is not None and e.noise > LEAST_NOISE:
         yield Reason(
-            f"noise makes {e.noise_share:.0%} of what readings kept from the fit are missed by",
+            f"noise is {e.noise_share:.0%} of the residual of the held-out readings",
             e.noise_share,
             light,
             NOISE_SHARE.level(e.noise_share),
@@ -299,17 +302,17 @@ def _noise(e: Evidence) -> Iterator[Reason]:
 
 
 def _search(e: Evidence) -> Iterator[Reason]:
-    """What methods that look for disparities say of them."""
+    """Reasons from the figures of methods that search disparities."""
     decided, at_end = e.parameters.get("decided"), e.parameters.get("at_end", 0.0)
     if decided is not None:
         yield Reason(
-            f"{1 - decided:.0%} of the textured patches prefer no disparity",
+            f"{1 - decided:.0%} of the textured patches fit all disparities alike",
             decided,
             "use a mask that differs from view to view, or more shots",
             UNDECIDED.level(1 - decided),
         )
     yield Reason(
-        f"{at_end:.0%} of the patches want disparities beyond the range searched",
+        f"{at_end:.0%} of the patches fit best at the end of the range of disparities searched",
         at_end,
         "raise furthest_px, or focus nearer to the scene",
         AT_END.level(at_end),
@@ -320,10 +323,10 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
     times = e.parameters.get("misfit", 0.0)
     row, column = (e.parameters.get(f"misfit_{axis}", 0.0) for axis in ("row", "column"))
     yield Reason(
-        f"readings are missed by {times:.1f} times their noise, most about row {row:.0f}, column "
-        f"{column:.0f}",
+        f"the residual of the readings is {times:.1f} times their noise, largest near row "
+        f"{row:.0f}, column {column:.0f}",
         times,
-        "take more shots, or see whether noise and Psi are right",
+        "take more shots, or check the noise model and Psi",
         MISFIT.level(times),
     )
 
@@ -331,8 +334,8 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
 def _fit(e: Evidence) -> Iterator[Reason]:
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
-            f"{max(e.explained, 0):.0%} of what readings kept from the fit show beyond a smooth "
-            "picture is explained",
+            f"the light field explains {max(e.explained, 0):.0%} of the detail that held-out "
+            "readings show beyond a smooth picture",
             e.explained,
             "take another method, or more shots",
             UNEXPLAINED.level(1 - e.explained),

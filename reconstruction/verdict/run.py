@@ -16,7 +16,7 @@ from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
 from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
-from reconstruction.verdict.rules import Verdict, judged
+from reconstruction.verdict.rules import Verdict, verdict_from
 
 Array = NDArray[np.floating]
 
@@ -37,7 +37,7 @@ def reconstruct_judged(
     """
     settings = settings or MethodSettings()
     typical, _ = checked_noise(psi, noise_sigma, usable)
-    read, told = _as_fitted(psi, frames, typical, usable, settings.screening)
+    read, notes = _as_fitted(psi, frames, typical, usable, settings.screening)
     result = reconstruct(
         name,
         psi,
@@ -48,8 +48,8 @@ def reconstruct_judged(
         read.usable & ~read.kept,
         on_step,
     )
-    result = dataclasses.replace(result, screening=told)
-    return result, judged(gathered(psi, read, typical, result))
+    result = dataclasses.replace(result, screening=notes)
+    return result, verdict_from(gathered(psi, read, typical, result))
 
 
 def verdict_of(
@@ -64,7 +64,7 @@ def verdict_of(
     """Return whether to trust what was found, in tiles say, without the readings `kept`."""
     read, _ = _as_fitted(psi, frames, noise_sigma, usable, screening)
     read = dataclasses.replace(read, kept=kept & read.usable)
-    return judged(gathered(psi, read, noise_sigma, result))
+    return verdict_from(gathered(psi, read, noise_sigma, result))
 
 
 def _as_fitted(
@@ -82,4 +82,4 @@ def _as_fitted(
     seen = screened(psi, fitted, usable)
     left_out = tuple(sorted((*seen.dark, *seen.double)))
     kept, bad = kept_readings(seen.usable), float(seen.bad.mean())
-    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad), seen.told
+    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad), seen.notes

@@ -1,9 +1,9 @@
-"""How strongly the masks' shadow stands in the readings, compared with what Psi says.
+"""How strongly the masks' shadow shows in the readings, compared with what Psi predicts.
 
-Around the smooth picture that explains the frames' local means, Psi says how the masks modulate
-the readings. Whatever the scene, its texture does not know the masks: so the regression of what
-the readings do around the smooth picture on what the masks should do has slope 1 where Psi is the
-camera's, less where the masks lie elsewhere or are blurred, and slope 0 where they are others.
+Psi predicts how the masks modulate the readings around the smooth picture that explains the frames'
+local means. The scene's texture is uncorrelated with the masks. So the regression of the measured
+modulation on the predicted one has slope 1 where Psi is the camera's, less where the masks are
+elsewhere or blurred, and 0 where they are other masks.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ Array = NDArray[np.floating]
 SMOOTH_PX = 4.0
 """Deviation of the window over which readings and masks are averaged."""
 LOCAL_PX = 2.0
-"""Deviation of the window over which the scene's texture is judged."""
+"""Deviation of the window over which the scene's texture is estimated."""
 DIMMEST = 0.05
-"""Share of the typical expected reading below which a pixel tells nothing."""
+"""Share of the typical expected reading below which a pixel is left out."""
 DIMMEST_CALM = 0.2
 """Brightness of calm places over the smooth picture's, by which readings are divided at least."""
 LEAST_RELIEF = 0.02
-"""Of the masks, over the readings, below which they tell nothing (a coded aperture has none)."""
+"""Modulation by the masks, over the readings, below which they are not tested (a coded aperture has
+none)."""
 TILE_PX = 24
 
 

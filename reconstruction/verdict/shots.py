@@ -17,9 +17,9 @@ from reconstruction.verdict.shadow import Relief, cross_strength, tiles
 
 Array = NDArray[np.floating]
 BLURS_PX = (0.8, 1.5, 4.0)
-"""Of the pictures that are compared: fine ones tell small motions, coarse ones large."""
+"""Blurs of the compared pictures: fine ones show small motions, coarse ones large."""
 OUTLIERS_PX = 3
-"""Side of the window whose median stands for a pixel when motion is told."""
+"""Side of the window whose median stands for a pixel when motion is measured."""
 SAME_VIEWPOINT = 0.1
 """View steps between the mean viewpoints of two shots beyond which parallax passes for motion."""
 
@@ -40,7 +40,7 @@ class Motion:
 @dataclass(frozen=True, eq=False)
 class Shots:
     """brightness: of every shot over their mean. masks: (read, said), how strongly each shot's
-    readings show each shot's masks. motion: None where it cannot be told.
+    readings show each shot's masks. motion: None where it cannot be measured.
     """
 
     brightness: NDArray[np.float64]

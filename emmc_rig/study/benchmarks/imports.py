@@ -1,4 +1,4 @@
-"""How long the program takes to start, beside what its libraries take."""
+"""Start-up times of the program and of its libraries."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Start:
 
 
 def start_timings(repeats: int) -> list[Start]:
-    """Return the median start of each of STARTS, measured in turn so that load meets all alike."""
+    """Return the median start of each of STARTS, measured in turn so that load affects all."""
     taken: dict[str, list[float]] = {name: [] for name in STARTS}
     for _ in range(repeats):
         for name, arguments in STARTS.items():

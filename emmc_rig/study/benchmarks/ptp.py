@@ -1,4 +1,4 @@
-"""Speed of the camera drivers on pictures in memory, as ratios to the library they rest on."""
+"""Speed of the camera drivers on pictures in memory, as ratios to rawpy alone."""
 
 from __future__ import annotations
 

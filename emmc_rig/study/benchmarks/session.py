@@ -1,4 +1,4 @@
-"""What capturing and keeping cost beside the devices: overhead, overlap, verifying, listing.
+"""Time of capturing and storing beside the devices: overhead, overlap, verifying, listing.
 
 Devices that take no time of their own stand in for real ones; the disk is the real one.
 """
@@ -125,7 +125,7 @@ def _overhead(
     session, plan = _begun(shots, disk, folder)
     steps = _Steps(device)
     Sequencer(session, plan, rig, steps).run()
-    told = overlap(run_entries(session.journal.entries)[-1])
+    overlapping = overlap(run_entries(session.journal.entries)[-1])
     program_s = steps.looped_s - steps.device_s - steps.handing_over_s
     return Overhead(
         shape[0] * shape[1] / 1e6,
@@ -133,7 +133,7 @@ def _overhead(
         move_s,
         1e3 * program_s / (shots - 1),
         1e3 * steps.handing_over_s / (shots - 1),
-        told.hidden_share,
+        overlapping.hidden_share,
     )
 
 
@@ -197,7 +197,7 @@ def _frame(shape: tuple[int, int], seed: int) -> RawFrame:
 
 
 def _plan(shots: int) -> Plan:
-    """Return a plan of so many shots, each at another place than the one before."""
+    """Return a plan of a number of shots, each at another place than the one before."""
     places = [{"mask_um": [24.0 * (i % PLACES), 0.0], "exposure_s": 0.01} for i in range(shots)]
     return Plan.model_validate(
         {
@@ -243,7 +243,7 @@ def verification(folder: Path, shots: int) -> Verification:
 
 
 def listing_seconds(folder: Path, shots: int) -> float:
-    """Return how long it takes to open a session of so many shots and to say what it holds."""
+    """Return the seconds to open and summarise a session of a number of shots."""
     with _scratch(folder) as scratch:
         session = _begun(shots, SYSTEM_DISK, scratch / "session")[0]
         facts = {

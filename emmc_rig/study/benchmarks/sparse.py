@@ -1,4 +1,4 @@
-"""Sparse solvers timed patch by patch: against what the machine can do, and against scikit-learn.
+"""Sparse solvers timed patch by patch, against the machine's bound and against scikit-learn.
 
 All run on the same sensed dictionaries in the same run, one core each. The bound of a solver is
 its operations, counted from the passes it took, at the rate at which a core multiplies and adds

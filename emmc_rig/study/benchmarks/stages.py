@@ -1,4 +1,4 @@
-"""What a stage command costs the host: on a wire in memory, which itself takes no time."""
+"""Host time of a stage command, over a wire in memory that takes no time of its own."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ STEPPED = Plan(
 
 @dataclass(frozen=True)
 class TriggerTiming:
-    """Mean time for each frame, in ms: the program waits and asks, or the stage tells the camera.
+    """Mean time for each frame, in ms: the program polls, or the stage triggers the camera.
 
     vibration_ms: waited after every arrival, by the program or by the camera's trigger delay.
     """

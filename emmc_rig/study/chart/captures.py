@@ -18,6 +18,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.sweep import digest_of
 from simulators.scenes import SCENES
@@ -72,19 +73,6 @@ class Capture:
         return scene.light_field, scene.disparity_px
 
 
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """What a method gets, (shot, pixel_y, pixel_x) each, and what it should find.
-
-    disparity_px: (y, x), None where it is not known.
-    """
-
-    psi: ImagingMatrix
-    readings: NDArray[np.float32]
-    usable: NDArray[np.bool_]
-    noise_sigma: float
-
-
 def kept_capture(capture: Capture, seed: int, folder: Path) -> tuple[Path, str]:
     """Return the file of a capture's frames and truth, made where missing, and its digest.
 
@@ -123,14 +111,14 @@ def _write(
             file["disparity_px"] = disparity_px
 
 
-def read_frames(path: Path) -> Frames:
-    """Read what a method gets."""
+def read_frames(path: Path) -> tuple[ImagingMatrix, Frames]:
+    """Read what a method gets: Psi and the frames, all their readings of one typical deviation."""
     psi = ImagingMatrix.load(path.with_suffix(".psi"))
     with h5py.File(path, "r") as file:
         readings, usable, sigma = (
             np.asarray(file[name]) for name in ("readings", "usable", "noise_sigma")
         )
-    return Frames(psi, readings, usable.astype(bool), float(sigma))
+    return psi, Frames(readings, np.full(readings.shape, sigma), usable.astype(bool))
 
 
 def read_truth(path: Path) -> tuple[Array, Array | None]:

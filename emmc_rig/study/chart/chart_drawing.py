@@ -69,7 +69,7 @@ def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
 
 
 def _name(axes: Axes, front: Sequence[Mark], colours: Mapping[str, str]) -> None:
-    """Write the names of the front above and left of it, where nothing is, clear of each other."""
+    """Write the names of the front's marks above and left of it, without overlaps."""
     assert axes.figure is not None
     placed: list[tuple[float, float, float]] = []
     for mark in front:

@@ -76,7 +76,7 @@ class ChartSweep(Sweep[Point]):
         return "failed" in result or self.picture(point).is_file()
 
     def group(self, point: Point) -> Hashable:
-        """Return what one process measures: a configuration, on so many cores."""
+        """Return what one process measures: a configuration on a number of cores."""
         return point.configuration, point.cores
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:

@@ -26,7 +26,6 @@ from emmc_rig.study.sweep import (
     csv_text,
     machine,
     provenance,
-    recorded,
     sweep_folder,
 )
 
@@ -128,7 +127,7 @@ def _write(sweep: ChartSweep, results: dict[Point, dict], outcome: ChartOutcome,
         "fronts": fronts,
         "growth": [asdict(growth) for growth in outcome.growths],
         "left_out": outcome.left_out,
-        **recorded(settings),
+        "settings": settings.model_dump(mode="json"),
     }
     write_metrics(new, metrics)
 

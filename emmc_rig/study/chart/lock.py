@@ -1,4 +1,4 @@
-"""One timed run at a time on this machine: a lock file that names who holds it.
+"""A lock for timed runs, one at a time on this machine; its file names the process that holds it.
 
 The lock is the kernel's (flock), so that it ends with the processes that hold it, however they end.
 """
@@ -35,15 +35,15 @@ def timing_lock(
     path = path or lock_path()
     descriptor = _opened(path)
     try:
-        told = False
+        announced = False
         while True:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                if on_wait is not None and not told:
+                if on_wait is not None and not announced:
                     on_wait(holder(path))
-                told = True
+                announced = True
                 sleep(0.2)
         _write(descriptor, f"process {os.getpid()}, {purpose}")
         yield descriptor

@@ -25,10 +25,12 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
-from emmc_rig.study.chart.captures import Frames, read_frames, read_truth
-from emmc_rig.study.chart.peers import PEERS, Given
+from emmc_rig.study.chart.captures import read_frames, read_truth
+from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.reference import reference
 from emmc_rig.study.chart.scores import scored
 from reconstruction.dictionary import Dictionary
@@ -47,13 +49,13 @@ def measured(job: dict) -> dict:
     memory of the process before the timed runs, with Psi and frames; peak_mib: at most during them.
     dictionary_s: of the one that this process has made.
     """
-    frames = read_frames(Path(job["capture"]))
+    psi, frames = read_frames(Path(job["capture"]))
     settings = MethodSettings.model_validate(job["settings"])
-    psi, dictionary, dictionary_s = frames.psi, None, 0.0
+    dictionary, dictionary_s = None, 0.0
     if job["needs_dictionary"]:
         views = psi.light_field_shape[:2]
         dictionary, dictionary_s = _dictionary(job["dictionary"], views, psi.binning)
-    _solved(job["method"], _window(frames), dictionary, settings)
+    _solved(job["method"], *_window(psi, frames), dictionary, settings)
     load, before = os.getloadavg()[0], reference()
     forget_peak()
     base_mib = peak_memory_mib()
@@ -62,7 +64,7 @@ def measured(job: dict) -> dict:
     while len(wall) < job["repeats"] and (not wall or sum(wall) < job["enough_s"]):
         result = None
         cpu_started, started = time.process_time(), time.perf_counter()
-        result = _solved(job["method"], frames, dictionary, settings)
+        result = _solved(job["method"], psi, frames, dictionary, settings)
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
     assert result is not None
@@ -109,28 +111,27 @@ def _dictionary(name: str | None, views: tuple[int, int], binning: int) -> tuple
 
 
 def _solved(
-    method: str, frames: Frames, dictionary: Dictionary | None, settings: MethodSettings
+    method: str,
+    psi: ImagingMatrix,
+    frames: Frames,
+    dictionary: Dictionary | None,
+    settings: MethodSettings,
 ) -> Reconstruction:
-    given = Given(frames.psi, frames.readings, frames.usable, frames.noise_sigma)
     if method in PEERS:
-        return PEERS[method].solve(given, dictionary)
+        return PEERS[method].solve(psi, frames, dictionary)
     return reconstruct(
-        method, given.psi, given.readings, given.noise_sigma, dictionary, settings, given.usable
+        method, psi, frames.readings, frames.noise_sigma, dictionary, settings, frames.usable
     )
 
 
-def _window(frames: Frames) -> Frames:
+def _window(psi: ImagingMatrix, frames: Frames) -> tuple[ImagingMatrix, Frames]:
     """Return a corner that is large enough for patches and small enough to take no time."""
-    k = frames.psi.binning
+    k = psi.binning
     side = WARM_UP_PX // k * k
-    rows, columns = (slice(0, min(side, length)) for length in frames.psi.size)
+    rows, columns = (slice(0, min(side, length)) for length in psi.size)
     seen = np.s_[:, : rows.stop // k, : columns.stop // k]
-    return Frames(
-        frames.psi.window(rows, columns),
-        np.ascontiguousarray(frames.readings[seen]),
-        np.ascontiguousarray(frames.usable[seen]),
-        frames.noise_sigma,
-    )
+    cut = Frames(frames.readings[seen].copy(), frames.deviation[seen], frames.usable[seen].copy())
+    return psi.window(rows, columns), cut
 
 
 def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:

@@ -1,4 +1,4 @@
-"""Other libraries on the same Psi and frames (extra `peers`): rivals in the same chart."""
+"""Methods of other libraries on the same Psi and frames (extra `peers`), for comparison."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.benchmarks.variational import PeerProblem, peer_module
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
@@ -30,22 +31,12 @@ STEPS, ATOMS, STRIDE = 100, 20, 5
 
 
 @dataclass(frozen=True)
-class Given:
-    """What every method gets; frames and usable are (shot, pixel_y, pixel_x)."""
-
-    psi: ImagingMatrix
-    readings: NDArray[np.float32]
-    usable: NDArray[np.bool_]
-    noise_sigma: float
-
-
-@dataclass(frozen=True)
 class Peer:
     """Another library's method. modules: what must be installed."""
 
     title: str
     modules: tuple[str, ...]
-    solve: Callable[[Given, Dictionary | None], Reconstruction]
+    solve: Callable[[ImagingMatrix, Frames, Dictionary | None], Reconstruction]
     needs_dictionary: bool = False
 
     def check(self) -> None:
@@ -54,24 +45,28 @@ class Peer:
             peer_module(module)
 
 
-def _without_unusable(given: Given) -> tuple[ImagingMatrix, NDArray[np.float32]]:
-    """Return Psi and frames with zeros where a pixel is not usable, which leaves it out exactly."""
-    k, psi = given.psi.binning, given.psi
-    kept = given.usable.repeat(k, axis=1).repeat(k, axis=2)[:, None, None, :, None, :]
+def _without_unusable(
+    psi: ImagingMatrix, frames: Frames
+) -> tuple[ImagingMatrix, NDArray[np.float32]]:
+    """Return Psi and readings with zeros where a pixel is not usable, which leaves it out."""
+    k = psi.binning
+    kept = frames.usable.repeat(k, axis=1).repeat(k, axis=2)[:, None, None, :, None, :]
     weights = np.ascontiguousarray(psi.weights * kept.astype(psi.weights.dtype))
-    return replace(psi, weights=weights), np.where(given.usable, given.readings, 0)
+    return replace(psi, weights=weights), np.where(frames.usable, frames.readings, 0)
 
 
-def pyproximal_tv(given: Given, _: Dictionary | None = None) -> Reconstruction:
+def pyproximal_tv(
+    psi: ImagingMatrix, frames: Frames, _: Dictionary | None = None
+) -> Reconstruction:
     """Return the light field after 100 steps of pyproximal's primal-dual total variation.
 
     It takes our weight mu, first picture, steps' sizes and exact data step, but neither opponent
     colours nor over-relaxation: DV_1 as in the paper.
     """
     started = time.perf_counter()
-    psi, readings = _without_unusable(given)
-    guess = smooth_guess(given.psi, given.readings, given.usable)
-    mu = choose_mu(given.psi, given.readings[given.usable], given.noise_sigma)
+    guess = smooth_guess(psi, frames.readings, frames.usable)
+    mu = choose_mu(psi, frames.readings[frames.usable], frames.noise_sigma)
+    psi, readings = _without_unusable(psi, frames)
     primal_step = choose_primal_step(contrast(guess), mu, 1.0)
     views = psi.light_field_shape[:2]
     dual_step = 1 / (norm_squared(1, (*views, None, None)) * primal_step)
@@ -81,7 +76,9 @@ def pyproximal_tv(given: Given, _: Dictionary | None = None) -> Reconstruction:
     return _result("pyproximal-tv", found, STEPS, started)
 
 
-def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
+def sklearn_omp(
+    psi: ImagingMatrix, frames: Frames, dictionary: Dictionary | None
+) -> Reconstruction:
     """Return the light field from patches coded by scikit-learn's OMP in our dictionary.
 
     Patches, sensed dictionaries and averaging are ours. It takes 20 atoms a patch, always, as it
@@ -91,7 +88,7 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
         raise ReconstructionError("sklearn-omp needs a dictionary")
     pursuit = peer_module("sklearn.linear_model").orthogonal_mp
     started = time.perf_counter()
-    psi, shape = given.psi, dictionary.patch_shape[2:4]
+    shape = dictionary.patch_shape[2:4]
     stride = max(STRIDE // psi.binning, 1) * psi.binning
     grid = regular_grid(psi.size, shape, stride, psi.binning)
     pixel = pixel_of_sample(shape, psi.binning)
@@ -106,7 +103,7 @@ def sklearn_omp(given: Given, dictionary: Dictionary | None) -> Reconstruction:
         warnings.simplefilter("ignore")
         for corner in grid.corners:
             corners = corner[None]
-            sensing = sense_patches(psi, given.readings, given.usable, corners, shape)
+            sensing = sense_patches(psi, frames.readings, frames.usable, corners, shape)
             sensed = np.zeros((1, dictionary.size, sensing.data.shape[1]), dtype=np.float32)
             for shot in range(psi.shots):
                 colours = None if sensing.colours is None else sensing.colours[0, shot]

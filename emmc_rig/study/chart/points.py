@@ -1,4 +1,4 @@
-"""What a chart measures: captures, methods with their settings, and the problem's size varied.
+"""The points of a chart: captures, methods with their settings, and sizes of the problem.
 
 Nothing is computed here. The methods are those of `reconstruction.methods.METHODS`, whatever they
 are; VARIATIONS adds settings for those it knows.
@@ -57,7 +57,7 @@ BESIDE_FRONT = ("best", "fast", "5 atoms, stride 9", "40 atoms", "stride 3")
 
 @dataclass(frozen=True)
 class Configuration:
-    """A method with settings; `level` tells those of one method apart."""
+    """A method with settings; `level` names one of a method's settings."""
 
     method: str
     level: str = DEFAULT
@@ -125,7 +125,7 @@ def chart_settings(
     repeats: int | None,
     **others: object,
 ) -> ChartSettings:
-    """Return the settings of a chart; what is not given is that of --fast or of the full one."""
+    """Return the settings of a chart; defaults are those of --fast or of the full chart."""
     given = {"size": size, "repeats": repeats}
     chosen = {
         "fast": fast,

@@ -1,4 +1,4 @@
-"""A yardstick for the machine: what a fixed, small reconstruction takes on it.
+"""A reference for the machine's speed: the time of a fixed, small reconstruction.
 
 A method's seconds of computing over the yardstick's carry a chart from one machine to another, and
 from a busy hour to a quiet one, as far as all slow down alike.

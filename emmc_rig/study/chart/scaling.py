@@ -1,4 +1,4 @@
-"""How time and memory grow with the size of the problem: the exponents found and expected."""
+"""How time and memory grow with the size of the problem: the exponents measured and expected."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Growth:
 
     Seconds are those of all cores together, the work, as this is what methods count; against cores
     by the clock. Memory is that of the whole process; its exponent is fitted to what the runs
-    added to what was there before, where that is enough to be told from noise.
+    added to what was there before, where that exceeds NOISE_MIB.
     exponent: of seconds ~ at^exponent, by least squares of logarithms; expected_exponent: of the
-    operations or bytes that the method counts, between the ends; None where nobody counted them.
+    operations or bytes that the method counts, between the ends; None where they are not counted.
     """
 
     axis: str
@@ -73,8 +73,8 @@ def fitted_exponent(at: Sequence[float], values: Sequence[float]) -> float:
 
 def _memory_exponent(at: Sequence[float], rows: Sequence[dict]) -> float | None:
     added = [(x, row["peak_mib"] - row["base_mib"]) for x, row in zip(at, rows, strict=True)]
-    told = [(x, mib) for x, mib in added if mib > NOISE_MIB]
-    return fitted_exponent(*zip(*told, strict=True)) if len(told) > 1 else None
+    clear = [(x, mib) for x, mib in added if mib > NOISE_MIB]
+    return fitted_exponent(*zip(*clear, strict=True)) if len(clear) > 1 else None
 
 
 def expected_exponent(scaling: Scaling, at: Sequence[float], rows: Sequence[dict]) -> float | None:

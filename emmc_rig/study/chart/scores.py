@@ -1,4 +1,4 @@
-"""How right an estimate's views are, the differences between them, and the depth they show."""
+"""Scores of an estimate: PSNR and SSIM of its views, parallax between views, and disparity."""
 
 from __future__ import annotations
 

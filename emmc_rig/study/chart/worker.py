@@ -1,6 +1,6 @@
 """A process that measures the points of one configuration, one after another.
 
-Starting one costs more than most points. Where the peak of memory cannot be told for each point,
+Starting one costs more than most points. Where the peak of memory is not known for each point,
 and after a point that its process did not outlive, the next gets a new one.
 """
 
@@ -26,8 +26,8 @@ MODULE = "emmc_rig.study.chart.measure"
 @contextmanager
 def working(environment: Mapping[str, str], limit_s: float, lock: int) -> Iterator[Worker]:
     """Yield a worker, which ends with the block."""
-    with TemporaryFile("w+") as told:
-        worker = Worker(environment, limit_s, lock, told, forget_peak())
+    with TemporaryFile("w+") as errors:
+        worker = Worker(environment, limit_s, lock, errors, forget_peak())
         try:
             yield worker
         finally:
@@ -39,14 +39,14 @@ class Worker:
     """Measures jobs.
 
     environment: added to this process's. limit_s: after which a job is given up. lock: a
-    descriptor that the process holds as well, should this one be killed. told: gets its messages.
+    descriptor that the process holds as well, should this one be killed. errors: gets its messages.
     lasting: whether it measures more than one.
     """
 
     environment: Mapping[str, str]
     limit_s: float
     lock: int
-    told: IO[str]
+    errors: IO[str]
     lasting: bool
     _process: subprocess.Popen[str] | None = None
 
@@ -84,8 +84,8 @@ class Worker:
             return {"failed": f"not done after {self.limit_s:.0f} s"}
         if code < 0:
             return {"failed": f"killed by signal {-code}: memory?", "keep": False}
-        self.told.seek(0)
-        lines = self.told.read().strip().splitlines() or ["no message"]
+        self.errors.seek(0)
+        lines = self.errors.read().strip().splitlines() or ["no message"]
         raise AppError(f"{job['method']}: the measuring process failed: {lines[-1]}")
 
     def _started(self) -> subprocess.Popen[str]:
@@ -94,7 +94,7 @@ class Worker:
             [sys.executable, "-m", MODULE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self.told,
+            stderr=self.errors,
             text=True,
             env={**os.environ, **self.environment},
             pass_fds=(self.lock,),

@@ -1,4 +1,4 @@
-"""Psi, sensor and stage on the simulated bench that is wrong in ways nobody is told of."""
+"""Psi, sensor and stage on the simulated bench, whose faults are unknown to the calibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.calibrate.simulated import measured_stage, run_calibration
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.progress import Silent
-from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, judged
+from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 
 Array = NDArray[np.floating]
 FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
@@ -41,19 +41,19 @@ def check_psi(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     distance = (1 + at.distance_share) / (1 + truth["distance_share"]) - 1
     turn = abs(np.degrees(at.rotation_rad - truth["rotation_rad"]))
     rows = [
-        judged("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
-        judged(
+        target_row("Psi, parametric (dust not modelled)", errors["parametric"], None, ".3%"),
+        target_row(
             f"Psi, mixed (states {stated['mixed']:.2%})",
             errors["mixed"],
             2 * stated["mixed"],
             ".3%",
         ),
-        judged("Psi, free", errors["free"], 0.02, ".3%"),
-        judged("Psi, combined", errors["combined"], 0.005, ".3%"),
-        judged("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
-        judged("distance d", abs(float(distance)), 0.005, ".4%"),
-        judged("shift, px", float(shift_px) / pitch_um, 0.02, ".5f"),
-        judged("rotation, degrees", float(turn), 0.005, ".6f"),
+        target_row("Psi, free", errors["free"], 0.02, ".3%"),
+        target_row("Psi, combined", errors["combined"], 0.005, ".3%"),
+        target_row("Psi, as designed", metrics["design_relative_error"], None, ".0%"),
+        target_row("distance d", abs(float(distance)), 0.005, ".4%"),
+        target_row("shift, px", float(shift_px) / pitch_um, 0.02, ".5f"),
+        target_row("rotation, degrees", float(turn), 0.005, ".6f"),
     ]
     return rows, metrics
 
@@ -68,8 +68,8 @@ def check_few(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     error, stated = (metrics[f"psi_{key}_error"][chosen] for key in ("relative", "stated"))
     once, twice = metrics["psi_coverage"][chosen]
     rows = [
-        judged("few: whiteboards", boards, 12, ".0f"),
-        judged(f"few: true error of Psi ({chosen}, states {stated:.2%})", error, 0.005, ".2%"),
+        target_row("few: whiteboards", boards, 12, ".0f"),
+        target_row(f"few: true error of Psi ({chosen}, states {stated:.2%})", error, 0.005, ".2%"),
         covered("few: within one deviation", once, COVERED),
         covered("few: within two", twice, COVERED_TWICE),
     ]
@@ -77,7 +77,7 @@ def check_few(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
 
 def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
-    """EMVA 1288 figures of the simulated sensor against what it was made with."""
+    """EMVA 1288 figures of the simulated sensor against its true parameters."""
     noise, flaws = settings.camera.sensor.noise, settings.truth.sensor
     size, rng = settings.size, np.random.default_rng(settings.seed)
     well = flaws.full_well_electrons or noise.white_level_dn / noise.gain_dn_per_electron
@@ -95,9 +95,7 @@ def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
     sheet = characterise(
         pairs(0.0, np.array([0.01, 1.0, 4.0])),
-        pairs(
-            1.0, brightest_s * np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1])
-        ),
+        pairs(1.0, brightest_s * np.array(FLAT_SHARES)),
         noise.white_level_dn,
     )
     known = {
@@ -139,7 +137,7 @@ def check_stage(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     off_um = float(np.hypot(place.x_um - real[0], place.y_um - real[1]))
     pitch_um = camera.sensor.sample_pitch_um
     rows = [
-        judged("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
+        target_row("a mask located, px off", off_um / pitch_um, 0.02, ".5f"),
         Row("scale of the stage", f"{found.scale[0]:.5f}", f"{faults.scale:.5f}"),
         Row(
             "rotation of the stage, degrees",

@@ -8,7 +8,7 @@ from dataclasses import replace
 from emmc_rig.calibrate.bench import BenchTruth
 from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.calibrate.simulated import run_calibration
-from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, judged
+from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 from simulators.effects import EFFECTS, ORDINARY, TOGETHER, flawed
 
 TRUE_ERROR = 0.01
@@ -28,7 +28,7 @@ def check_effect(settings: CalibrateSettings, name: str) -> tuple[list[Row], dic
     true, stated = (metrics[key][chosen] for key in ("psi_relative_error", "psi_stated_error"))
     once, twice = metrics["psi_coverage"][chosen]
     rows = [
-        judged(f"{name}: true error of Psi ({chosen}, states {stated:.2%})", true, TRUE_ERROR,
+        target_row(f"{name}: true error of Psi ({chosen}, states {stated:.2%})", true, TRUE_ERROR,
                ".2%"),
         covered(f"{name}: within one deviation", once, COVERED),
         covered(f"{name}: within two", twice, COVERED_TWICE),

@@ -20,7 +20,7 @@ from emmc_rig.calibrate.board_plan import soft_design
 from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import psi_layout
-from emmc_rig.study.checks.rows import Row, judged
+from emmc_rig.study.checks.rows import Row, target_row
 
 Array = NDArray[np.floating]
 LARGE = (4000, 6000)
@@ -100,13 +100,13 @@ def check_large(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     free_s = (time.perf_counter() - started - frames.seconds) / 2
     memory_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     at = fit.placement
+    turn = abs(np.degrees(at.rotation_rad - 0.0005))
     rows = [
-        judged("24 MP: parametric fit, s", fit_s, 120.0, ".1f"),
+        target_row("24 MP: parametric fit, s", fit_s, 120.0, ".1f"),
         Row("24 MP: one plane of Psi, s (25 of them)", f"{plane_s:.1f}"),
         Row("24 MP: free route, s a view beyond getting its frame", f"{free_s:.1f}"),
-        judged("24 MP: peak memory, GiB, five whiteboards held", memory_gib, 4.0, ".2f"),
-        judged("24 MP: distance d", abs(at.distance_share - 0.03) / 1.03, 0.005, ".4%"),
-        judged("24 MP: rotation, degrees", abs(float(np.degrees(at.rotation_rad - 0.0005))), 0.005,
-             ".6f"),
-    ]  # fmt: skip
+        target_row("24 MP: peak memory, GiB, five whiteboards held", memory_gib, 4.0, ".2f"),
+        target_row("24 MP: distance d", abs(at.distance_share - 0.03) / 1.03, 0.005, ".4%"),
+        target_row("24 MP: rotation, degrees", float(turn), 0.005, ".6f"),
+    ]
     return rows, {"fit_seconds": fit_s, "plane_seconds": plane_s, "peak_gib": memory_gib}

@@ -1,4 +1,4 @@
-"""The rows of a check: what was measured, what was asked, and whether it is met."""
+"""The rows of a check: figures measured, their targets, and whether they are met."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COVERED, COVERED_TWICE, MARGIN = 0.683, 0.954, 0.03
 
 @dataclass(frozen=True)
 class Row:
-    """One target: what, measured, asked, and whether it is met ("" where nothing was asked)."""
+    """One figure, its target, and whether it is met ("" where there is no target)."""
 
     what: str
     measured: str
@@ -21,8 +21,8 @@ class Row:
     verdict: str = ""
 
 
-def judged(what: str, value: float, limit: float | None, form: str, above: bool = False) -> Row:
-    """Return the row of a figure that is to be at most, or at least, a limit (None: nothing)."""
+def target_row(what: str, value: float, limit: float | None, form: str, above: bool = False) -> Row:
+    """Return the row of a figure with an upper, or lower, limit as its target (None: no target)."""
     if limit is None:
         return Row(what, format(value, form))
     met = value >= limit if above else value <= limit

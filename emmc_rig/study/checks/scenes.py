@@ -1,4 +1,4 @@
-"""What calibration means to reconstructions: its cost, its frames, drifts and false alarms.
+"""Effect of the calibration on reconstructions: cost in dB, frames, drifts and false alarms.
 
 Scenes are captured ray by ray through the same bench as the whiteboards.
 """
@@ -35,7 +35,7 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.checks.rows import Row, judged
+from emmc_rig.study.checks.rows import Row, target_row
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -129,10 +129,10 @@ def check_cost(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         detail[Path(spec).name] = {"exact_psnr_db": with_exact, **costs}
         name = Path(spec).name
         rows.append(
-            judged(f"{name}: cost of the parametric Psi, dB", costs["parametric"], 0.3, ".3f")
+            target_row(f"{name}: cost of the parametric Psi, dB", costs["parametric"], 0.3, ".3f")
         )
-        rows.append(judged(f"{name}: cost of the mixed Psi, dB", costs["mixed"], 0.3, ".3f"))
-        rows.append(judged(f"{name}: cost of the design, dB", costs["design"], None, ".2f"))
+        rows.append(target_row(f"{name}: cost of the mixed Psi, dB", costs["mixed"], 0.3, ".3f"))
+        rows.append(target_row(f"{name}: cost of the design, dB", costs["design"], None, ".2f"))
     return rows, detail
 
 
@@ -174,10 +174,12 @@ def check_frames(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         if db > reached - SAME_DB:
             whiteboards = len(free_boards.frames) / boards
             rows.append(
-                judged("whiteboards, free over parametric", whiteboards, 5.0, ".1f", above=True)
+                target_row("whiteboards, free over parametric", whiteboards, 5.0, ".1f", above=True)
             )
             every = free_boards.exposures / few.exposures
-            rows.append(judged("all frames, free over parametric", every, 5.0, ".1f", above=True))
+            rows.append(
+                target_row("all frames, free over parametric", every, 5.0, ".1f", above=True)
+            )
             break
     else:
         rows.append(Row("the parametric routes do not reach it", "-", "at least 5.0", "missed"))
@@ -196,7 +198,7 @@ def _drift_of(
     usable = calibration.usable(captured.frames_dn, white)
     variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
     if design.colour is None:
-        raise AppError("a drift is sought on sensors with a colour filter")
+        raise AppError("a drift is estimated on sensors with a colour filter only")
     return find_drift(
         readings,
         variance,
@@ -268,14 +270,14 @@ def check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
                     f"{what}, {name}: ideal / mismatched / oracle / blind",
                     " / ".join(f"{value:.2f}" for value in db.values())
                     + f" dB; left {left_px:.3f} px; "
-                    + ("told" if found.drifted else "not told"),
+                    + ("drift detected" if found.drifted else "no drift detected"),
                 )
             )
         if lost > 0.05:
             share = gained / lost
-            rows.append(judged(f"{what}: lost dB recovered", share, 0.85, ".0%", above=True))
+            rows.append(target_row(f"{what}: lost dB recovered", share, 0.85, ".0%", above=True))
         else:
-            rows.append(Row(f"{what}: next to nothing is lost", f"{lost:.3f} dB in all"))
+            rows.append(Row(f"{what}: loss below 0.05 dB", f"{lost:.3f} dB in all"))
     return rows, detail
 
 
@@ -295,7 +297,7 @@ def check_alarms(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     alarms = sum(one[1] for one in found)
     largest = max(one[2] for one in found)
     rows = [
-        judged("false alarms on a Psi that fits", alarms / len(found), 0.01, ".1%"),
+        target_row("false alarms on a Psi that fits", alarms / len(found), 0.01, ".1%"),
         Row("largest displacement found there, px", f"{largest:.3f} in {len(found)} captures"),
     ]
     return rows, {"captures": found}

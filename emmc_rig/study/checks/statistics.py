@@ -38,7 +38,7 @@ from emmc_rig.calibrate.board_plan import (
 )
 from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
-from emmc_rig.study.checks.rows import Row, judged
+from emmc_rig.study.checks.rows import Row, target_row
 
 Array = NDArray[np.floating]
 FITS, PSI_FITS = 16, 4
@@ -132,21 +132,21 @@ def check_bound(settings: CalibrateSettings) -> tuple[list[Row], dict]:
             reached.append(psi.relative_difference(exact))
             expected.append(expected_psi_error(Shadow(mask, truth), fit.bound))
     ratios = np.sqrt(np.mean(np.square(errors) / bounds, axis=0))
-    told = f"{np.mean(expected):.3%}, {np.sqrt(np.mean(np.square(reached))):.3%}"
+    errors_words = f"{np.mean(expected):.3%}, {np.sqrt(np.mean(np.square(reached))):.3%}"
     rows = [
-        judged(
+        target_row(
             "deviation of the parameters / Cramer-Rao bound (root mean square)",
             float(np.sqrt(np.mean(ratios**2))),
             1.5,
             ".2f",
         ),
-        judged(
+        target_row(
             f"... the worst of {len(ratios)}, each known to {1 / np.sqrt(2 * FITS):.0%}",
             float(ratios.max()),
             None,
             ".2f",
         ),
-        Row("Psi's error by formula, and as drawn", told),
+        Row("Psi's error by formula, and as drawn", errors_words),
     ]
     detail = {
         "ratios": dict(zip(labels(camera.views), ratios.tolist(), strict=True)),

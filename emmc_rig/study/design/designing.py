@@ -36,7 +36,7 @@ from emmc_rig.study.design.mask_file import (
     write_picture,
 )
 from emmc_rig.study.design.search import Search, search
-from emmc_rig.study.sweep import check_scene_names, open_folder, provenance, recorded
+from emmc_rig.study.sweep import check_scene_names, open_folder, provenance
 
 JOURNAL, PAGE, CAMERA = "simulations.jsonl", "report.html", "camera.yaml"
 COMMAND, CHECK_COMMAND = "design", "design --check"
@@ -132,7 +132,7 @@ def _metrics(
         "manufacturing_db": {one.candidate.label: dict(one.psnr_db) for one in found.held},
         "tried": [{**asdict(one), **asdict(what)} for one, what in found.tried],
         "simulated": [asdict(one) for one in compared],
-        **recorded(bench),
+        "settings": bench.model_dump(mode="json"),
     }
 
 
@@ -172,5 +172,12 @@ def run_check(
         page = check_page(about, found, words, picture, origin)
         (new / PAGE).write_text(page, encoding="utf-8")
         rows = [asdict(one) for one in found]
-        write_metrics(new, {"rank_correlations": ranks, "simulated": rows, **recorded(bench)})
+        write_metrics(
+            new,
+            {
+                "rank_correlations": ranks,
+                "simulated": rows,
+                "settings": bench.model_dump(mode="json"),
+            },
+        )
     return Checked(tuple(found), ranks, folder / PAGE)

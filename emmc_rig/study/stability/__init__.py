@@ -1,1 +1,1 @@
-"""Where methods fail: faults of every strength, each method's curve, its breaking points."""
+"""Where methods fail: sweeps of faults by strength, each method's curve and breaking points."""

@@ -1,4 +1,4 @@
-"""What stands beside the sweeps: theory, numerical stability and the mismatch protocol.
+"""Studies beside the sweeps: theory, numerical stability and the mismatch protocol.
 
 Each part is measured into the sweeps' folder, with their scenes, camera and crop, and becomes
 sections of the page, a chart, a CSV file and figures for metrics.json.
@@ -15,7 +15,7 @@ from emmc_rig.files.folders import result_folder
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.breaking import below_best, told
+from emmc_rig.study.stability.breaking import below_best, span_words
 from emmc_rig.study.stability.checks import BROKEN, WEAK
 from emmc_rig.study.stability.fault_points import StabilitySettings
 from emmc_rig.study.stability.fault_sweep import StabilitySweep
@@ -28,8 +28,8 @@ from emmc_rig.study.stability.theory_section import (
     BOUND,
     ORACLE,
     Compared,
+    agreement,
     compared,
-    judged,
     oracle_offset,
     rank_correlation,
     theory_sections,
@@ -42,11 +42,11 @@ NOT_PREDICTED = ("sooner", "later", "only", "not measured")
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """sections: of the page. metrics: by part. told: a line each for the terminal."""
+    """sections: of the page. metrics: by part. lines: for the terminal."""
 
     sections: list[Section]
     metrics: dict[str, object]
-    told: list[str]
+    lines: list[str]
 
 
 def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
@@ -73,7 +73,7 @@ def _theory_break(one: Compared, method: str) -> dict:
     """Return where bound, oracle and a method break, and whether the bound predicts the method."""
 
     def break_of(key: str) -> str:
-        return told(below_best(one.levels[key], one.fault.whole), one.strengths)
+        return span_words(below_best(one.levels[key], one.fault.whole), one.strengths)
 
     measured = f"{method}_db"
     return {
@@ -83,7 +83,7 @@ def _theory_break(one: Compared, method: str) -> dict:
         "bound": break_of(BOUND),
         "oracle": break_of(ORACLE),
         "measured": break_of(measured),
-        "judged": judged(one, method),
+        "judged": agreement(one, method),
         "rank_correlation": rank_correlation(one.levels[BOUND], one.levels[measured]),
     }
 
@@ -109,9 +109,9 @@ def _mismatch(settings: StabilitySettings, folder: Path, new: Path, watcher: Wat
     ]
     write_text(new / "mismatch.csv", csv_text(rows))
     share = recovered_share(found, of_oracle=True)
-    line = "mismatch: next to nothing is lost"
+    line = "mismatch: too little is lost to measure a recovered share"
     if share is not None:
-        line = f"mismatch: blind mending gives back {share:.0%} of what knowing Psi gives back"
+        line = f"mismatch: blind correction recovers {share:.0%} of what the true Psi recovers"
     return Beside(mismatch_sections(found, new / DRAWN), {"mismatch": rows}, [line])
 
 
@@ -144,5 +144,5 @@ def measure_beside(
                 found = measure(settings, folder, new, watcher)
                 sections += found.sections
                 metrics |= found.metrics
-                lines += found.told
+                lines += found.lines
     return Beside(sections, metrics, lines)

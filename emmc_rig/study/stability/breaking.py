@@ -1,4 +1,4 @@
-"""Where a curve breaks: how far from its best a method stays above a limit, between the strengths.
+"""Breaking points of a curve: the strengths between which a method stays above a limit.
 
 A place on a sweep is an index into its strengths, with a fraction between two of them.
 """
@@ -85,8 +85,8 @@ def strength_at(strengths: Sequence[float], place: float) -> float:
     return first + (last - first) * part
 
 
-def told(found: Span | None, strengths: Sequence[float]) -> str:
-    """Return a span as what the table says of it."""
+def span_words(found: Span | None, strengths: Sequence[float]) -> str:
+    """Return a span in words, for the table."""
     if found is None:
         return "already at the mildest"
     words = []
@@ -99,6 +99,6 @@ def told(found: Span | None, strengths: Sequence[float]) -> str:
 
 
 def _plain(strength: float) -> str:
-    """Return two digits, as one writes them: 0.042, 12, 340."""
+    """Return a strength with two digits and no exponent: 0.042, 12, 340."""
     rounded = float(f"{strength:.2g}")
     return f"{rounded:.0f}" if rounded >= 10 else f"{rounded:g}"

@@ -1,4 +1,4 @@
-"""What a numerical check is made of: a small capture, a method on it, and a verdict in words."""
+"""Parts of a numerical check: a small capture, a method's attempt on it, and a finding."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.result import Reconstruction
@@ -31,8 +31,8 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a method: its PSNR, or why there is none.
+class Attempt:
+    """What a method made of a capture: its PSNR, or why there is none.
 
     refused: the error's line, "" where it ran. db: NaN where it did not run or is not finite.
     """
@@ -53,11 +53,11 @@ def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) 
     chosen = find_camera(camera)
     sensor = chosen.sensor.model_copy(update={"binning": binning})
     chosen = chosen.with_shots(shots).model_copy(update={"views": VIEWS, "sensor": sensor})
-    return taken(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
+    return trial_of(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
 
 
 def solved(trial: Trial, method: str, settings: MethodSettings | None = None) -> Reconstruction:
-    """Return what a method makes of a trial; raises ReconstructionError as it does."""
+    """Return a method's reconstruction of a trial; raises ReconstructionError."""
     psi = trial.psi
     dictionary = None
     if METHODS[method].needs_dictionary:
@@ -67,12 +67,12 @@ def solved(trial: Trial, method: str, settings: MethodSettings | None = None) ->
     )
 
 
-def outcome_of(trial: Trial, method: str, scale: float = 1.0) -> Outcome:
-    """Return the outcome of a method, its light field divided by `scale`."""
+def attempted(trial: Trial, method: str, scale: float = 1.0) -> Attempt:
+    """Return the attempt of a method, its light field divided by `scale`."""
     try:
         found = np.clip(solved(trial, method).light_field.astype(np.float64) / scale, 0, 1)
     except (ReconstructionError, ModelError) as fault:
-        return Outcome(math.nan, str(fault))
+        return Attempt(math.nan, str(fault))
     if not np.isfinite(found).all():
-        return Outcome(math.nan)
-    return Outcome(psnr_db(found, trial.truth))
+        return Attempt(math.nan)
+    return Attempt(psnr_db(found, trial.truth))

@@ -1,4 +1,4 @@
-"""Captures that are hard on numbers: dark masks, rows of zeros, dark and repeated shots, scales."""
+"""Ill-conditioned captures: dark masks, rows of zeros, dark and repeated shots, scales."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ CONDITIONS = (
         "a fiftieth of the light under the same noise: what is seen is hardly more than the noise",
     ),
     Condition(
-        "5 % of the rows are 0", 1, _blind_rows, False, "readings that see nothing, not told",
+        "5 % of the rows are 0", 1, _blind_rows, False, "readings without light, not marked",
     ),
     Condition("a dark shot", 2, _dark_shot, False, "blocks of Psi Psi^T are singular"),
     Condition(
         "two identical shots", 1, _repeated, True,
-        "blocks of Psi Psi^T are singular; the same readings twice tell the same",
+        "blocks of Psi Psi^T are singular; repeated readings add nothing",
     ),
 )  # fmt: skip

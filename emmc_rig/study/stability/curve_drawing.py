@@ -100,7 +100,7 @@ def _is_mixed(curves: Sequence[Curve]) -> bool:
 
 
 def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
-    """End the axis a little below the copied view, as what is worse is only worse; return where."""
+    """End the axis a little below the copied view, where lower values add nothing; return where."""
     views = [view for curve in curves for view in curve.views if view is not None]
     levels = [level for curve in curves for level in curve.levels if level is not None]
     if not levels:

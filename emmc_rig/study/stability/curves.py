@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.study.stability.breaking import Span, below_best, below_view, strength_at, told
+from emmc_rig.study.stability.breaking import Span, below_best, below_view, span_words, strength_at
 from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.stability.fault_points import Point
 from emmc_rig.study.stability.faults import FAULTS
@@ -137,7 +137,7 @@ def breaking_rows(curves: Sequence[Curve], scene: str) -> tuple[list[BreakingRow
 
 def _cell(curve: Curve) -> str:
     return " / ".join(
-        told(span, curve.strengths) for span in (curve.below_best(), curve.below_view())
+        span_words(span, curve.strengths) for span in (curve.below_best(), curve.below_view())
     )
 
 
@@ -149,7 +149,7 @@ def break_row(curve: Curve) -> dict[str, object]:
     def ends(name: str, span: Span | None) -> dict[str, object]:
         places = (None, None) if span is None else (span.low, span.high)
         low, high = (None if p is None else strength_at(curve.strengths, p) for p in places)
-        return {f"{name}_from": low, f"{name}_to": high, name: told(span, curve.strengths)}
+        return {f"{name}_from": low, f"{name}_to": high, name: span_words(span, curve.strengths)}
 
     return {
         "scene": curve.scene,

@@ -1,11 +1,11 @@
-"""The camera's design taken to its ends: mask, shots, views, pixels; Psi is always the true one."""
+"""Extremes of the camera's design: mask, shots, views, pixels; Psi is always the true one."""
 
 from __future__ import annotations
 
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
 from emmc_rig.study.stability.fault import DESIGN, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
 
 
@@ -23,7 +23,7 @@ def _near_mask(camera: Camera) -> tuple[str, Mask]:
 def _with_mask(setup: Setup, **changed: float) -> Trial:
     name, mask = _near_mask(setup.camera)
     masks = {**setup.camera.masks, name: mask.model_copy(update=changed)}
-    return taken(setup.with_camera(masks=masks))
+    return trial_of(setup.with_camera(masks=masks))
 
 
 def mask_cell(setup: Setup, px: float) -> Trial:
@@ -44,7 +44,7 @@ def shots(setup: Setup, count: float) -> Trial:
         camera = setup.camera.with_shots(round(count))
     except CameraError as fault:
         raise NotApplicableError(str(fault)) from fault
-    return taken(Setup(setup.scene, camera, setup.size, setup.seed, setup.zoom))
+    return trial_of(Setup(setup.scene, camera, setup.size, setup.seed, setup.zoom))
 
 
 def views(setup: Setup, count: float) -> Trial:
@@ -56,7 +56,7 @@ def views(setup: Setup, count: float) -> Trial:
     if setup.is_built_in:
         cell_mm = lens.aperture_cell_mm * max(camera.views) / side
         lens = lens.model_copy(update={"aperture_cell_mm": cell_mm})
-    return taken(setup.with_camera(views=(side, side), lens=lens))
+    return trial_of(setup.with_camera(views=(side, side), lens=lens))
 
 
 def pixel_size(setup: Setup, r: float) -> Trial:
@@ -67,7 +67,7 @@ def pixel_size(setup: Setup, r: float) -> Trial:
     noise = own.noise.model_copy(update={"gain_dn_per_electron": gain})
     sensor = own.model_copy(update={"binning": k, "noise": noise})
     try:
-        return taken(setup.with_camera(sensor=sensor))
+        return trial_of(setup.with_camera(sensor=sensor))
     except CameraError as fault:
         raise NotApplicableError(str(fault)) from fault
 

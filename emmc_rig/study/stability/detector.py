@@ -1,9 +1,9 @@
-"""How well verdicts tell broken results from good ones: captures with every fault, each judged.
+"""How often verdicts flag broken results and pass good ones, on captures with every fault.
 
 A result is broken when it lost more than 3 dB against that of the same capture without the fault,
 good when it lost 1 dB or less. It is poor when it lost 3 dB or less but had little to lose: without
 the fault it was within 5 dB of a picture of one even colour, or another method of those measured
-was 2 dB better. What is poor or between may be flagged or not. Rows keep the evidence, from which
+was 2 dB better. These and those between may be flagged or not. Rows keep the evidence, from which
 verdicts are made anew: changed rules need no new measurement.
 """
 
@@ -31,11 +31,11 @@ from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS, Fault
 from emmc_rig.study.stability.fault_sweep import open_dictionary_once
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.stability.trial import Trial
-from emmc_rig.study.sweep import Results, Sweep, csv_text, recorded, sweep_folder
+from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, find_method
 from reconstruction.verdict.evidence import Evidence
-from reconstruction.verdict.rules import Verdict, judged
+from reconstruction.verdict.rules import Verdict, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
 
@@ -47,7 +47,7 @@ KINDS = (SENSOR, MASK, SHOTS)
 
 
 class DetectorSettings(Settings):
-    """What to judge. faults: names; empty takes those that befall a capture."""
+    """What to measure. faults: names; empty takes those of a capture."""
 
     scenes: tuple[str, ...]
     cameras: tuple[str, ...] = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
@@ -90,7 +90,7 @@ def detector_settings(
 
 @dataclass(frozen=True)
 class Case:
-    """One result to judge. fault None: nothing is wrong."""
+    """One result to test. fault None: nothing is wrong."""
 
     scene: str
     camera: str
@@ -109,11 +109,11 @@ class Case:
     @property
     def label(self) -> str:
         """In words."""
-        told = "nothing wrong"
+        condition = "nothing wrong"
         if self.fault is not None:
             fault = FAULTS[self.fault]
-            told = f"{fault.title} {self.strength:g} {fault.unit}"
-        return f"{Path(self.scene).stem}, {Path(self.camera).stem}, {told}, {self.method}"
+            condition = f"{fault.title} {self.strength:g} {fault.unit}"
+        return f"{Path(self.scene).stem}, {Path(self.camera).stem}, {condition}, {self.method}"
 
 
 def _named(fault: Fault, strength: float) -> dict:
@@ -121,7 +121,7 @@ def _named(fault: Fault, strength: float) -> dict:
 
 
 def cases(settings: DetectorSettings) -> list[Case]:
-    """Return what to judge; those of one trial together."""
+    """Return the cases; those of one trial together."""
     names = settings.faults or tuple(f.name for f in FAULTS.values() if f.kind in KINDS)
     found = []
     for scene in settings.scenes:
@@ -139,7 +139,7 @@ def cases(settings: DetectorSettings) -> list[Case]:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class CaseResult:
     """A case with its PSNR, what it lost against its harmless end, and its verdict.
 
     little_to_lose: whether the harmless end is poor already.
@@ -173,7 +173,7 @@ class Judged:
 
 @dataclass
 class DetectorSweep(Sweep[Case]):
-    """The cases whose verdicts are judged; settings: DetectorSettings."""
+    """The cases whose verdicts are tested; settings: DetectorSettings."""
 
     journal = "verdicts.jsonl"
     noun = "cases"
@@ -224,8 +224,8 @@ def _row(method: str, given: Trial) -> dict:
     return {"psnr_db": level, "even_db": even_db, "evidence": verdict.evidence.as_dict()}
 
 
-def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
-    """Return the rows judged by today's rules; those that a method refused are left out."""
+def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
+    """Return the rows with verdicts by the present rules; those without a result are left out."""
     best: dict[Case, float] = {}
     for case, row in rows.items():
         if "psnr_db" in row:
@@ -239,8 +239,8 @@ def judged_rows(rows: Mapping[Case, dict]) -> list[Judged]:
         level = harmless["psnr_db"]
         rival = best[replace(case.harmless, method="")]
         little = level < max(rival - POOR_DB, harmless["even_db"] + EVEN_DB)
-        verdict = judged(Evidence.from_dict(row["evidence"]))
-        found.append(Judged(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
+        verdict = verdict_from(Evidence.from_dict(row["evidence"]))
+        found.append(CaseResult(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
     return found
 
 
@@ -258,7 +258,7 @@ class Tally:
     poor_flagged: int = 0
 
     @property
-    def found(self) -> float | None:
+    def detected(self) -> float | None:
         """Share of the broken ones that were flagged; None without any."""
         return self.broken_flagged / self.broken if self.broken else None
 
@@ -268,7 +268,7 @@ class Tally:
         return self.good_flagged / self.good if self.good else None
 
 
-def tallied(results: Iterable[Judged]) -> Tally:
+def tallied(results: Iterable[CaseResult]) -> Tally:
     """Return the counts."""
     counts = dict.fromkeys(Tally.__dataclass_fields__, 0)
     for one in results:
@@ -277,7 +277,7 @@ def tallied(results: Iterable[Judged]) -> Tally:
     return Tally(**counts)
 
 
-def tables(results: Sequence[Judged]) -> dict[tuple[str, str], Tally]:
+def tables(results: Sequence[CaseResult]) -> dict[tuple[str, str], Tally]:
     """Return the counts by fault and method, then by method, then of all; ALL names the sums."""
     faults = list(dict.fromkeys(one.case.fault or NONE for one in results))
     methods = list(dict.fromkeys(one.case.method for one in results))
@@ -293,32 +293,32 @@ def tables(results: Sequence[Judged]) -> dict[tuple[str, str], Tally]:
     }
 
 
-def wrong(results: Iterable[Judged]) -> list[Judged]:
+def wrong(results: Iterable[CaseResult]) -> list[CaseResult]:
     """Return the broken results that were trusted and the good ones that were not."""
     return [one for one in results if one.wrong]
 
 
-def told(one: Judged) -> str:
-    """Return a judged result in words."""
+def case_words(one: CaseResult) -> str:
+    """Return a result in words."""
     reasons = "; ".join(reason.what for reason in one.verdict.reasons) or "nothing against it"
     return f"{one.case.label}: lost {one.lost_db:.1f} dB, {one.verdict.level} ({reasons})"
 
 
-def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[Judged]:
-    """Judge all cases; write verdicts.csv and metrics.json beside the rows.
+def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> list[CaseResult]:
+    """Measure all cases; write verdicts.csv and metrics.json beside the rows.
 
     Raises SweepStopped at Ctrl-C, AppError for a folder that cannot be written, and what the
     layers below do.
     """
     with sweep_folder(out, DetectorSweep.journal, "stability --verdicts") as folder:
-        results = judged_rows(DetectorSweep(settings, folder).run(cases(settings), watcher))
+        results = case_results(DetectorSweep(settings, folder).run(cases(settings), watcher))
         if not results:
-            raise AppError("nothing could be judged: no fault befalls these scenes and cameras")
+            raise AppError("no case to measure: no fault applies to these scenes and cameras")
         rows = [_csv_row(one) for one in results]
         tallies = {
             f"{fault}, {method}": {
                 **asdict(tally),
-                "found": tally.found,
+                "found": tally.detected,
                 "alarms": tally.false_alarms,
             }
             for (fault, method), tally in tables(results).items()
@@ -326,8 +326,8 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
         metrics = {
             "results": len(results),
             "tallies": tallies,
-            "wrong": [told(one) for one in wrong(results)],
-            **recorded(settings),
+            "wrong": [case_words(one) for one in wrong(results)],
+            "settings": settings.model_dump(mode="json"),
         }
         with result_folder(folder, "stability --verdicts", adds=True) as new:
             write_text(new / CSV, csv_text(rows, form=".3f", forms={"strength": "g"}))
@@ -335,7 +335,7 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
     return results
 
 
-def _csv_row(one: Judged) -> dict[str, object]:
+def _csv_row(one: CaseResult) -> dict[str, object]:
     case = one.case
     return {
         "scene": Path(case.scene).stem,

@@ -1,4 +1,4 @@
-"""What a fault of a capture is: its unit, strengths from harmless to hopeless, and its trial."""
+"""A fault of a capture: its unit, its strengths from harmless to hopeless, and its trial."""
 
 from __future__ import annotations
 

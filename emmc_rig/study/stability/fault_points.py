@@ -1,4 +1,4 @@
-"""What a stability sweep measures: scenes, faults at their strengths, methods; nothing is computed.
+"""The points of a stability sweep: scenes, faults at their strengths, methods.
 
 All methods of a (scene, fault, strength) get the same trial.
 """
@@ -58,7 +58,7 @@ class StabilitySettings(Settings):
 def stability_settings(
     fast: bool, scenes: Sequence[str], size: tuple[int, int] | None, **others: object
 ) -> StabilitySettings:
-    """Return the settings of a sweep; what is not given is that of --fast or of the full one."""
+    """Return the settings of a sweep; defaults are those of --fast or of the full sweep."""
     chosen = {
         "fast": fast,
         "scenes": tuple(scenes) or (FAST_SCENES if fast else SCENES),

@@ -156,7 +156,7 @@ def _settings(point: Point, binning: int = 1) -> MethodSettings:
 def _content(
     scene: str, camera: str, size: tuple[int, int] | None, seed: int
 ) -> list[float] | None:
-    """Return what tells a measured scene from another of its name; a built-in one has its seed."""
+    """Return what identifies a measured scene beside its name; a built-in one has its seed."""
     setup = Setup(scene, find_camera(camera), size, seed)
     if setup.is_built_in:
         return None

@@ -1,4 +1,4 @@
-"""The faults by name, and the trial of one: each module of a kind offers some in its FAULTS."""
+"""The faults by name, from FAULTS of each module of a kind, and the trial of one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from emmc_rig.study.stability import (
     shot_faults,
 )
 from emmc_rig.study.stability.fault import Fault
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
 
 KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults, design_faults)
@@ -43,12 +43,12 @@ def trial(
     """Return what a method gets from a capture with a fault of some strength, and the truth.
 
     scene, size, zoom: see `Setup`. The readings are made by the true Psi with the sensor's noise;
-    Psi, noise level and usable pixels are those that the method is told. Raises NotApplicableError
-    where the fault cannot befall the scene or the camera, and what the layers below do.
+    Psi, noise level and usable pixels are those given to the method. Raises NotApplicableError
+    where the fault does not apply to the scene or the camera, and what the layers below do.
     """
     setup = Setup(scene, camera_for(fault, camera), size, seed, zoom)
     if fault.is_clean(strength):
-        return taken(setup)
+        return trial_of(setup)
     return fault.make(setup, strength)
 
 

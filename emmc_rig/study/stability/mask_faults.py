@@ -1,4 +1,4 @@
-"""Faults of mask and lens that Psi does not know of: misplaced, soft edges, vignetting.
+"""Faults of mask and lens that Psi does not model: misplaced, soft edges, vignetting.
 
 The true Psi is that of the calibration's placement model; the method assumes the design's.
 """
@@ -15,7 +15,7 @@ from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.fault import MASK, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
 from simulators.flaws import OpticsFlaws
 
@@ -57,7 +57,7 @@ def _misplaced(setup: Setup, **changed: float) -> Trial:
     truth = setup.scene_seen().light_field
     placement = replace(designed_placement(setup.camera), **changed)
     size = (truth.shape[2], truth.shape[3])
-    return taken(setup, true_psi=misplaced_psi(setup.camera, size, placement))
+    return trial_of(setup, true_psi=misplaced_psi(setup.camera, size, placement))
 
 
 def _diagonal(px: float, setup: Setup) -> dict[str, float]:
@@ -107,7 +107,9 @@ def vignetting(setup: Setup, percent: float) -> Trial:
     natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, setup.camera.views, lengths)
     power = math.log(1 - percent / 100) / math.log(float(natural.min()))
     passed = (natural**power).astype(psi.weights.dtype)
-    return taken(setup, true_psi=replace(psi, weights=psi.weights * passed[None, :, :, :, None, :]))
+    return trial_of(
+        setup, true_psi=replace(psi, weights=psi.weights * passed[None, :, :, :, None, :])
+    )
 
 
 FAULTS = (

@@ -1,9 +1,9 @@
-"""The mismatch protocol: each method with the right Psi, a wrong one, and the wrong one mended.
+"""The mismatch protocol: each method with the right Psi, a wrong one, and the wrong one corrected.
 
 Four scenarios, after InverseNet (arXiv 2603.04538): ideal, nothing has moved; mismatched, the mask
 has moved and Psi is the design's; oracle-corrected, the same readings with the Psi that made them;
 blind-corrected, with the Psi that the readings themselves suggest (`calibration.drift`, as
-`emmc-rig calibrate --drift` mends it: left alone where no drift is told). Recovered is
+`emmc-rig calibrate --drift` corrects it: unchanged where no drift is detected). Recovered is
 (blind - mismatched) / (ideal - mismatched); what the oracle does not recover is lost by the moved
 mask being a worse code for this scene, not by not knowing it.
 """
@@ -53,8 +53,8 @@ LEAST_DB = 0.2
 class Mismatch:
     """One method under one error, PSNRs in dB; NaN where it refused.
 
-    told: whether the readings told the drift. psi_error, psi_left: relative error of Psi before and
-    after blind mending (Frobenius norm).
+    told: whether a drift was detected. psi_error, psi_left: relative error of Psi before and
+    after blind correction (Frobenius norm).
     """
 
     scene: str
@@ -70,12 +70,12 @@ class Mismatch:
 
     @property
     def recovered(self) -> float | None:
-        """Share of the loss that blind mending recovers; None where next to nothing is lost."""
+        """Share of the loss that blind correction recovers; None below a loss of LEAST_DB."""
         return _share(self.blind - self.mismatched, self.ideal - self.mismatched)
 
     @property
     def of_oracle(self) -> float | None:
-        """Likewise of what knowing Psi recovers."""
+        """Likewise of what the true Psi recovers."""
         return _share(self.blind - self.mismatched, self.oracle - self.mismatched)
 
 
@@ -83,15 +83,15 @@ def _share(gained: float, lost: float) -> float | None:
     return gained / lost if math.isfinite(gained) and lost > LEAST_DB else None
 
 
-def mended(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, bool]:
-    """Return Psi as the readings suggest, and whether they told a drift.
+def corrected(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, bool]:
+    """Return Psi as fitted to the readings, and whether a drift was detected.
 
-    Raises NotApplicableError for a camera of which no drift is sought.
+    Raises NotApplicableError for a camera whose drift cannot be estimated.
     """
     psi = moved.psi
     camera = Camera.model_validate_json(psi.camera_json)
     if psi.colour is None:
-        raise NotApplicableError("a drift is sought on sensors with a colour filter")
+        raise NotApplicableError("a drift is estimated on sensors with a colour filter")
     noise, light = camera.sensor.noise, pixel_light(camera, psi.size)
     variance = noise.variance(moved.readings, camera.exposures_s()[:, None, None], light)
     try:
@@ -164,7 +164,7 @@ class MismatchSweep(Sweep[MismatchPoint]):
         """Yield the methods' PSNRs by scenario, and what became of Psi."""
         settings, one = self.settings, points[0]
         moved = settings.trial(one.error, one.strength, one.scene)
-        blind, told = mended(moved, drift_settings(settings.fast))
+        blind, detected = corrected(moved, drift_settings(settings.fast))
         for point in points:
             mismatched = _psnr(moved, moved.psi, point.method)
             if point.strength == 0:
@@ -173,8 +173,8 @@ class MismatchSweep(Sweep[MismatchPoint]):
             yield {
                 "mismatched": mismatched,
                 "oracle": _psnr(moved, moved.true_psi, point.method),
-                "blind": _psnr(moved, blind, point.method) if told else mismatched,
-                "told": told,
+                "blind": _psnr(moved, blind, point.method) if detected else mismatched,
+                "told": detected,
                 "psi_error": moved.psi.relative_difference(moved.true_psi),
                 "psi_left": blind.relative_difference(moved.true_psi),
             }

@@ -42,7 +42,7 @@ def draw_mismatch(rows: Sequence[Mismatch], path: Path) -> Path:
 
 
 def recovered_share(rows: Sequence[Mismatch], of_oracle: bool = False) -> float | None:
-    """Return what blind mending recovers of all that was lost; None where next to nothing was."""
+    """Return what blind correction recovers of all that was lost; None where too little was."""
     whole = [row for row in rows if (row.of_oracle if of_oracle else row.recovered) is not None]
     best = (row.oracle if of_oracle else row.ideal for row in whole)
     lost = sum(one - row.mismatched for one, row in zip(best, whole, strict=True))

@@ -20,10 +20,10 @@ from emmc_rig.study.stability.checks import (
     BROKEN,
     SOUND,
     WEAK,
+    Attempt,
     Finding,
-    Outcome,
+    attempted,
     example,
-    outcome_of,
     solved,
 )
 from emmc_rig.study.stability.conditions import CONDITIONS, scaled
@@ -44,18 +44,18 @@ class Numerics:
     of results divided by it."""
 
     findings: list[Finding]
-    outcomes: dict[str, dict[str, Outcome]]
-    scales: dict[float, dict[str, Outcome]]
+    outcomes: dict[str, dict[str, Attempt]]
+    scales: dict[float, dict[str, Attempt]]
 
 
 def card_db(trial: Trial) -> float:
-    """Return the PSNR of a card of the scene's mean colour: of knowing next to nothing."""
+    """Return the PSNR of a card of the scene's mean colour, a lower bound for any method."""
     mean = trial.truth.mean(axis=(0, 1, 2, 3))
     return psnr_db(np.broadcast_to(mean, trial.truth.shape), trial.truth)
 
 
-def told(
-    outcomes: Mapping[str, Outcome], wanted: Mapping[str, float], same: bool
+def condition_verdict(
+    outcomes: Mapping[str, Attempt], wanted: Mapping[str, float], same: bool
 ) -> tuple[str, str]:
     """Return figure and verdict of a condition: the worst over the methods."""
     broken = [name for name, one in outcomes.items() if not one.refused and math.isnan(one.db)]
@@ -141,22 +141,24 @@ def measure_numerics(
     watcher.step("step sizes")
     findings += repeats(one, every)
     watcher.step("repeated runs")
-    usual = {name: outcome_of(one, name).db for name in methods}
+    usual = {name: attempted(one, name).db for name in methods}
     watcher.step("methods as they are")
-    outcomes = {"as it is": {name: Outcome(db) for name, db in usual.items()}}
+    outcomes = {"as it is": {name: Attempt(db) for name, db in usual.items()}}
     card = dict.fromkeys(methods, card_db(one))
     for condition in CONDITIONS:
         trial = condition.change(one if condition.shots == 1 else two)
-        found = {name: outcome_of(trial, name) for name in methods}
+        found = {name: attempted(trial, name) for name in methods}
         outcomes[condition.name] = found
-        figure, verdict = told(found, usual if condition.same else card, condition.same)
+        figure, verdict = condition_verdict(
+            found, usual if condition.same else card, condition.same
+        )
         findings.append(Finding(condition.name, figure, verdict, condition.meaning))
         watcher.step(condition.name)
     by_scale = {}
     for factor in scales:
         trial = scaled(one, factor)
-        by_scale[factor] = {name: outcome_of(trial, name, factor) for name in methods}
-        figure, verdict = told(by_scale[factor], usual, True)
+        by_scale[factor] = {name: attempted(trial, name, factor) for name in methods}
+        figure, verdict = condition_verdict(by_scale[factor], usual, True)
         meaning = "a scene so much dimmer: the same light field, so much dimmer"
         if factor > 1:
             meaning = "a scene so much brighter than white cannot be: to be refused"

@@ -1,4 +1,4 @@
-"""Numerical stability as a section of the page: the checks, and what became of every method."""
+"""Numerical stability as a section of the page: the checks, and the PSNR of every method."""
 
 from __future__ import annotations
 

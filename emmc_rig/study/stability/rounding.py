@@ -130,7 +130,7 @@ def step_sizes(trial: Trial) -> list[Finding]:
                 f"objective {reached:.3g} times the usual after {found.steps} steps; "
                 f"{found.status}",
                 BROKEN if not finite else SOUND if honest else WEAK,
-                "stays finite; not converging is told",
+                "stays finite; the status says where it did not converge",
             )
         )
     for mu in (1e-12, 1e6):

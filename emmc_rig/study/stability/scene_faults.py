@@ -1,4 +1,4 @@
-"""What makes a scene hard: depth, occlusions, mirrors, little contrast."""
+"""Difficult scenes: depth, occlusions, mirrors, little contrast."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from emmc_rig.study.stability.fault import SCENE, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from simulators import changes
 from simulators.scenes import SCENES
 
@@ -19,7 +19,7 @@ def disparity_range(setup: Setup, px: float) -> Trial:
     assert known is not None
     factor = px / float(np.ptp(known))
     changed = setup.scene_seen(change=lambda world: changes.deepened(world, factor))
-    return taken(setup, scene=changed)
+    return trial_of(setup, scene=changed)
 
 
 def occlusion(setup: Setup, percent: float) -> Trial:
@@ -30,7 +30,7 @@ def occlusion(setup: Setup, percent: float) -> Trial:
     changed = setup.scene_seen(
         change=lambda world: changes.overgrown(world, percent / 100, nearest, rng)
     )
-    return taken(setup, scene=changed)
+    return trial_of(setup, scene=changed)
 
 
 def specularity(setup: Setup, percent: float) -> Trial:
@@ -38,7 +38,7 @@ def specularity(setup: Setup, percent: float) -> Trial:
     setup.need_built_in()
     rng = np.random.default_rng([setup.seed, 8])
     changed = setup.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
-    return taken(setup, scene=changed)
+    return trial_of(setup, scene=changed)
 
 
 def contrast(setup: Setup, percent: float) -> Trial:
@@ -46,7 +46,7 @@ def contrast(setup: Setup, percent: float) -> Trial:
     seen, share = setup.scene_seen(), percent / 100
     mean = seen.light_field.mean(axis=(0, 1, 2, 3), keepdims=True, dtype=np.float64)
     faded = np.asarray(mean + share * (seen.light_field - mean), dtype=np.float32)
-    trial = taken(setup, scene=replace(seen, light_field=faded))
+    trial = trial_of(setup, scene=replace(seen, light_field=faded))
     return replace(trial, peak=share)
 
 

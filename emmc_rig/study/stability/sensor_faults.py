@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.camera import build_imaging_matrix, pixel_light
 from emmc_rig.model.noise import SensorNoise
 from emmc_rig.study.stability.fault import SENSOR, Fault
-from emmc_rig.study.stability.trial import Array, Setup, Trial, taken
+from emmc_rig.study.stability.trial import Array, Setup, Trial, trial_of
 from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
@@ -33,7 +33,9 @@ def exposure(setup: Setup, electrons: float) -> Trial:
         else shot.model_copy(update={"exposure_s": shot.exposure_s * factor})
         for shot in camera.shots
     )
-    return taken(setup.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots))
+    return trial_of(
+        setup.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots)
+    )
 
 
 def _with_room(setup: Setup, electrons: float) -> Setup:
@@ -56,7 +58,9 @@ def read_noise(setup: Setup, electrons: float) -> Trial:
     # The black level lies clear of the noise, as on any sensor: clipped noise would be a bias.
     black = math.ceil(BLACK_DEVIATIONS * electrons * own.gain_dn_per_electron)
     black = min(max(black, own.black_level_dn), own.white_level_dn - 1)
-    return taken(_with_noise(setup, {"read_noise_electrons": electrons, "black_level_dn": black}))
+    return trial_of(
+        _with_noise(setup, {"read_noise_electrons": electrons, "black_level_dn": black})
+    )
 
 
 def saturation(setup: Setup, percent: float) -> Trial:
@@ -70,7 +74,7 @@ def saturation(setup: Setup, percent: float) -> Trial:
     )
     level = float(np.quantile(electrons, 1 - percent / 100)) * noise.gain_dn_per_electron
     white = max(noise.black_level_dn + 1, round(noise.black_level_dn + level))
-    return taken(_with_noise(setup, {"white_level_dn": min(white, noise.white_level_dn)}))
+    return trial_of(_with_noise(setup, {"white_level_dn": min(white, noise.white_level_dn)}))
 
 
 def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
@@ -80,16 +84,16 @@ def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
 
 
 def bad_pixels(setup: Setup, percent: float) -> Trial:
-    """So many percent of the pixels are dead or hot, half of each, and nobody is told."""
-    return _bad(setup, percent, told=False)
+    """So many percent of the pixels are dead or hot, half of each, and not marked as unusable."""
+    return _bad(setup, percent, listed=False)
 
 
 def masked_pixels(setup: Setup, percent: float) -> Trial:
-    """The same pixels, and the method is told which."""
-    return _bad(setup, percent, told=True)
+    """The same pixels, marked as unusable."""
+    return _bad(setup, percent, listed=True)
 
 
-def _bad(setup: Setup, percent: float, told: bool) -> Trial:
+def _bad(setup: Setup, percent: float, listed: bool) -> Trial:
     camera = setup.camera
     truth = setup.scene_seen().light_field
     k = camera.sensor.binning
@@ -105,7 +109,7 @@ def _bad(setup: Setup, percent: float, told: bool) -> Trial:
         return np.where(dead, DEAD_RESPONSE * clean, clean) + np.where(hot, glow / light, 0)
 
     bad: NDArray[np.bool_] = np.broadcast_to(hot | dead, (len(camera.shots), *pixels))
-    return taken(setup, change_clean=spoilt, unusable=bad if told else None)
+    return trial_of(setup, change_clean=spoilt, unusable=bad if listed else None)
 
 
 FAULTS = (
@@ -126,7 +130,7 @@ FAULTS = (
         SENSOR, saturation,
     ),
     Fault(
-        "bad-pixels", "Bad pixels, not told", "% of pixels",
+        "bad-pixels", "Bad pixels, not marked", "% of pixels",
         (0, 0.1, 0.3, 1, 3, 10, 30), (0, 0.3, 3, 20),
         SENSOR, bad_pixels, repairable=True, screened=True,
     ),

@@ -1,4 +1,4 @@
-"""Faults between shots: a lamp that flickers, things that move, frames missing or doubled."""
+"""Faults between shots: flicker, motion, missing and repeated frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
 from emmc_rig.study.stability.fault import SEVERAL, SHOTS, Fault
-from emmc_rig.study.stability.trial import Array, Setup, Trial, taken
+from emmc_rig.study.stability.trial import Array, Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
 from simulators import changes
 from simulators.raycaster import World
@@ -30,7 +30,7 @@ def flicker_gains(shots: int, percent: float, seed: int) -> Array:
 def flicker(setup: Setup, percent: float) -> Trial:
     """The lamp's brightness differs from shot to shot."""
     gains = flicker_gains(len(setup.camera.shots), percent, setup.seed)
-    return taken(setup, change_clean=lambda clean: clean * gains[:, None, None])
+    return trial_of(setup, change_clean=lambda clean: clean * gains[:, None, None])
 
 
 def scene_motion(setup: Setup, px: float) -> Trial:
@@ -64,7 +64,7 @@ def camera_motion(setup: Setup, px: float) -> Trial:
         np.stack([[shifted(one, -down * i, -across * i) for one in row] for row in wide])[inside]
         for i in range(shots)
     ]
-    return taken(setup, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
+    return trial_of(setup, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
 
 
 DIRECTION = (np.cos(np.pi / 6), np.sin(np.pi / 6))
@@ -83,7 +83,7 @@ def _moving(setup: Setup, px: float, background: bool) -> Trial:
             return changes.moved(world, s, t, background)
 
         seen.append(setup.scene_seen(change=moved).light_field)
-    return taken(setup, shot_scenes=seen)
+    return trial_of(setup, shot_scenes=seen)
 
 
 def missing_shot(setup: Setup, count: float) -> Trial:
@@ -95,7 +95,7 @@ def missing_shot(setup: Setup, count: float) -> Trial:
         kept[dark:] = 0
         return kept
 
-    return taken(setup, change_clean=lost)
+    return trial_of(setup, change_clean=lost)
 
 
 def repeated_shot(setup: Setup, count: float) -> Trial:
@@ -105,7 +105,7 @@ def repeated_shot(setup: Setup, count: float) -> Trial:
     weights = psi.weights.copy()
     last = len(setup.camera.shots) - _count(setup, count) - 1
     weights[last + 1 :] = weights[last]
-    return taken(setup, true_psi=replace(psi, weights=weights))
+    return trial_of(setup, true_psi=replace(psi, weights=weights))
 
 
 def _count(setup: Setup, count: float) -> int:

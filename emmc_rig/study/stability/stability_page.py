@@ -17,7 +17,7 @@ CAVEATS = (
     "the true centre view copied to every view. Between measured strengths the curve is taken as "
     "straight.",
     "The readings are made by the real Psi with the sensor's noise on the grid of the "
-    "reconstruction; where mask, lens or shots are at fault, the methods are told the design's.",
+    "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
     "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
     "Contrast: the PSNR is that of the picture stretched back to full contrast.",
 )

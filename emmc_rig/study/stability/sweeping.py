@@ -31,7 +31,7 @@ from emmc_rig.study.stability.stability_page import (
     curves_section,
     stability_page,
 )
-from emmc_rig.study.sweep import csv_text, machine, provenance, recorded, sweep_folder
+from emmc_rig.study.sweep import csv_text, machine, provenance, sweep_folder
 from reconstruction.methods import METHODS
 
 POINTS_CSV, BREAKS_CSV, PAGE, DRAWN = "points.csv", "breaking.csv", "stability.html", "charts"
@@ -121,7 +121,7 @@ def _write(
             for row, one in zip(breaks, found, strict=True)
         ],
         "left_out": outcome.left_out,
-        **recorded(settings),
+        "settings": settings.model_dump(mode="json"),
         **figures,
     }
     write_metrics(folder, metrics)

@@ -1,10 +1,10 @@
 """Theory beside measurement: what Psi and a scene's statistics predict as a camera gets worse.
 
-Theory speaks of the faults that leave Psi true. It takes from the scene, patch by patch, its
+Theory covers the faults that leave Psi true. It takes from the scene, patch by patch, its
 disparity and the variance of its texture, and from the camera Psi and the noise (see
 `reconstruction.theory`); it never sees the frames. Measured on the same samples: the posterior
-mean that theory speaks of, told disparity, mean colour and variance of each patch and given the
-noisy frames (the oracle), and the methods, which are told nothing.
+mean that theory describes, given disparity, mean colour and variance of each patch and given the
+noisy frames (the oracle), and the methods, which are given none of these.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ LEAST_AMPLITUDE, LEAST_CHROMA = 1e-7, 1e-3
 DISPARITIES = 9
 """Between which the Ziv-Zakai bound decides: it sees no finer than their steps."""
 APART_PX = 1.0
-"""Between the disparities whose patches are told apart."""
+"""Between the disparities whose patches are compared."""
 WIDEST_PX = 10.0
-"""Disparities swept to both sides where a scene does not tell its own."""
+"""Disparities swept to both sides where a scene has no known disparity."""
 NOT_USED = 1e6
 """Variance of a reading that is not to be used."""
 
@@ -158,7 +158,7 @@ class Seen:
         return cls(trial, np.where(trial.usable, variance, NOT_USED), disparity_px)
 
     def places(self, count: int) -> list[Place]:
-        """Return so many patches, spread over the scene."""
+        """Return a number of patches, spread over the scene."""
         return places_of(self.trial.truth, self.disparity_px, self.trial.psi.binning, count)
 
     def patch(self, place: Place) -> tuple[PatchModel, Array, Array]:
@@ -191,7 +191,7 @@ def predicted(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
         sums["found"] += min(expected.error + lost, 2 * expected.prior)
         sums["crb"] += crb
         sums["gain"] += expected.noise_gain
-        sums["told"] += expected.told
+        sums["told"] += expected.degrees_of_freedom
         part = (slice(None), slice(None), *(slice(at, at + SIDE) for at in place.corner))
         flat = np.broadcast_to(place.mean, truth[part].shape).reshape(-1, 3) @ OPPONENT.T
         plain = np.einsum("omr,ro->m", patch.opponent, flat)
@@ -241,7 +241,7 @@ def conditioned(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
 
 
 def measured(seen: Seen, places: Sequence[Place], method: str) -> dict[str, float]:
-    """Return a method's PSNR on the samples that theory speaks of, and its disparity's error.
+    """Return a method's PSNR on the samples that theory covers, and its disparity's error.
 
     Raises ReconstructionError as the method does.
     """

@@ -22,7 +22,7 @@ from emmc_rig.pages.drawing import (
     titled,
 )
 from emmc_rig.pages.page import Section, embedded, fragment, number
-from emmc_rig.study.stability.breaking import Span, below_best, strength_at, told
+from emmc_rig.study.stability.breaking import Span, below_best, span_words, strength_at
 from emmc_rig.study.stability.curve_drawing import shown
 from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.stability.faults import FAULTS
@@ -95,7 +95,7 @@ def _place(span: Span | None) -> tuple[float | None, float | None]:
     return (0.0, 0.0) if span is None else (span.low, span.high)
 
 
-def judged(one: Compared, method: str) -> str:
+def agreement(one: Compared, method: str) -> str:
     """Return whether the bound breaks where a method does, in words."""
     measured, expected = (
         below_best(one.levels[key], one.fault.whole) for key in (f"{method}_db", BOUND)
@@ -195,12 +195,12 @@ def _breaks_table(some: Sequence[Compared]) -> Table:
     for one in some:
         row = [one.fault.title, one.fault.unit]
         for key in (BOUND, ORACLE):
-            row.append(told(below_best(one.levels[key], one.fault.whole), one.strengths))
+            row.append(span_words(below_best(one.levels[key], one.fault.whole), one.strengths))
         for method in methods:
             levels = one.levels[f"{method}_db"]
-            row.append(told(below_best(levels, one.fault.whole), one.strengths))
+            row.append(span_words(below_best(levels, one.fault.whole), one.strengths))
             row += [
-                judged(one, method),
+                agreement(one, method),
                 number(rank_correlation(one.levels[BOUND], levels), "+.2f"),
             ]
         rows.append(row)
@@ -226,7 +226,7 @@ def _summary(some: Sequence[Compared]) -> list[str]:
         "planes."
     ]
     for method in some[0].methods:
-        verdicts = {one.fault.title: judged(one, method) for one in some}
+        verdicts = {one.fault.title: agreement(one, method) for one in some}
         missed = [
             f"{title.lower()} ({verdict})"
             for title, verdict in verdicts.items()

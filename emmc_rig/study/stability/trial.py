@@ -1,4 +1,4 @@
-"""One trial: what a method is told (Psi, readings, noise, usable pixels) and what was there."""
+"""One trial: what a method is given (Psi, readings, noise, usable pixels), and the truth."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _opened(
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What a method gets, and what it should find.
+    """What a method gets, and the truth.
 
     psi, readings, noise_sigma, usable: the method's inputs; `psi` is the assumed one. true_psi: the
     one that made the readings. truth: (v, u, y, x, c); disparity_px: (y, x), None where it is not
@@ -88,7 +88,7 @@ class Trial:
     peak: float = 1.0
 
 
-def taken(
+def trial_of(
     setup: Setup,
     *,
     scene: Scene | None = None,
@@ -101,7 +101,7 @@ def taken(
 
     scene: instead of the setup's. true_psi: makes the readings, instead of the assumed one.
     shot_scenes: the light field before each shot, where it changes. change_clean: what becomes of
-    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels that the method is told of.
+    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels marked as such.
     """
     scene = scene or setup.scene_seen()
     truth = scene.light_field

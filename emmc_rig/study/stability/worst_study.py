@@ -27,7 +27,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
 from emmc_rig.study.stability.fault_points import FAST_METHODS, FAST_SCENES, METHODS, SCENES
-from emmc_rig.study.stability.trial import Setup, Trial, taken
+from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
     Results,
@@ -36,7 +36,6 @@ from emmc_rig.study.sweep import (
     csv_text,
     open_folder,
     provenance,
-    recorded,
 )
 from reconstruction.methods import find_method, reconstruct
 
@@ -65,7 +64,7 @@ class WorstSettings(Settings):
 
     def trial(self, scene: str) -> Trial:
         """Return what a method gets of a scene, nothing at fault."""
-        return taken(Setup(scene, find_camera(self.camera), self.size, self.seed))
+        return trial_of(Setup(scene, find_camera(self.camera), self.size, self.seed))
 
     @property
     def details(self) -> tuple[Detail, ...]:
@@ -249,7 +248,7 @@ def run_worst(settings: WorstSettings, out: Path, watcher: Watcher) -> WorstOutc
             "Every method under the worst perturbation of the noise's size, and small details."
         ]
         write_text(new / PAGE, framed("The worst that can happen", about, CAVEATS, sections))
-        write_metrics(new, {"points": rows, **recorded(settings)})
+        write_metrics(new, {"points": rows, "settings": settings.model_dump(mode="json")})
     return WorstOutcome(noise, details, folder / PAGE)
 
 

@@ -1,1 +1,1 @@
-"""The paper's tables and figures on given light fields: ours beside the paper's, and judged."""
+"""The paper's tables and figures on given light fields, and tests of its claims."""

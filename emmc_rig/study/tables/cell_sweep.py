@@ -1,4 +1,4 @@
-"""The cells of tables and figures, reconstructed one by one, with how long the rest will take."""
+"""The cells of tables and figures, reconstructed one by one, with the time left."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Forecast:
             self._seconds[kind].append(seconds)
 
     def left(self) -> str:
-        """Return the time left in words; nothing before the first cell is done."""
+        """Return the time left in words; "" before the first cell is done."""
         if not self._seconds[()]:
             return ""
         left_s = 0.0

@@ -1,4 +1,4 @@
-"""What each table and figure asks for: scenes, captures and methods; nothing is computed here."""
+"""The cells of each table and figure: scenes, captures and methods."""
 
 from __future__ import annotations
 

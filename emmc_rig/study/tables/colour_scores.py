@@ -1,4 +1,4 @@
-"""How good an estimate is, in whole, in brightness and in colour."""
+"""Scores of an estimate: of all values, of brightness and of colour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tables and findings as a person reads them in a terminal."""
+"""The tables and findings as text for a terminal."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
             missing += 1
             continue
         judge = finding.claim.judged_by
-        told = "" if judge == "tv-dict" else f" [dim](by {METHOD_TITLES[judge]})[/]"
+        by_method = "" if judge == "tv-dict" else f" [dim](by {METHOD_TITLES[judge]})[/]"
         table.add_row(
             Text(finding.verdict, style=COLOURS[finding.verdict]),
             f"{judged}, {judged.holding}/{judged.scenes}",
             "-" if printed is None else f"{printed.mean_db:+.2f}",
-            finding.claim.says + told,
+            finding.claim.says + by_method,
         )
     if missing:
         table.caption = f"{missing} findings need tables that were not asked for"

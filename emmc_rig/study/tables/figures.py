@@ -90,13 +90,13 @@ def _figure_5(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, d
     curve = DisplayCurve.fitted_to(white)
     for name, shots, picture, light in shown:
         scenario = name[1 : name.index(")")]
-        told = "" if "demosaiced" in name else f"sensor PSNR {shots.sensor_psnr_db:.2f} dB"
-        if paper.known_as(scene) == "dragons" and told:
+        caption = "" if "demosaiced" in name else f"sensor PSNR {shots.sensor_psnr_db:.2f} dB"
+        if paper.known_as(scene) == "dragons" and caption:
             printed = paper.SENSOR_PSNR_DB.get(scenario)
-            told += f" (paper: {'over 50' if printed is None else f'{printed:.2f}'})"
+            caption += f" (paper: {'over 50' if printed is None else f'{printed:.2f}'})"
         tiles.append(
             Tile(
-                f"{name}\n{told}",
+                f"{name}\n{caption}",
                 screen(picture * light, curve),
                 (_stretched(piece.of(picture)),),
                 (piece,),

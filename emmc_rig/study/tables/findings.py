@@ -1,4 +1,4 @@
-"""The paper's qualitative findings, each judged on cells: does it hold, and by how many dB.
+"""The paper's qualitative findings, each tested on cells: does it hold, and by how many dB.
 
 Each is a difference per scene, mostly the worst of what should be better less the best of what
 should be worse. It holds when the mean over the scenes is above zero.
@@ -77,7 +77,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim and what was found: by method on the given scenes, and in the paper's numbers."""
+    """A claim and its test: by method on the given scenes, and in the paper's numbers."""
 
     claim: Claim
     ours: Mapping[str, Spread]
@@ -290,7 +290,7 @@ def printed_figures() -> dict[Cell, dict[str, object]]:
 
 
 def judge(measured: Measured, scenes: Sequence[str]) -> list[Finding]:
-    """Return all claims judged on cells of the given scenes."""
+    """Return all claims tested on cells of the given scenes."""
     printed = printed_figures()
     findings = []
     for claim in CLAIMS:

@@ -31,9 +31,6 @@ class Pair:
     paper: float | None
 
 
-NOTHING = Pair(None, None)
-
-
 @dataclass(frozen=True)
 class Line:
     """One line of a grid; `mean` for those that summarise scenes."""

@@ -1,4 +1,4 @@
-"""The scenes given, by name: checked once, identified by their content, cut to the middle."""
+"""The scenes of the tables, by name: checked, identified by their content, cut to the middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numbers that the paper prints in its Tables II, III and IV, and the sentences to judge.
+"""The numbers that the paper prints in its Tables II, III and IV, and the sentences to test.
 
 PSNR in dB. Scenes are named as their folders would be; scenarios are (i) colour by colour, (ii) a
 colour filter array, (iii) monochrome. One full-colour image of (i) counts as three shots.
@@ -144,7 +144,7 @@ def _printed() -> dict[Printed, float]:
 
 PSNR_DB = _printed()
 SENSOR_PSNR_DB = {"i": 42.88, "iii": 45.90}
-"""Of the noisy frames of Dragon (Section VII-B); (ii) is told as "over 50 dB"."""
+"""Of the noisy frames of Dragon (Section VII-B); (ii) is stated as "over 50 dB"."""
 
 
 def known_as(name: str) -> str | None:

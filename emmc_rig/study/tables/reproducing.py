@@ -1,4 +1,4 @@
-"""`emmc-rig tables`: do the cells, judge the claims, and write tables.csv, page and metrics."""
+"""`emmc-rig tables`: measure the cells, test the claims, and write tables.csv, page and metrics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
-from emmc_rig.study.sweep import csv_text, provenance, recorded, sweep_folder
+from emmc_rig.study.sweep import csv_text, provenance, sweep_folder
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import Cell, Part, cells_of, chosen_parts
 from emmc_rig.study.tables.charts import draw_charts
@@ -124,7 +124,7 @@ def _metrics(sweep: TablesSweep, dictionaries: Sequence[str], outcome: TablesOut
         "dictionary": list(dictionaries) or "leave-one-out",
         "findings": [_described_finding(finding) for finding in outcome.findings],
         "seed": sweep.settings.seed,
-        **recorded(sweep.settings),
+        "settings": sweep.settings.model_dump(mode="json"),
     }
 
 
