@@ -26,7 +26,8 @@ class HeldOut:
 
     chi2: mean squared residual over its variance, all usable pixels. trimmed: without the worst
     1 % of them. whiteness: correlation of neighbours' residuals. residual: (pixel_y, pixel_x), in
-    deviations, 0 where not usable. groups: chi2 by kind of whiteboard; all else is of the worst.
+    deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted. groups:
+    chi2 by kind of whiteboard; all else is of the worst.
     """
 
     route: str
@@ -35,6 +36,7 @@ class HeldOut:
     whiteness: float
     relative_error: float
     residual: NDArray[np.float32]
+    brightness: float = 1.0
     groups: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -88,6 +90,7 @@ def judge(
         neighbour_correlation(scaled, usable),
         float(np.sqrt(np.mean(residual[usable] ** 2))) / level,
         scaled.astype(np.float32),
+        float(np.sum(board.reading[usable]) / max(float(np.sum(predicted[usable])), 1e-9)),
     )
 
 

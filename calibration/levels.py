@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
+from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame
 
 Array = NDArray[np.floating]
@@ -126,10 +127,17 @@ def check_of(
 
 
 def fit_levels(checks: Sequence[Check]) -> Levels | None:
-    """Return lamp and response from checks; None where no board was seen twice."""
+    """Return lamp and response from checks; None where no board was seen twice.
+
+    Raises CalibrationError for one that is dark.
+    """
     boards = sorted({one.board for one in checks})
     if len(checks) <= len(boards):
         return None
+    if any(np.nanmin(one.above_dn) <= 0 for one in checks):
+        raise CalibrationError(
+            "a whiteboard that was seen again is dark: is the lamp on, and the aperture open?"
+        )
     times = np.array([one.taken_s for one in checks])
     levels = np.array([one.above_dn for one in checks])
     channels = np.flatnonzero(np.isfinite(levels).all(axis=0))

@@ -30,7 +30,9 @@ from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
 from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, measured_misfit
 from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
-from calibration.placement import Tolerances
+from calibration.placement import Tolerances, designed_placement
+from calibration.refusals import refuse_another_bench, refuse_unfit, refuse_without_mask
+from calibration.registration import register
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera
@@ -38,8 +40,6 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 MOST_PIXELS_WITH_DEVIATION = 2_000_000
 LARGEST_FLICKER = 0.01
-BRIGHTEST_MASK = 0.95
-"""No mask that codes lets nearly all light through everywhere."""
 LARGEST_MOVE_UM = 1.0
 
 
@@ -115,6 +115,7 @@ def calibrate(
     advice: list[str] = []
     turned = turned or {}
     sets = [held_out, *(one for one in (few, pinholes) if one is not None), *turned.values()]
+    refuse_unfit(sets)
     good = np.logical_and.reduce([sensor_blemishes(one) for one in sets])
     channels = channels_of(design.layout)
     levels = fit_levels(list(dict.fromkeys(check for one in sets for check in one.checks)))
@@ -170,6 +171,8 @@ def calibrate(
                 "first shot: hold one out there"
             )
         judged["free"] = _judged_measured("free", free, still[0], design.binning)
+        if parametric is None:
+            advice += _unlike_the_design(camera, design, still[0])
         frames["free"] = pinholes.exposures
         best = mixed or parametric
         if "combined" in routes and best is not None and few is not None:
@@ -181,6 +184,7 @@ def calibrate(
                 judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
                 frames["combined"] = few.exposures
     chosen, why = choose([judged[name] for name in judged if name in routes])
+    refuse_another_bench(chosen)
     if chosen.chi2 > AT_THE_NOISE:
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
         calibrations[chosen.route] = _less_sure(calibrations[chosen.route], missed)
@@ -240,14 +244,20 @@ def _missing(
     return [name for name, known in watched.items() if not known]
 
 
-def refuse_without_mask(board: Board) -> None:
-    """Raise CalibrationError for an open whiteboard that reads as if no mask were in the beam."""
-    readings = board.reading[board.usable]
-    if readings.size and np.percentile(readings, 2) > BRIGHTEST_MASK:
-        raise CalibrationError(
-            f"{board.name}: it reads {np.median(readings):.2f} of the whiteboard without masks, "
-            "and no pixel much less: is the mask in the beam?"
-        )
+def _unlike_the_design(camera: Camera, design: ImagingMatrix, board: Board) -> list[str]:
+    """Return what a whiteboard says against the mask's design, which the free route can do without.
+
+    Nothing for cameras whose mask the parametric route does not know.
+    """
+    try:
+        mask = shadow_mask(camera, design.size)
+    except CalibrationError:
+        return []
+    try:
+        register(board, mask, designed_placement(camera))
+    except CalibrationError as fault:
+        return [f"{fault}; this Psi is measured without the design, be sure that it is this camera"]
+    return []
 
 
 def _mixed(
@@ -381,13 +391,19 @@ def _white(boards: BoardSet, design: ImagingMatrix, shot: int) -> NDArray[np.flo
 def fit_advice(fit: Fit) -> list[str]:
     """Return what the fit says to measure again: flicker, moved stage, too few frames."""
     found = []
+    flickering = [
+        one
+        for one in fit.boards
+        if abs(one.brightness - 1) > max(LARGEST_FLICKER, 5 * one.brightness_deviation)
+    ]
+    if flickering:
+        worst_of = max(flickering, key=lambda one: abs(one.brightness - 1))
+        others = f" ({len(flickering)} of {len(fit.boards)} do)" if len(flickering) > 1 else ""
+        found.append(
+            f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the others"
+            f"{others}; the lamp is not steady, let it warm up and capture it again"
+        )
     for one in fit.boards:
-        off = one.brightness - 1
-        if abs(off) > LARGEST_FLICKER and abs(off) > 5 * one.brightness_deviation:
-            found.append(
-                f"{one.name}: {off:+.1%} in brightness against the others; the lamp is not steady, "
-                "let it warm up and capture it again"
-            )
         moved = float(np.hypot(*one.moved_um))
         if moved > LARGEST_MOVE_UM and moved > 5 * one.moved_deviation_um:
             found.append(

@@ -23,6 +23,8 @@ from emmc_rig.progress import Silent
 from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 
 Array = NDArray[np.floating]
+STATED_TRUE = 1.25
+"""Times the stated error: what a route that is not chosen may be off by."""
 FLAT_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 1.0)
 
 
