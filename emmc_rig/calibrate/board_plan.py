@@ -13,6 +13,7 @@ import yaml
 from calibration.openings import parts
 from calibration.placement import Placement, designed_placement
 from calibration.planning import (
+    FEW_MODEL_ERROR,
     MODEL_ERROR,
     MOST_FRAMES,
     Kind,
@@ -183,7 +184,10 @@ def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> Pla
     others = frames_by_kind(settings, PlannedFrames(dict.fromkeys(kinds, 1), 0.0)).total()
     others -= len(kinds)
     most = MOST_FRAMES if settings.most_frames is None else settings.most_frames - others
-    planned = plan_parametric(mask, soft_design(camera, mask), kinds, light, target, most=most)
+    soft = soft_design(camera, mask)
+    planned = plan_parametric(
+        mask, soft, kinds, light, target, most=most, model_error=FEW_MODEL_ERROR
+    )
     taken = sum(planned.counts.values())
     if taken > max(most, 0) or planned.expected_error > target:
         raise AppError(
@@ -208,7 +212,7 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
         "camera": settings.camera_name,
         "size": list(settings.size),
         "target_relative_error": settings.target,
-        "model_error": MODEL_ERROR,
+        "model_error": FEW_MODEL_ERROR if settings.few else MODEL_ERROR,
         "exposures": {
             "open_s": light.exposure_s,
             "pinhole_s": light.exposure_s * float(np.prod(camera.views)),

@@ -1,0 +1,56 @@
+"""Parts of the aperture: which views the moved window uncovers, and that it uncovers whole ones."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from calibration.openings import parts, views_open, window_place_um
+from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
+from emmc_rig.files.cameras import find_camera
+
+CAMERA = find_camera("rgbw-bayer-1shot")
+
+
+@pytest.mark.parametrize(
+    ("window", "rows", "columns"),
+    [
+        ((0, 0), slice(0, 5), slice(0, 5)),
+        ((3, 0), slice(0, 5), slice(3, 5)),
+        ((-3, 0), slice(0, 5), slice(0, 2)),
+        ((2, -2), slice(0, 3), slice(2, 5)),
+    ],
+)
+def test_the_window_uncovers_the_views_on_the_side_to_which_it_moves(window, rows, columns):
+    expected = np.zeros((5, 5), dtype=bool)
+    expected[rows, columns] = True
+    np.testing.assert_array_equal(views_open((5, 5), None, window), expected)
+
+
+def test_the_windows_edge_lies_between_two_cells():
+    x_um, y_um = window_place_um((2, -1), (5, 5), cell_um=100.0, side_um=530.0)
+    assert x_um - 530 / 2 == pytest.approx(-250 + 2 * 100)
+    assert y_um + 530 / 2 == pytest.approx(250 - 100)
+
+
+@pytest.mark.parametrize("window", parts((5, 5)))
+def test_a_part_of_the_aperture_reads_the_sum_of_its_views(window):
+    bench = WhiteboardBench(CAMERA, (24, 32), BenchTruth(rays_per_view=16))
+    opened = np.argwhere(views_open(CAMERA.views, None, window)).tolist()
+    alone = [bench.reading(Setting(pinhole=(v, u))) for v, u in opened]
+    np.testing.assert_allclose(bench.reading(Setting(window=window)), np.sum(alone, 0), atol=1e-9)
+
+
+def test_few_whiteboards_are_planned_by_parts_of_the_aperture(run, tmp_path):
+    out = tmp_path / "plan"
+    asked = ("--plan", "--few", "--size", "32x48", "--target", "0.01", "--out", out)
+    code, _, _ = run("calibrate", *asked)
+    assert code == 0
+    boards = yaml.safe_load((out / "plan.yaml").read_text())["whiteboards"]
+    assert boards["views"] == []
+    windows = [tuple(one.get("window", (0, 0))) for one in boards["open"]]
+    assert set(parts(CAMERA.views)) <= set(windows)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert sum(one["frames"] for one in metrics["whiteboards"]) <= 12
+    assert metrics["model_error"] < metrics["expected_relative_error"] <= 0.01
