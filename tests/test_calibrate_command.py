@@ -174,7 +174,7 @@ def test_a_size_that_is_none_is_wrong_usage(run, tmp_path):
     [
         (["--route", "best"], "--route best: use one of auto, parametric, mixed, free"),
         (["--target", "2"], "a relative error lies between 0 and 1"),
-        (["--check", "speed"], "--check speed: use all, or some of psi, bound"),
+        (["--check", "speed"], "--check speed: use all, or some of psi, few, bound"),
         (["--camera", "conventional"], "one mask between lens and sensor"),
     ],
 )
