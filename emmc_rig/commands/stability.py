@@ -89,7 +89,7 @@ def stability(
         return
     if worst:
         stability_worst(
-            fast, scene or [], camera, method or [], parse_size(size), seed,
+            fast, scene or [], camera, method or [], parse_size(size), dictionary, seed,
             out or Path("emmc-worst"),
         )  # fmt: skip
         return

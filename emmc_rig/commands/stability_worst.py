@@ -13,6 +13,7 @@ def stability_worst(
     camera: str | None,
     methods: list[str],
     size: tuple[int, int] | None,
+    dictionary: str | None,
     seed: int,
     out: Path,
 ) -> None:
@@ -29,7 +30,7 @@ def stability_worst(
         worst_settings,
     )
 
-    settings = worst_settings(fast, scenes, camera, methods, size, seed)
+    settings = worst_settings(fast, scenes, camera, methods, size, dictionary, seed)
     with shown_bars() as bars:
         outcome = run_worst(settings, out, bars)
     for scene in settings.scenes:

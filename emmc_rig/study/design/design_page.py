@@ -20,7 +20,7 @@ from emmc_rig.study.design.search import Search, pareto
 
 CAVEATS = (
     "Theory knows textures on two planes half a sample of disparity apart, and noise; it knows no "
-    "occlusion. Differences of a tenth of a dB are below what it can order: see `--check`.",
+    "occlusion. Differences of a tenth of a dB are below what it can order.",
     "Frames are simulated by the Psi of the mask as printed, on the grid of the reconstruction; "
     "a bench measures that Psi.",
 )

@@ -1,9 +1,9 @@
 """What to expect of a camera before it is built: error, bound of disparity, light; from Psi alone.
 
 The error is that of textures on two surfaces half a sample of disparity apart, averaged over the
-disparities to be seen (see `reconstruction.theory.periodic`). Of the figures of Psi that were tried
-on one-shot cameras of group A it ordered the default method's PSNR best: rank correlation 0.85,
-against 0.81 of the Ziv-Zakai bound and 0.63 of the error of one surface of known disparity.
+disparities to be seen (see `reconstruction.theory.periodic`). It orders the default method's PSNR:
+rank correlation 0.93 over 13 cameras with the mean of four scenes of group A, 96x96 (`emmc-rig
+design --check`).
 """
 
 from __future__ import annotations

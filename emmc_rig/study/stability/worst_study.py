@@ -25,8 +25,10 @@ from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import swept_disparity
+from emmc_rig.study.stability import fault_points
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
-from emmc_rig.study.stability.fault_points import FAST_METHODS, FAST_SCENES, METHODS, SCENES
+from emmc_rig.study.stability.fault_points import FAST_SCENES, SCENES
+from emmc_rig.study.stability.fault_sweep import open_dictionary_once
 from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
@@ -34,10 +36,11 @@ from emmc_rig.study.sweep import (
     Sweep,
     check_scene_names,
     csv_text,
+    dictionary_identity,
     open_folder,
     provenance,
 )
-from reconstruction.methods import find_method, reconstruct
+from reconstruction.methods import METHODS, find_method, reconstruct
 
 Array = NDArray[np.floating]
 CAMERA = "rgbw-bayer-1shot"
@@ -60,6 +63,7 @@ class WorstSettings(Settings):
     methods: tuple[str, ...]
     size: tuple[int, int]
     fast: bool = False
+    dictionary: str | None = None
     seed: int = 0
 
     def trial(self, scene: str) -> Trial:
@@ -79,6 +83,7 @@ def worst_settings(
     camera: str | None,
     methods: Sequence[str],
     size: tuple[int, int] | None,
+    dictionary: str | None,
     seed: int,
 ) -> WorstSettings:
     """Return the settings, checked; raises AppError and ReconstructionError for wrong ones."""
@@ -91,10 +96,11 @@ def worst_settings(
         find_method(name)
     camera = camera or CAMERA
     find_camera(camera)
-    methods = tuple(methods) or (FAST_METHODS if fast else METHODS)
+    methods = tuple(methods) or (fault_points.FAST_METHODS if fast else fault_points.METHODS)
     return WorstSettings(
-        scenes=scenes, camera=camera, methods=methods, size=size, fast=fast, seed=seed
-    )
+        scenes=scenes, camera=camera, methods=methods, size=size, fast=fast,
+        dictionary=dictionary, seed=seed,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -136,6 +142,7 @@ class WorstSweep(Sweep[Point]):
             "camera": find_camera(settings.camera).model_dump(mode="json"),
             "size": settings.size,
             "seed": settings.seed,
+            "dictionary": dictionary_identity(settings.dictionary),
         }
 
     def group(self, point: Point) -> tuple[str, str]:
@@ -144,12 +151,16 @@ class WorstSweep(Sweep[Point]):
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the figures of each point of one scene and method."""
-        trial = self.settings.trial(points[0].scene)
+        trial, method = self.settings.trial(points[0].scene), points[0].method
+        dictionary = None
+        if METHODS[method].needs_dictionary:
+            views = trial.psi.light_field_shape[:2]
+            dictionary = open_dictionary_once(self.settings.dictionary, views, trial.psi.binning)
 
         def solve(readings: Array) -> Array:
             frames = readings.astype(np.float32)
             sigma = max(trial.noise_sigma, 1e-9)
-            result = reconstruct(points[0].method, trial.psi, frames, sigma, usable=trial.usable)
+            result = reconstruct(method, trial.psi, frames, sigma, dictionary, usable=trial.usable)
             return result.light_field
 
         base = None
