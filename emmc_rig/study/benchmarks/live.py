@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import http.client
 import json
-import multiprocessing
 import socket
 import statistics
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import uvicorn
@@ -161,19 +161,29 @@ def _served(watch: Watch) -> Iterator[tuple[int, str]]:
         watch.close()
 
 
-def _poll(port: int, path: str, clients: int, ready: Any) -> None:
-    """Ask for the state again and again, as so many pages do, until ended."""
+def _client(call: str) -> subprocess.Popen[str]:
+    """Start a process that makes a call of this module; it must be ended."""
+    code = f"from emmc_rig.study.benchmarks import live; live.{call}"
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def _poll(port: int, path: str, clients: int) -> None:
+    """Ask for the state again and again, as so many pages do, until ended; say when all do."""
+    begun = threading.Barrier(clients + 1)
 
     def one() -> None:
         link, version = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S), 0
         while True:
             link.request("GET", f"{path}/state?after={version}")
+            if version == 0:
+                begun.wait()
             version = json.loads(link.getresponse().read())["version"]
-            ready.release()
 
     threads = [threading.Thread(target=one, daemon=True) for _ in range(clients)]
     for thread in threads:
         thread.start()
+    begun.wait()
+    print("all ask", flush=True)
     for thread in threads:
         thread.join()
 
@@ -181,13 +191,10 @@ def _poll(port: int, path: str, clients: int, ready: Any) -> None:
 def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
     """Return how soon the stage is told to stop while so many pages follow a running camera."""
     stage, camera = StoppingStage(), MemoryCamera((480, 640))
-    spawning = multiprocessing.get_context("spawn")
-    with _served(Watch(camera, stage)) as (port, path):  # pyright: ignore[reportArgumentType]
-        ready = spawning.Semaphore(0)
-        crowd = spawning.Process(target=_poll, args=(port, path, clients, ready), daemon=True)
-        crowd.start()
-        for _ in range(2 * clients):
-            ready.acquire()
+    watch = Watch(camera, stage)  # pyright: ignore[reportArgumentType]
+    with _served(watch) as (port, path), _client(f"_poll({port}, {path!r}, {clients})") as crowd:
+        assert crowd.stdout is not None
+        crowd.stdout.readline()
         delays_s = []
         for _ in range(stops):
             link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
@@ -197,14 +204,13 @@ def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
             link.close()
             delays_s.append(stage.told_s[before] - sent_s)
             time.sleep(0.1)
-        crowd.terminate()
-        crowd.join()
+        crowd.kill()
     ms = [1e3 * one for one in delays_s]
     return StopTiming(clients, statistics.median(ms), max(ms))
 
 
-def _fetch(port: int, path: str, seconds: float, told: Any) -> None:
-    """Follow the page for some seconds as its script does; send how many pictures came."""
+def _fetch(port: int, path: str, seconds: float) -> None:
+    """Follow the page for some seconds as its script does; print pictures per second, bytes."""
     links = [http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S) for _ in range(2)]
 
     def ask(link: http.client.HTTPConnection, what: str) -> bytes:
@@ -222,20 +228,17 @@ def _fetch(port: int, path: str, seconds: float, told: Any) -> None:
         if time.monotonic() >= begin_s:
             started_s = started_s or time.monotonic()
             pictures, size = pictures + 1, len(data)
-    told.put(((pictures - 1) / (time.monotonic() - started_s), size))
+    print((pictures - 1) / (time.monotonic() - started_s), size)
 
 
 def shown_timing(shape: tuple[int, int] = LARGE_PX, seconds: float = WATCHED_S) -> ShownTiming:
     """Return how many pictures a second of a large camera reach one page, with all its figures."""
-    spawning = multiprocessing.get_context("spawn")
     with _served(Watch(MemoryCamera(shape))) as (port, path):
-        told = spawning.Queue()
-        client = spawning.Process(target=_fetch, args=(port, path, seconds, told), daemon=True)
-        client.start()
         before_s, began_s = time.process_time(), time.monotonic()
-        rate, size = told.get(timeout=PATIENCE_S + seconds)
+        with _client(f"_fetch({port}, {path!r}, {seconds})") as client:
+            answer, _ = client.communicate(timeout=PATIENCE_S + seconds)
         cpu_share = (time.process_time() - before_s) / (time.monotonic() - began_s)
-        client.join()
+        rate, size = (float(one) for one in answer.split())
     return ShownTiming(shape[0] * shape[1] / 1e6, rate, size / 1e3, cpu_share / rate)
 
 
