@@ -35,6 +35,7 @@ WRITERS = {
     "chart --ablation": (*SIZE,),
     "chart --guard": (*SIZE,),
     "chart --kernels": (*SIZE,),
+    "chart --live": (*SIZE,),
     "chart --next-shot": (*SIZE,),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
