@@ -32,7 +32,7 @@ from emmc_rig.live.watch import Watch
 from emmc_rig.rig.hardware import simulated_rig
 
 BLACK, WHITE = 256, 4095
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 TOKEN = "secret"
 
 
