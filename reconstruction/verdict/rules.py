@@ -1,4 +1,8 @@
-"""The rules: figures beyond a limit become reasons, each with its remedy, and reasons a verdict."""
+"""The rules: figures beyond a limit become reasons, each with its remedy, and reasons a verdict.
+
+The limits are tuned, not derived: `emmc-rig stability --verdicts` measures how many broken results
+and how many good ones they flag. Half and double of a limit are not measured on all of its cases.
+"""
 
 from __future__ import annotations
 
