@@ -135,6 +135,7 @@ def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "files.json",
         "light_field.h5",
+        "maps.h5",
         "metrics.json",
         "pictures",
     }
