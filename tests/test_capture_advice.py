@@ -215,6 +215,30 @@ def a_window_of_unknown_size(bench):
     bench.boards(open=[{"window": [0, 0]}])
 
 
+@walk("give file or camera, one of them")
+def a_condition_of_no_source(bench):
+    bench.plan(suspend=[{"name": "lamp", "low": 1}])
+    yield bench.refused()
+    bench.plan()
+
+
+@walk("give low, high or both")
+def a_condition_without_range(bench):
+    bench.plan(suspend=[{"name": "lamp", "file": "lamp.txt"}])
+    yield bench.refused()
+    bench.plan()
+
+
+@walk("it is empty")
+@walk(" cannot be read (")
+def a_condition_of_an_empty_file(bench):
+    file = bench.folder / "lamp.txt"
+    file.write_text("")
+    bench.plan(suspend=[{"name": "lamp", "file": str(file), "low": 1}])
+    yield bench.refused()
+    file.write_text("1.5 mW")
+
+
 @walk(" shots, from 0")
 def shots_that_are_none(bench):
     bench.boards(shots=[0, 2])

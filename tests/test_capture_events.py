@@ -144,14 +144,14 @@ def test_figures_are_read_from_files_and_from_the_camera(tmp_path):
     details["DeviceTemperature"], details["door"] = "40", "open"
     assert asked() == "a door is open"
     del details["DeviceTemperature"]
-    assert "the camera tells no DeviceTemperature" in asked()
+    assert "the camera reports no DeviceTemperature" in asked()
 
 
 @pytest.mark.parametrize(
     ("suspend", "said"),
     [
         ([{"name": "lamp", "file": "/no/such", "low": 1}], "suspend.0: lamp cannot be read"),
-        ([{"name": "t", "camera": "Temperature", "high": 1}], "the camera tells no Temperature"),
+        ([{"name": "t", "camera": "Temperature", "high": 1}], "the camera reports no Temperature"),
         ([{"name": "t", "high": 1}], "give file or camera"),
         ([{"name": "t", "file": "x"}], "give low, high or both"),
         ([{"name": "t", "file": "x", "hihg": 1}], "did you mean 'high'"),

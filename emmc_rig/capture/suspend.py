@@ -18,7 +18,7 @@ def suspended_by(
     details: Callable[[], Mapping[str, str]],
     further: Suspend | None = None,
 ) -> Suspend:
-    """Return what tells whether a capture has to wait; details: what the camera tells of itself.
+    """Return a function that says why a capture has to wait; details: of the camera, by name.
 
     Raises AppError with one line for a figure that cannot be read even now.
     """
@@ -48,7 +48,7 @@ def _out_of_range(one: Suspender, details: Callable[[], Mapping[str, str]]) -> s
         value = _value(one, details)
     except (OSError, ValueError, KeyError, DriverError) as fault:
         return f"{one.name} cannot be read ({_why(fault)})"
-    if one.low is not None and value < one.low:
+    if one.low is not None and not value >= one.low:
         return f"{one.name} is {value:g}, below {one.low:g}"
     if one.high is not None and not value <= one.high:
         return f"{one.name} is {value:g}, above {one.high:g}"
@@ -57,14 +57,18 @@ def _out_of_range(one: Suspender, details: Callable[[], Mapping[str, str]]) -> s
 
 def _value(one: Suspender, details: Callable[[], Mapping[str, str]]) -> float:
     if one.file is not None:
-        return float(Path(one.file).read_text(encoding="utf-8").split()[0])
-    assert one.camera is not None
-    return float(details()[one.camera].split()[0])
+        text = Path(one.file).read_text(encoding="utf-8")
+    else:
+        assert one.camera is not None
+        text = details()[one.camera]
+    if not text.split():
+        raise ValueError("it is empty")
+    return float(text.split()[0])
 
 
 def _why(fault: Exception) -> str:
     if isinstance(fault, OSError):
         return fault.strerror or str(fault)
     if isinstance(fault, KeyError):
-        return f"the camera tells no {fault.args[0]}"
+        return f"the camera reports no {fault.args[0]}"
     return str(fault).partition("\n")[0]
