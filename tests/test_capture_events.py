@@ -135,7 +135,9 @@ def test_figures_are_read_from_files_and_from_the_camera(tmp_path):
     lamp.write_text("0.9")
     assert asked() == "lamp is 0.9, below 0.98"
     lamp.write_text("nan")
-    assert "above" in asked()
+    assert asked() == "lamp is nan, below 0.98"
+    lamp.write_text("")
+    assert asked() == "lamp cannot be read (it is empty)"
     lamp.unlink()
     assert "lamp cannot be read (No such file" in asked()
     lamp.write_text("1")
