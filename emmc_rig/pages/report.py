@@ -352,13 +352,7 @@ def _cards(content: ReportContent) -> list[Card]:
         versus,
         Card("SSIM", _written(metrics.get("ssim"), ".4f"), "1 is identical"),
         Card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
-        Card(
-            "Calibration costs",
-            _written(cost, "z.2f", "dB"),
-            f"with the exact Psi: {_written(exact, '.2f', 'dB')}"
-            if _number(exact) is not None
-            else "needs a run with the exact Psi",
-        ),
+        *([] if exact is None else [_cost_card(exact, cost)]),
         Card(
             "Time",
             f"{total_s:.1f} s" if stages else "not measured",
@@ -371,6 +365,11 @@ def _cards(content: ReportContent) -> list[Card]:
             "good" if status.startswith("converged") else "watch",
         ),
     ]
+
+
+def _cost_card(exact_db: object, cost_db: object) -> Card:
+    with_exact = f"with the exact Psi: {_written(exact_db, '.2f', 'dB')}"
+    return Card("Calibration costs", _written(cost_db, "z.2f", "dB"), with_exact)
 
 
 class VerdictHead(NamedTuple):
@@ -392,7 +391,7 @@ def _verdict_head(content: ReportContent) -> VerdictHead | None:
     advice = str(content.metrics.get("advice") or "")
     return VerdictHead(
         level,
-        "; ".join(why) or "nothing in frames, Psi and light field speaks against it",
+        "; ".join(why) or "frames, Psi and light field agree",
         [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
         {"trust": "good", "doubt": "watch"}.get(level, "bad"),
     )
