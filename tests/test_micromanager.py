@@ -157,7 +157,7 @@ def test_a_camera_or_axis_that_the_configuration_lacks_is_named():
         demo_camera(label="Cam2")
     with pytest.raises(MicroManagerError, match=r"no axis 'XY.z' for mask_x: name one of XY.x"):
         demo_stage({"mask_x": "XY.z"})
-    with pytest.raises(MicroManagerError, match="how far mask_x may go"):
+    with pytest.raises(MicroManagerError, match="does not state the travel of mask_x"):
         demo_stage(travel_um={})
 
 
