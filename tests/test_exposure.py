@@ -47,7 +47,7 @@ def scene_samples(name, views=(5, 5)):
 def rig_for(text, scene="near-planar", brightness=1.0, spot=0.0):
     """The simulated rig; spot: in one corner of the scene, how much brighter than white."""
     camera = plan_and_camera(text)[1]
-    samples = brightness * scene_samples(scene, camera.views)
+    samples = np.float32(brightness) * scene_samples(scene, camera.views)
     if spot:
         samples = samples.copy()
         samples[:, :, :3, :3] = spot

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from emmc_rig.cli import app
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import FAULTS, trial
@@ -84,6 +85,23 @@ def test_an_even_scene_behind_a_displaced_mask_tells_the_displacement():
     assert found.shift == pytest.approx((-0.2, 0.1), abs=0.03)
     assert found.size_px == pytest.approx(np.hypot(0.2, 0.1), abs=0.03)
     assert still.size_px < 0.02
+
+
+def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
+    """One monochrome shot: the picture's colours are wrong, which looks like a displaced mask."""
+    camera, size = find_camera("scenario-iii-mono"), (96, 128)
+    moved = camera.model_copy(
+        update={"shots": (camera.shots[0].model_copy(update={"offset_um": {"mask": (0, 24.0)}}),)}
+    )
+    psi, true = build_imaging_matrix(camera, size), build_imaging_matrix(moved, size)
+    scene = np.asarray(open_scene("deep-occlusions", size=size))
+    sizes = []
+    for frames in (psi.forward(scene), true.forward(scene)):
+        found = displaced(psi, relief_in(psi, frames))
+        assert found is not None
+        sizes.append(found.size_px)
+    assert sizes[0] < 0.22
+    assert sizes[1] > 0.8
 
 
 def test_a_psi_without_its_camera_tells_no_displacement(three):

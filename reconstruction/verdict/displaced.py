@@ -6,7 +6,7 @@ residual of the readings beyond Psi's own modulation is regressed on these chang
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,12 @@ DISTANCE_STEP = 0.1
 VIGNETTING_STEP = 0.3
 ALIKE = 0.5
 """Correlation below which the design says nothing about a Psi."""
+DECOYS_PX = (36, 12), (-24, 48), (36, -36), (-24, -24)
+"""By how much derivatives are moved (y, x) so that they mean nothing: further than masks correlate,
+and by whole tiles of colour filters of 2, 3, 4 and 6 pixels."""
+DECOY = 0.2
+"""Correlation with the derivatives themselves above which moved ones still mean something: those of
+periodic masks."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,10 @@ class Displaced:
     """shifts: (tile, 2), by which the shadow lies off Psi's (y, x), in pixels.
 
     errors: (tile, 2), their deviations. centres: (tile, 2), (y, x) in pixels. shift: their
-    weighted mean. size_px: their root mean square beyond what the deviations make. changes: of
-    `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost rays lose.
+    weighted mean. size_px: their root mean square beyond what the deviations make, and beyond what
+    derivatives elsewhere make of the same readings (a placebo: what a wrong picture adds to both).
+    changes: of `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost
+    rays lose.
     """
 
     shifts: NDArray[np.float64]
@@ -117,20 +125,15 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
         "blur": (up + down + right + left - 4 * own) / (2 * STEP_PX**2),
         "vignetting": (darker - found.masks) / VIGNETTING_STEP,
     }
-    shifts, errors, centres = [], [], []
-    for y, x in tiles(good.shape[1:]):
-        base = [one[:, y, x] for one in (found.masks, shift_y, shift_x)]
-        fit = _regressed(base, found.seen[:, y, x], found.weight[:, y, x])
-        if fit is not None:
-            shifts.append(fit.values[1:])
-            errors.append(fit.deviations[1:])
-            centres.append(((y.start + y.stop) / 2, (x.start + x.stop) / 2))
-    if not shifts:
+    tiled = _tiled(found, shift_y, shift_x)
+    if tiled is None:
         return None
-    moved, deviation = np.array(shifts), np.array(errors)
-    weight = 1 / np.square(deviation)
-    mean = np.average(moved, axis=0, weights=weight)
-    beyond = np.average(np.square(moved) - np.square(deviation), axis=0, weights=weight)
+    placebo = [
+        one.beyond
+        for one in (_tiled(found, *moved) for moved in _decoys(shift_y, shift_x, good))
+        if one is not None
+    ]
+    beyond = tiled.beyond - (float(np.mean(placebo)) if placebo else 0.0)
     # One at a time: they are so correlated that together none could be estimated.
     beyond_psi = found.seen - found.masks
     alone = {
@@ -138,17 +141,71 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
         for name, one in changes.items()
     }
     return Displaced(
-        moved,
-        deviation,
-        np.array(centres),
-        (float(mean[0]), float(mean[1])),
-        float(np.sqrt(max(beyond.sum(), 0))),
+        tiled.shifts,
+        tiled.errors,
+        tiled.centres,
+        tiled.mean,
+        float(np.sqrt(max(beyond, 0))),
         {
             name: Change(float(fit.values[0]), float(fit.deviations[0]), fit.gain)
             for name, fit in alone.items()
             if fit is not None
         },
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Tiled:
+    """shifts, errors, centres: see `Displaced`. beyond: mean square of the shifts, y and x added,
+    less what the deviations make."""
+
+    shifts: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    centres: NDArray[np.float64]
+
+    @property
+    def mean(self) -> tuple[float, float]:
+        y, x = np.average(self.shifts, axis=0, weights=1 / np.square(self.errors))
+        return float(y), float(x)
+
+    @property
+    def beyond(self) -> float:
+        squares = np.square(self.shifts) - np.square(self.errors)
+        return float(np.average(squares, axis=0, weights=1 / np.square(self.errors)).sum())
+
+
+def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Tiled | None:
+    """Return the shifts that each tile's readings ask for, None where no tile determines any."""
+    fits = {}
+    for y, x in tiles(found.good.shape[1:]):
+        base = [one[:, y, x] for one in (found.masks, shift_y, shift_x)]
+        fit = _regressed(base, found.seen[:, y, x], found.weight[:, y, x])
+        if fit is not None:
+            fits[(y.start + y.stop) / 2, (x.start + x.stop) / 2] = fit
+    if not fits:
+        return None
+    return _Tiled(
+        np.array([fit.values[1:] for fit in fits.values()]),
+        np.array([fit.deviations[1:] for fit in fits.values()]),
+        np.array(list(fits)),
+    )
+
+
+def _decoys(
+    shift_y: Array, shift_x: Array, good: NDArray[np.bool_]
+) -> Iterator[tuple[Array, Array]]:
+    """Yield the derivatives moved by each of DECOYS_PX, but for those that still correlate."""
+    for by in DECOYS_PX:
+        moved = np.roll(shift_y, by, axis=(1, 2)), np.roll(shift_x, by, axis=(1, 2))
+        pairs = zip((shift_y, shift_x), moved, strict=True)
+        if all(_correlation(own[good], other[good]) < DECOY for own, other in pairs):
+            yield moved
+
+
+def _correlation(one: Array, other: Array) -> float:
+    """Return that of two arrays around 0, its size alone."""
+    products = np.mean(one * other), np.mean(np.square(one)) * np.mean(np.square(other))
+    return abs(float(products[0])) / max(float(np.sqrt(products[1])), 1e-12)
 
 
 def _vignetted(psi: ImagingMatrix, lost: float) -> ImagingMatrix:
