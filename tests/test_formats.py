@@ -14,9 +14,9 @@ from programs import program
 
 from emmc_rig.errors import ERRORS
 from emmc_rig.files.formats import FORMATS, Export
-from emmc_rig.files.formats.format import linear_of, srgb_of
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, view_disparities
+from emmc_rig.model.srgb import linear_of, srgb_of
 from emmc_rig.pages.viewer import VIEWER
 
 VIEWS, SIZE = (5, 5), (36, 48)

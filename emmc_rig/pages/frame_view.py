@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from drivers.raw import RawFrame
+from emmc_rig.model.srgb import codes_of, srgb_of
 
 BAYER = ("rggb", "bggr", "grbg", "gbrg")
 LETTERS = {"r": "red", "g": "green", "b": "blue"}
@@ -114,8 +115,7 @@ def preview(frame: RawFrame) -> NDArray[np.uint8]:
 
 def srgb_codes(linear: Array) -> NDArray[np.uint8]:
     """Return linear light in [0, 1] (any shape) as 8 bits for a display (IEC 61966-2-1)."""
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255 * coded).astype(np.uint8)
+    return codes_of(srgb_of(linear))
 
 
 def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:

@@ -134,7 +134,7 @@ def render(content: ReportContent) -> str:
             "data": _page_data(content, shown, curve, errors),
             "viewer-data": viewer_data(_viewer_content(content), atlases=False),
         },
-        scripts=("report.js", "viewer.js"),
+        scripts=("viewer.js", "report.js"),
     )
 
 

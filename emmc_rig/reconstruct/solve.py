@@ -174,12 +174,7 @@ def reconstruct_folder(
         result = reconstruct(
             psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
         )
-        if session is not None:
-            result = with_exposure(result, session)
-        metrics = {**result.metrics(), "chosen": chosen}
-        metrics |= _compared(result.light_field, truth, psi.layout)
-        result.write(out, metrics)
-        return metrics
+        return _written(result, {"chosen": chosen}, out, session, truth)
     saved.verify()
     check_frames(saved.frames_shape, frames.readings)
     capture = Capture(
@@ -195,24 +190,19 @@ def reconstruct_folder(
         blocks = run_capture(capture, frames, workers, tile, on_block)
         if as_zarr:
             blocks.write_shards(out / RESULT_GROUP, workers)
-    result, verdict = blocks.result(), blocks.verdict(saved.binning)
+    solved, verdict = blocks.result(), blocks.verdict(saved.binning)
     if one_block and not as_zarr:
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
-        whole = replace(result, light_field=light_field, maps=arrays)
-        small = Result(whole, verdict, ImagingMatrix.load(psi_path), frames)
-        if session is not None:
-            small = with_exposure(small, session)
-        metrics = {**small.metrics(), "chosen": chosen, **blocks.metrics()}
-        metrics |= _compared(light_field, truth, saved)
-        small.write(out, metrics)
-        return metrics
+        whole = replace(solved, light_field=light_field, maps=arrays)
+        result = Result(whole, verdict, ImagingMatrix.load(psi_path), frames)
+        return _written(result, {"chosen": chosen, **blocks.metrics()}, out, session, truth)
     if session is not None:
         verdict = verdict_with_exposure(verdict, session)
     metrics = {
-        **figures(result, verdict, frames),
+        **figures(solved, verdict, frames),
         "shots": saved.shape[0],
         "size": list(saved.size),
         "psi_sha256": saved.checksum,
@@ -231,6 +221,18 @@ def reconstruct_folder(
                 blocks.write(name, home.create_dataset(name, shape, dtype))
             metrics |= _compared(file["light_field"], truth, saved)
     write_metrics(out, metrics)
+    return metrics
+
+
+def _written(
+    result: Result, further: dict[str, Any], out: Path, session: Session | None, truth: str | None
+) -> dict:
+    """Write a result that is in memory, judged by its session's exposures; return the metrics."""
+    if session is not None:
+        result = with_exposure(result, session)
+    compared_with = _compared(result.light_field, truth, result.psi.layout)
+    metrics = {**result.metrics(), **further, **compared_with}
+    result.write(out, metrics)
     return metrics
 
 

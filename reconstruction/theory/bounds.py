@@ -51,9 +51,14 @@ def distances(
     covariances = [
         patch.signal(patch.alike(float(d), texture), texture) + noise for d in disparities
     ]
+    return bhattacharyya(covariances)
+
+
+def bhattacharyya(covariances: Sequence[Array]) -> NDArray[np.float64]:
+    """Return the distances of normal distributions of these covariances around 0, (d, d)."""
     halves = [_log_det(one) / 2 for one in covariances]
-    found = np.zeros((len(disparities), len(disparities)))
-    for i in range(len(disparities)):
+    found = np.zeros((len(covariances), len(covariances)))
+    for i in range(len(covariances)):
         for j in range(i):
             both = _log_det((covariances[i] + covariances[j]) / 2) / 2
             found[i, j] = found[j, i] = max(both - (halves[i] + halves[j]) / 2, 0.0)

@@ -34,6 +34,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import OPPONENT
+from reconstruction.theory.bounds import bhattacharyya
 
 Array = NDArray[np.floating]
 SIDE = 16
@@ -192,15 +193,4 @@ class Block:
     def distances(self, disparities: Sequence[float], texture: SceneTexture) -> NDArray[np.float64]:
         """Return the Bhattacharyya distances of the middle's readings, (d, d)."""
         seen = np.ix_(self.middle, self.middle)
-        covariances = [self.covariance(d, texture)[seen] for d in disparities]
-        halves = [_log_det(one) / 2 for one in covariances]
-        found = np.zeros((len(disparities),) * 2)
-        for i in range(len(disparities)):
-            for j in range(i):
-                both = _log_det((covariances[i] + covariances[j]) / 2) / 2
-                found[i, j] = found[j, i] = max(both - (halves[i] + halves[j]) / 2, 0.0)
-        return found
-
-
-def _log_det(matrix: Array) -> float:
-    return 2 * float(np.log(np.diag(np.linalg.cholesky(matrix))).sum())
+        return bhattacharyya([self.covariance(d, texture)[seen] for d in disparities])

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Array, Export, Format, codes_of, srgb_of, write_picture
+from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.novel_view import between, centre_disparity, view_disparities
+from emmc_rig.model.srgb import codes_of, srgb_of
 
 QUILT_COLUMNS, QUILT_ROWS = 8, 6
 FRAMES, FRAMES_PER_S = 48, 24

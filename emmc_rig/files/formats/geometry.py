@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.formats.format import Array, Export, Format, codes_of, srgb_of, write_picture
+from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import centre_disparity
+from emmc_rig.model.srgb import codes_of, srgb_of
 
 BASELINE = 0.02
 """Between views, where disparity 0 lies at 1: a disparity of 1 % of the width is a third nearer."""

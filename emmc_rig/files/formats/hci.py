@@ -18,18 +18,11 @@ import h5py
 import numpy as np
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import (
-    Array,
-    Export,
-    Format,
-    codes_of,
-    linear_of,
-    srgb_of,
-    write_picture,
-)
+from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.lightfield import read_picture
 from emmc_rig.model.novel_view import centre_disparity
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.srgb import codes_of, linear_of, srgb_of
 
 PARAMETERS, DISPARITY = "parameters.cfg", "gt_disp_lowres.pfm"
 FOCAL_MM, SENSOR_MM, BASELINE_MM = 100.0, 35.0, 1.0

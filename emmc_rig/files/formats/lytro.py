@@ -13,16 +13,9 @@ import numpy as np
 import scipy.io
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import (
-    Array,
-    Export,
-    Format,
-    codes_of,
-    linear_of,
-    srgb_of,
-    write_picture,
-)
+from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.lightfield import read_picture
+from emmc_rig.model.srgb import codes_of, linear_of, srgb_of
 
 ESLF = re.compile(r".*_(\d+)x(\d+)_eslf\.png")
 

@@ -8,30 +8,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Array, Export, Format
-
-if TYPE_CHECKING:
-    from types import ModuleType
+from emmc_rig.files.formats.format import Array, Export, Format, extra_module
 
 NAME = "light_field.ome.zarr"
 SCALES = 3
 
 
-def _ngff() -> ModuleType:
-    try:
-        import ngff_zarr
-    except ImportError:
-        raise AppError('OME-Zarr needs ngff-zarr: pip install "emmc-rig[formats]"') from None
-    return ngff_zarr
-
-
 def _write(folder: Path, export: Export) -> None:
-    ngff = _ngff()
+    ngff = extra_module("ngff_zarr", "OME-Zarr")
     rows, columns, height, width, colours = export.light_field.shape
     views = export.light_field.reshape(rows * columns, height, width, colours)
     data = np.ascontiguousarray(views.transpose(0, 3, 1, 2), dtype=np.float32)
@@ -55,7 +43,7 @@ def _read(path: Path) -> Array:
     try:
         attributes = json.loads((path / ".zattrs").read_text())
         rows, columns = attributes["emmc_rig"]["views"]
-        stored = _ngff().from_ngff_zarr(str(path)).images[0].data
+        stored = extra_module("ngff_zarr", "OME-Zarr").from_ngff_zarr(str(path)).images[0].data
         data = np.asarray(stored, dtype=np.float32)
         return data.reshape(rows, columns, *data.shape[1:]).transpose(0, 1, 3, 4, 2)
     except (OSError, ValueError, KeyError, TypeError) as fault:

@@ -17,7 +17,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Array, Export, Format, codes_of, write_picture
+from emmc_rig.files.formats.format import Array, Export, Format, extra_module, write_picture
+from emmc_rig.model.srgb import codes_of
 
 IHDR_END = 33
 """Of every PNG: signature 8, length 4, type 4, data 13, checksum 4."""
@@ -47,16 +48,8 @@ def _write_tiff(folder: Path, export: Export) -> None:
         )  # fmt: skip
 
 
-def _openexr():
-    try:
-        import OpenEXR
-    except ImportError:
-        raise AppError('EXR needs OpenEXR: pip install "emmc-rig[formats]"') from None
-    return OpenEXR
-
-
 def _write_exr(folder: Path, export: Export) -> None:
-    openexr = _openexr()
+    openexr = extra_module("OpenEXR", "EXR")
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     for v, u in np.ndindex(export.light_field.shape[:2]):
         view = np.ascontiguousarray(export.light_field[v, u], np.float32)
@@ -65,7 +58,7 @@ def _write_exr(folder: Path, export: Export) -> None:
 
 
 def _read_exr(path: Path) -> NDArray:
-    with _openexr().File(str(path)) as file:
+    with extra_module("OpenEXR", "EXR").File(str(path)) as file:
         return file.channels()["RGB"].pixels
 
 

@@ -17,17 +17,6 @@ const state = {
 };
 const sources = {}; // truth, estimate, errorViews, errorMean: canvases that hold the sprites
 
-async function load(uri) {
-  const image = new Image();
-  image.src = uri;
-  await image.decode();
-  const canvas = document.createElement("canvas");
-  canvas.width = image.naturalWidth;
-  canvas.height = image.naturalHeight;
-  canvas.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
-  return canvas;
-}
-
 // A request to draw is answered once per screen refresh, however many events asked for it.
 function oncePerFrame(draw) {
   let waiting = false;
@@ -371,7 +360,7 @@ function frameViewer(host, frames, name) {
   whole.addEventListener("pointermove", follow);
   whole.addEventListener("pointerdown", follow);
   onArrows(whole, (dx, dy) => { cursor = [cursor[0] + dx, cursor[1] + dy]; redraw(); });
-  return Promise.all(frames.map((frame) => load(frame.picture))).then((loaded) => {
+  return Promise.all(frames.map((frame) => decoded(frame.picture))).then((loaded) => {
     pictures.push(...loaded);
     whole.classList.toggle("pixels", loaded[0].width < 320);
     draw();
@@ -501,11 +490,11 @@ async function main() {
     frameViewer(byId("shots"), data.shots, "Captured frames"),
     frameViewer(byId("whiteboards"), data.whiteboards, "Whiteboard frames"),
   ];
-  sources.estimate = await load(data.estimate);
+  sources.estimate = await decoded(data.estimate);
   if (data.truth) {
-    sources.truth = await load(data.truth);
-    sources.errorViews = await load(data.error.views);
-    sources.errorMean = await load(data.error.mean);
+    sources.truth = await decoded(data.truth);
+    sources.errorViews = await decoded(data.error.views);
+    sources.errorMean = await decoded(data.error.mean);
   }
   listen();
   drawViews();

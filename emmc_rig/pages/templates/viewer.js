@@ -1,4 +1,23 @@
 "use strict";
+// Pictures in the page as canvases that hold their pixels; each is decoded once, whoever asks: report.js does too.
+const decoded = (() => {
+  const known = new Map();
+  async function decode(uri) {
+    const image = new Image();
+    image.src = uri;
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    canvas.width = image.naturalWidth;
+    canvas.height = image.naturalHeight;
+    canvas.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
+    return canvas;
+  }
+  return (uri) => {
+    if (!known.has(uri)) known.set(uri, decode(uri));
+    return known.get(uri);
+  };
+})();
+
 // A light field to turn, focus and look into. The shader is the twin of model/novel_view.py.
 (() => {
 const data = JSON.parse(document.getElementById("viewer-data").textContent);
@@ -16,17 +35,6 @@ const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus
 const state = { ...home(), overlay: -1, x: width >> 1, y: height >> 1 };
 const picture = byId("picture");
 let renderer, atlases = {}, depth, overlayLevels = [];
-
-async function decoded(uri) {
-  const image = new Image();
-  image.src = uri;
-  await image.decode();
-  const canvas = document.createElement("canvas");
-  canvas.width = image.naturalWidth;
-  canvas.height = image.naturalHeight;
-  canvas.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
-  return canvas;
-}
 
 const VERTEX = `#version 300 es
 void main() {
