@@ -15,17 +15,18 @@ from emmc_rig.pages import drawing
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Silent
 from emmc_rig.study.stability import fault_sweep, sweeping
-from emmc_rig.study.stability.breaking import (
+from emmc_rig.study.stability.curves import (
+    POOLED,
     Span,
     below_best,
     below_view,
+    breaking_rows,
+    curves,
     span,
     span_words,
     strength_at,
 )
-from emmc_rig.study.stability.curves import POOLED, breaking_rows, curves
-from emmc_rig.study.stability.fault_points import Point, planned, stability_settings
-from emmc_rig.study.stability.fault_sweep import StabilitySweep
+from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep, planned, stability_settings
 from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.stability.sweeping import BREAKS_CSV, POINTS_CSV, run_stability
 from emmc_rig.study.sweep import SweepStopped

@@ -15,8 +15,8 @@ def chart_kernels(camera: str, size: tuple[int, int], repeats: int, out: Path) -
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics
-    from emmc_rig.study.benchmarks.imports import start_timings
     from emmc_rig.study.benchmarks.kernels import kernel_timings, reconstruction_memory
+    from emmc_rig.study.benchmarks.timing import start_timings
 
     described = emmc.camera(camera)
     table = Table("kernel", "GB counted", "ms", "GB/s", "times its bound")

@@ -240,10 +240,13 @@ def bench(
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics
-    from emmc_rig.study.benchmarks.ptp import picture_timing
-    from emmc_rig.study.benchmarks.stages import stage_timings
-    from emmc_rig.study.benchmarks.trigger import capture_timing, trigger_timing
-    from emmc_rig.study.benchmarks.u3v import u3v_timings
+    from emmc_rig.study.benchmarks.devices import (
+        capture_timing,
+        picture_timing,
+        stage_timings,
+        trigger_timing,
+        u3v_timings,
+    )
 
     with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
         timings = stage_timings(repeats)

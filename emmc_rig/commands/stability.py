@@ -75,10 +75,9 @@ def stability(
 
     from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.files.results import parse_size
-    from emmc_rig.study.stability.beside import measure_beside
     from emmc_rig.study.stability.curves import breaking_rows
-    from emmc_rig.study.stability.fault_points import CAMERA, planned, stability_settings
-    from emmc_rig.study.stability.sweeping import run_stability
+    from emmc_rig.study.stability.fault_sweep import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.sweeping import measure_beside, run_stability
 
     if faults:
         _list_faults()

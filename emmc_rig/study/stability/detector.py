@@ -27,10 +27,9 @@ from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS, Fault
 from emmc_rig.study.stability.fault_sweep import open_dictionary_once
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
-from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.stability.trial import MASK, SENSOR, SHOTS, Fault, Trial
 from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, find_method

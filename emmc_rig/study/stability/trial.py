@@ -1,4 +1,4 @@
-"""One trial: what a method is given (Psi, readings, noise, usable pixels), and the truth."""
+"""Trials, what a method is given and the truth, and the faults that a capture can have."""
 
 from __future__ import annotations
 
@@ -119,3 +119,45 @@ def trial_of(
     shots = setup.camera.read_out(clean, setup.seed)
     usable = shots.usable if unusable is None else shots.usable & ~unusable
     return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
+
+
+SEVERAL = 3
+"""Shots that a camera is given where a fault needs several."""
+
+
+SENSOR, MASK, SHOTS = "Light and sensor", "Mask and lens", "Between shots"
+SCENE, DESIGN = "Scene", "Design"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One way to fail.
+
+    strengths: from harmless to hopeless, in `unit`; a sweep is judged on both sides of its best,
+    as a design has two ends. quick: those that `--fast` measures. repairable: whether better
+    calibration, detection or repair could undo it, rather than physics or the design setting the
+    limit. screened: whether screening the frames is meant to help. shots: fewest that it takes.
+    whole: whether there is nothing between two strengths. clean: whether strength 0 is no fault.
+    """
+
+    name: str
+    title: str
+    unit: str
+    strengths: tuple[float, ...]
+    quick: tuple[float, ...]
+    kind: str
+    make: Callable[[Setup, float], Trial]
+    repairable: bool = False
+    screened: bool = False
+    shots: int = 1
+    whole: bool = False
+    clean: bool = True
+
+    def is_clean(self, strength: float) -> bool:
+        """Whether nothing is wrong at a strength: the trial is then that of any other fault."""
+        return self.clean and strength == 0
+
+    @property
+    def explained(self) -> str:
+        """What happens, in one sentence."""
+        return (self.make.__doc__ or "").strip().partition("\n")[0]

@@ -25,10 +25,9 @@ from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import swept_disparity
-from emmc_rig.study.stability import fault_points
+from emmc_rig.study.stability import fault_sweep
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
-from emmc_rig.study.stability.fault_points import FAST_SCENES, SCENES
-from emmc_rig.study.stability.fault_sweep import open_dictionary_once
+from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES, open_dictionary_once
 from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
@@ -96,7 +95,7 @@ def worst_settings(
         find_method(name)
     camera = camera or CAMERA
     find_camera(camera)
-    methods = tuple(methods) or (fault_points.FAST_METHODS if fast else fault_points.METHODS)
+    methods = tuple(methods) or (fault_sweep.FAST_METHODS if fast else fault_sweep.SWEPT_METHODS)
     return WorstSettings(
         scenes=scenes, camera=camera, methods=methods, size=size, fast=fast,
         dictionary=dictionary, seed=seed,
