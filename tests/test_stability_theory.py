@@ -27,7 +27,7 @@ from emmc_rig.study.stability.theory_section import (
     rank_correlation,
     theory_sections,
 )
-from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.problem import OPPONENT
 from reconstruction.theory.patch import SIDE, PatchModel, Texture

@@ -14,7 +14,7 @@ import numpy as np
 
 from emmc_rig.study.stability.fault_sweep import Point
 from emmc_rig.study.stability.faults import FAULTS
-from emmc_rig.study.stability.trial import Fault
+from emmc_rig.study.trial import Fault
 
 LOST_DB = 3.0
 

@@ -5,7 +5,6 @@ All methods of a (scene, fault, strength) get the same trial.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,8 +16,7 @@ from pydantic import Field
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import number
 from emmc_rig.pages.pictures import telling_lines
@@ -26,7 +24,6 @@ from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
-from emmc_rig.study.stability.trial import Fault, Setup, Trial
 from emmc_rig.study.sweep import (
     Results,
     Sweep,
@@ -35,7 +32,8 @@ from emmc_rig.study.sweep import (
     digest_of,
     machine,
 )
-from reconstruction.methods import METHODS, MethodSettings, find_method, reconstruct
+from emmc_rig.study.trial import Fault, Setup, Trial
+from reconstruction.methods import METHODS, MethodSettings, find_method
 from reconstruction.sparse import SparseSettings
 
 SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
@@ -152,7 +150,6 @@ def planned(settings: StabilitySettings) -> list[Point]:
 
 
 PICTURES = "pictures"
-open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)
 
 
 @dataclass
@@ -225,22 +222,10 @@ class StabilitySweep(Sweep[Point]):
             yield self._measured(point, made)
 
     def _measured(self, point: Point, made: Trial) -> dict:
-        dictionary = None
-        if METHODS[point.method].needs_dictionary:
-            views = made.psi.light_field_shape[:2]
-            dictionary = open_dictionary_once(self.settings.dictionary, views, made.psi.binning)
-        stretched_db = 20 * math.log10(made.peak)
-        view_db = psnr_db(replicate_centre(made.truth), made.truth) + stretched_db
+        view_db = made.psnr_db(replicate_centre(made.truth))
         try:
-            result = reconstruct(
-                point.method,
-                made.psi,
-                made.readings,
-                made.noise_sigma,
-                dictionary,
-                _settings(point, made.psi.binning),
-                made.usable,
-            )
+            settings = _settings(point, made.psi.binning)
+            result = made.solved(point.method, settings, self.settings.dictionary)
         except MemoryError:
             return {"failed": "not enough memory", "keep": False}
         except Exception as fault:
@@ -253,7 +238,7 @@ class StabilitySweep(Sweep[Point]):
             return {"failed": "the estimate is not finite", "view_db": view_db}
         save_thumbnail(self.picture(point), estimate, telling_lines(made.truth))
         return {
-            "psnr_db": psnr_db(estimate, made.truth) + stretched_db,
+            "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,
             "angular_db": angular_snr_db(estimate, made.truth),
             "usable": float(made.usable.mean()),

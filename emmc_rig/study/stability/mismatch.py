@@ -22,16 +22,14 @@ from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
-from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.drawing import COLOURS, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
 from emmc_rig.study.stability.fault_sweep import StabilitySettings
 from emmc_rig.study.stability.faults import find_fault
-from emmc_rig.study.stability.rounding import solved
-from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
+from emmc_rig.study.trial import Trial
 from reconstruction.errors import ReconstructionError
 
 SCENARIOS = ("ideal", "mismatched", "oracle", "blind")
@@ -117,10 +115,10 @@ def corrected(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, boo
 
 def _psnr(taken: Trial, psi: ImagingMatrix, method: str) -> float:
     try:
-        found = solved(replace(taken, psi=psi), method)
+        found = replace(taken, psi=psi).solved(method)
     except ReconstructionError:
         return math.nan
-    return psnr_db(found.light_field, taken.truth)
+    return taken.psnr_db(found.light_field)
 
 
 @dataclass(frozen=True)

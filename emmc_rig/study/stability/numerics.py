@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
-from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.pages.drawing import LEGEND, colours_of, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
@@ -29,10 +28,9 @@ from emmc_rig.study.stability.rounding import (
     double_precision,
     example,
     rounding,
-    solved,
     step_sizes,
 )
-from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.trial import Trial
 from reconstruction.methods import METHODS
 from reconstruction.result import Reconstruction
 
@@ -136,8 +134,7 @@ class Numerics:
 
 def card_db(trial: Trial) -> float:
     """Return the PSNR of a card of the scene's mean colour, a lower bound for any method."""
-    mean = trial.truth.mean(axis=(0, 1, 2, 3))
-    return psnr_db(np.broadcast_to(mean, trial.truth.shape), trial.truth)
+    return trial.psnr_db(trial.even)
 
 
 def condition_verdict(
@@ -169,14 +166,14 @@ def repeats(trial: Trial, methods: Sequence[str]) -> list[Finding]:
     differ, threaded = [], {}
     threads = get_num_threads()
     for method in methods:
-        first = solved(trial, method)
-        if not identical(first, solved(trial, method)):
+        first = trial.solved(method)
+        if not identical(first, trial.solved(method)):
             differ.append(method)
         if threads == 1:
             continue
         try:
             set_num_threads(1)
-            alone = solved(trial, method).light_field
+            alone = trial.solved(method).light_field
         finally:
             set_num_threads(threads)
         threaded[method] = float(np.abs(alone - first.light_field).max())

@@ -13,18 +13,17 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model import kernels as psi_kernels
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import Setup, Trial, trial_of
 from reconstruction.choices import choose_mu, first_light_field, smooth_guess
 from reconstruction.differences import norm_squared
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings
 from reconstruction.problem import Problem, colour_metric
-from reconstruction.result import Reconstruction, Status
+from reconstruction.result import Status
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -152,21 +151,10 @@ def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) 
     return trial_of(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
 
 
-def solved(trial: Trial, method: str, settings: MethodSettings | None = None) -> Reconstruction:
-    """Return a method's reconstruction of a trial; raises ReconstructionError."""
-    psi = trial.psi
-    dictionary = None
-    if METHODS[method].needs_dictionary:
-        dictionary = open_dictionary(None, psi.light_field_shape[:2], psi.binning)
-    return reconstruct(
-        method, psi, trial.readings, trial.noise_sigma, dictionary, settings, trial.usable
-    )
-
-
 def attempted(trial: Trial, method: str, scale: float = 1.0) -> Attempt:
     """Return the attempt of a method, its light field divided by `scale`."""
     try:
-        found = np.clip(solved(trial, method).light_field.astype(np.float64) / scale, 0, 1)
+        found = np.clip(trial.solved(method).light_field.astype(np.float64) / scale, 0, 1)
     except (ReconstructionError, ModelError) as fault:
         return Attempt(math.nan, str(fault))
     if not np.isfinite(found).all():
@@ -254,8 +242,8 @@ def _tv_against(plain: Reference, trial: Trial) -> float:
 def double_precision(trial: Trial) -> Finding:
     """The light field of TV run to its end in float32 and in float64, by PSNR."""
     wide = ImagingMatrix(trial.psi.weights.astype(np.float64), trial.psi.colour, trial.psi.binning)
-    narrow = solved(trial, "tv").light_field
-    other = solved(replace(trial, psi=wide), "tv").light_field
+    narrow = trial.solved("tv").light_field
+    other = replace(trial, psi=wide).solved("tv").light_field
     apart = psnr_db(narrow, trial.truth) - psnr_db(other, trial.truth)
     verdict = SOUND if abs(apart) < SAME_DB else WEAK
     meaning = "all of Psi and the solver in float64 find the same light field"
@@ -264,13 +252,13 @@ def double_precision(trial: Trial) -> Finding:
 
 def step_sizes(trial: Trial) -> list[Finding]:
     """TV with primal steps and mu far from those that it chooses."""
-    usual = solved(trial, "tv", MethodSettings(tv=TVSettings(objective_every=1)))
+    usual = trial.solved("tv", MethodSettings(tv=TVSettings(objective_every=1)))
     objective = usual.objective[-1][1]
     findings = []
     for factor in STEP_FACTORS:
         step = usual.parameters["primal_step"] * factor
         chosen = TVSettings(mu=usual.parameters["mu"], primal_step=step, objective_every=1)
-        found = solved(trial, "tv", MethodSettings(tv=chosen))
+        found = trial.solved("tv", MethodSettings(tv=chosen))
         value = found.objective[-1][1]
         finite = bool(np.isfinite(found.light_field).all())
         stopped = found.status != Status.CONVERGED
@@ -286,7 +274,7 @@ def step_sizes(trial: Trial) -> list[Finding]:
             )
         )
     for mu in (1e-12, 1e6):
-        found = solved(trial, "tv", MethodSettings(tv=TVSettings(mu=mu)))
+        found = trial.solved("tv", MethodSettings(tv=TVSettings(mu=mu)))
         finite = bool(np.isfinite(found.light_field).all())
         db = psnr_db(found.light_field, trial.truth) if finite else math.nan
         findings.append(

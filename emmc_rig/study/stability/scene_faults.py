@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emmc_rig.study.stability.trial import SCENE, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import SCENE, Fault, Setup, Trial, trial_of
 from simulators import changes
 from simulators.scenes import SCENES
 

@@ -26,7 +26,7 @@ from emmc_rig.study.stability.curves import Span, below_best, span_words, streng
 from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.stability.stability_page import shown
 from emmc_rig.study.stability.theory import TheoryPoint
-from emmc_rig.study.stability.trial import Fault
+from emmc_rig.study.trial import Fault
 
 BOUND, FOUND, ORACLE = "bound_db", "found_db", "oracle_db"
 DRAWN_AS = {
