@@ -57,10 +57,10 @@ class DetectorSettings(Settings):
 
 def detector_settings(
     fast: bool,
-    scenes: Sequence[str],
+    scenes: Sequence[str] | None,
     camera: str | None,
-    faults: Sequence[str],
-    methods: Sequence[str],
+    faults: Sequence[str] | None,
+    methods: Sequence[str] | None,
     size: tuple[int, int] | None,
     seed: int,
 ) -> DetectorSettings:
@@ -68,19 +68,19 @@ def detector_settings(
 
     Raises AppError and ReconstructionError naming the nearest for names that are not known.
     """
-    for name in faults:
+    for name in faults or ():
         find_fault(name)
-    for name in methods:
+    for name in methods or ():
         find_method(name)
     given = {
         "cameras": (camera,) if camera else (),
-        "faults": tuple(faults),
-        "methods": tuple(methods),
+        "faults": tuple(faults or ()),
+        "methods": tuple(methods or ()),
         "size": size,
     }
     chosen = {key: value for key, value in given.items() if value}
     return DetectorSettings.model_validate(
-        {"fast": fast, "scenes": tuple(scenes) or tuple(SCENES), "seeds": (seed,), **chosen}
+        {"fast": fast, "scenes": tuple(scenes or ()) or tuple(SCENES), "seeds": (seed,), **chosen}
     )
 
 
@@ -250,6 +250,11 @@ class Tally:
     good_flagged: int = 0
     poor: int = 0
     poor_flagged: int = 0
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return, of broken, good, between and poor, how many were flagged, and how many are."""
+        counts = asdict(self)
+        return [(counts[f"{k}_flagged"], counts[k]) for k in ("broken", "good", "between", "poor")]
 
     @property
     def detected(self) -> float | None:
