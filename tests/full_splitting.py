@@ -1,7 +1,7 @@
-"""The paper's full-splitting algorithm (Section VI-B, eq. 10-13), exactly as written: a reference.
+"""The paper's full-splitting algorithm (Section VI-B, eq. 10-13), in plain NumPy: a reference.
 
-It takes the gradients of the misfits of frames and patches where `tv` takes their exact proximal
-step, reaches the same minimiser, and needs many times the steps.
+It takes the gradients of the misfits of frames and patches where `reconstruction.tv` takes their
+exact proximal step, reaches the same minimiser, and needs many times the steps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from reconstruction.choices import (
     first_light_field,
     smooth_guess,
 )
-from reconstruction.differences import adjoint, gradient, norm_squared
+from reconstruction.differences import fitting_indices, norm_squared
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
@@ -31,9 +31,36 @@ from reconstruction.problem import Problem, colour_metric
 from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
+AXIS = (3, 2, 1, 0)
+"""Entries of a multi-index, x y u v, as axes of (v, u, y, x, c)."""
 METHOD = "full-splitting"
 MARGIN = 0.99
 """Of the largest step sizes allowed, what is taken where the settings leave it open."""
+
+
+def gradient(light_field, order):
+    """Return all derivatives (index, v, u, y, x, c) that fit somewhere, 0 where they do not."""
+    found = []
+    for index in fitting_indices(order, light_field.shape):
+        one, missing = light_field, [(0, 0)] * 5
+        for entry, axis in zip(index, AXIS, strict=True):
+            one, missing[axis] = np.diff(one, entry, axis), (0, entry)
+        found.append(np.pad(one, missing))
+    return np.stack(found)
+
+
+def adjoint(derivatives, order):
+    """Return the adjoint of `gradient`; values where a derivative does not fit do not count."""
+    shape = derivatives.shape[1:]
+    total = np.zeros(shape, derivatives.dtype)
+    for index, one in zip(fitting_indices(order, shape), derivatives, strict=True):
+        for entry, axis in zip(index, AXIS, strict=True):
+            one = np.take(one, range(shape[axis] - entry), axis)
+            for _ in range(entry):
+                ends = [(1, 1) if i == axis else (0, 0) for i in range(5)]
+                one = -np.diff(np.pad(one, ends), axis=axis)
+        total += one
+    return total
 
 
 class FullSplittingSettings(Settings):
