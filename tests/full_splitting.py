@@ -38,6 +38,21 @@ MARGIN = 0.99
 """Of the largest step sizes allowed, what is taken where the settings leave it open."""
 
 
+def from_patches(positions, patches, weights, shape):
+    """Return the term of patches (v, u, y, x, c) at their corners; weights: None counts each once.
+
+    The paper's P and its weights: what covers a sample is averaged, as each patch weighs.
+    """
+    total, weight = np.zeros(shape, np.float32), np.zeros(shape[2:4], np.float32)
+    for (y, x), patch, share in zip(
+        positions, patches, weights or [1.0] * len(patches), strict=True
+    ):
+        place = np.s_[y : y + patch.shape[2], x : x + patch.shape[3]]
+        weight[place] += share
+        total[(slice(None), slice(None), *place)] += np.float32(share)[..., None] * patch
+    return PatchTerm(total / np.where(weight > 0, weight, 1)[..., None], weight)
+
+
 def gradient(light_field, order):
     """Return all derivatives (index, v, u, y, x, c) that fit somewhere, 0 where they do not."""
     found = []

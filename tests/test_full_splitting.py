@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from full_splitting import (
     FullSplittingSettings,
+    from_patches,
     into_ball,
     reconstruct_full_splitting,
     step_sizes,
@@ -12,7 +13,6 @@ from full_splitting import (
 
 from emmc_rig.model.settings import validated
 from reconstruction.errors import ReconstructionError
-from reconstruction.patch_term import from_patches
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 

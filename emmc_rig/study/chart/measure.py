@@ -33,7 +33,7 @@ from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.study.chart.captures import read_frames, read_truth
 from emmc_rig.study.chart.peers import PEERS
-from emmc_rig.study.chart.scores import scored
+from emmc_rig.study.scores import scored
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct

@@ -22,7 +22,7 @@ from emmc_rig.pages.page import number
 from emmc_rig.pages.pictures import telling_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import angular_snr_db
+from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
 from emmc_rig.study.sweep import (
     Results,
