@@ -16,7 +16,7 @@ from emmc_rig.progress import Silent
 from emmc_rig.study.tables import reproducing
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import PARTS, cells_of, distinct
-from emmc_rig.study.tables.figures import Piece, Tile, composed, telling_pieces
+from emmc_rig.study.tables.figures import Piece, Tile, composed, detailed_pieces
 from emmc_rig.study.tables.grids import MEAN
 from emmc_rig.study.tables.library import Cut
 from emmc_rig.study.tables.reproducing import COLUMNS, run_tables, shown
@@ -260,7 +260,7 @@ def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
 def test_the_most_telling_piece_is_where_the_texture_is():
     picture = np.full((60, 80, 3), 0.5, np.float32)
     picture[30:42, 50:62] = np.random.default_rng(0).random((12, 12, 3))
-    (piece,) = telling_pieces(picture, 16)
+    (piece,) = detailed_pieces(picture, 16)
     assert 26 <= piece.y <= 32
     assert 46 <= piece.x <= 52
 

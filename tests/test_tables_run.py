@@ -11,7 +11,7 @@ import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
-from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.pictures import Pictures, epipolar_lines, pictures_of
 from emmc_rig.progress import Silent
 from emmc_rig.study.scores import colour_scored
 from emmc_rig.study.sweep import Journal, SweepStopped, digest_of, open_folder
@@ -447,7 +447,7 @@ def test_epipolar_lines_are_taken_where_views_differ():
     lf = np.zeros((5, 5, 20, 30, 3), np.float32)
     lf[:, -1, 11] = 1
     lf[-1, :, :, 17] += 0.5
-    assert telling_lines(lf) == (11, 17)
+    assert epipolar_lines(lf) == (11, 17)
     kept = pictures_of(lf, (11, 17))
     assert (kept.across.shape, kept.down.shape) == ((5, 30, 3), (5, 20, 3))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calibration.shadow import shadow_mask
-from emmc_rig.capture.enough import METHOD, Judgement, judged
+from emmc_rig.capture.assessment import METHOD, Assessment, assessed
 from emmc_rig.capture.plan import Plan
 from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
@@ -129,9 +129,9 @@ class Until:
         session.note("decided", **entry)
         self._watcher.tell(decided_words(entry))
 
-    def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
+    def _judged(self, shots: tuple[int, ...], target_db: float) -> Assessment:
         self._scale = self._scale or session_scale(self._session)
         taken = scaled_readings(self._session, self._scale, shots)
         sigma = taken.noise_sigma
         result = reconstruct(METHOD, taken.psi, taken.readings, sigma, usable=taken.usable)
-        return judged(self._scale.psi, result, shots, sigma, target_db)
+        return assessed(self._scale.psi, result, shots, sigma, target_db)

@@ -43,7 +43,7 @@ class Pictures:
             return None
 
 
-def telling_lines(truth: Array) -> tuple[int, int]:
+def epipolar_lines(truth: Array) -> tuple[int, int]:
     """Return the row and the column (y, x) along which the outer views differ most.
 
     Epipolar images through them show slopes. They lie in the middle three fifths of the picture.

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import centre_view, epi_horizontal
-from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.pages.pictures import epipolar_lines
 
 Array = NDArray[np.floating]
 PANEL_IN = 3.4
@@ -22,7 +22,7 @@ def draw_result(
     epipolar image stacks one row of pixels as the centre row of views shows it: the slope of its
     lines is the disparity.
     """
-    row, _ = telling_lines(light_field)
+    row, _ = epipolar_lines(light_field)
     middle = light_field.shape[0] // 2, light_field.shape[1] // 2
     maps = [
         ("disparity, px per view", disparity, "viridis"),

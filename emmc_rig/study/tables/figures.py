@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
-from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.pictures import Pictures, epipolar_lines, pictures_of
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (
@@ -68,7 +68,7 @@ def screen(picture: Array, curve: DisplayCurve) -> Codes:
     return curve.encode(picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=-1))
 
 
-def telling_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
+def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
     """Return the squares of a picture (y, x, c) with most edges and colour, away from each other.
 
     They lie inside the border, which has no neighbours in other views.
@@ -216,12 +216,12 @@ class _Seen:
         self.scene = scenes_of(part, run.library.names)[0]
         self.run = run
         self.truth = run.truth(Cell(self.scene, part.captures[0], ""))
-        self.lines = telling_lines(self.truth)
+        self.lines = epipolar_lines(self.truth)
         self.true = pictures_of(self.truth, self.lines)
         picture = self.true.corner if corner else self.true.centre
         self.curve = DisplayCurve.fitted_to(self.true.centre)
         side = max(LEAST_PIECE_PX, round(PIECE_SHARE * picture.shape[1]))
-        self.pieces = telling_pieces(picture, side, pieces)
+        self.pieces = detailed_pieces(picture, side, pieces)
 
     def kept(self, cell: Cell) -> Pictures:
         """Return the pictures that the sweep has left of a cell."""
