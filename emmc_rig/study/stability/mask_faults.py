@@ -94,7 +94,7 @@ def edge_blur(setup: Setup, px: float) -> Trial:
 
 
 def vignetting(setup: Setup, percent: float) -> Trial:
-    """The outermost ray loses a share of its light, the others less, by a power of the cos^4 law."""
+    """The outermost ray loses a share of light, the others less, by a power of the cos^4 law."""
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     lens = setup.camera.lens
