@@ -9,10 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -53,29 +55,30 @@ def from_patches(positions, patches, weights, shape):
     return PatchTerm(total / np.where(weight > 0, weight, 1)[..., None], weight)
 
 
+@cache
+def difference_matrix(shape, order):
+    """Return the derivatives of flattened light fields as a sparse matrix, index by index."""
+    blocks = []
+    for index in fitting_indices(order, shape):
+        parts = [sparse.eye_array(length) for length in shape]
+        for entry, axis in zip(index, AXIS, strict=True):
+            inside = sparse.csr_array(np.diff(np.eye(shape[axis]), entry, axis=0))
+            inside.resize((shape[axis], shape[axis]))
+            parts[axis] = inside
+        blocks.append(reduce(sparse.kron, parts))
+    return sparse.vstack(blocks).tocsr()
+
+
 def gradient(light_field, order):
     """Return all derivatives (index, v, u, y, x, c) that fit somewhere, 0 where they do not."""
-    found = []
-    for index in fitting_indices(order, light_field.shape):
-        one, missing = light_field, [(0, 0)] * 5
-        for entry, axis in zip(index, AXIS, strict=True):
-            one, missing[axis] = np.diff(one, entry, axis), (0, entry)
-        found.append(np.pad(one, missing))
-    return np.stack(found)
+    matrix = difference_matrix(light_field.shape, order)
+    return (matrix @ light_field.ravel()).reshape(-1, *light_field.shape)
 
 
 def adjoint(derivatives, order):
     """Return the adjoint of `gradient`; values where a derivative does not fit do not count."""
     shape = derivatives.shape[1:]
-    total = np.zeros(shape, derivatives.dtype)
-    for index, one in zip(fitting_indices(order, shape), derivatives, strict=True):
-        for entry, axis in zip(index, AXIS, strict=True):
-            one = np.take(one, range(shape[axis] - entry), axis)
-            for _ in range(entry):
-                ends = [(1, 1) if i == axis else (0, 0) for i in range(5)]
-                one = -np.diff(np.pad(one, ends), axis=axis)
-        total += one
-    return total
+    return (difference_matrix(shape, order).T @ derivatives.ravel()).reshape(shape)
 
 
 class FullSplittingSettings(Settings):

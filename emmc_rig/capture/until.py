@@ -2,8 +2,8 @@
 
 Everything but the shots comes first, so that Psi of every planned shot is known before one of them
 is chosen: measured, or foretold by the parametric fit. Then shots are taken one by one; after each
-the light field so far is reconstructed and assessed (`assessment`), and what is decided is journalled
-before it is acted on, so that a resume goes on with it.
+the light field so far is reconstructed and assessed, and what is decided is journalled before it is
+acted on, so that a resume goes on with it.
 """
 
 from __future__ import annotations
