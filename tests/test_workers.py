@@ -22,8 +22,8 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.reconstruct import tiles
-from emmc_rig.reconstruct.captures import parse_memory
 from emmc_rig.reconstruct.inputs import load_settings
+from emmc_rig.reconstruct.memory import parse_memory
 from emmc_rig.reconstruct.solve import reconstruct_folder
 from reconstruction.errors import ReconstructionError
 
