@@ -18,10 +18,10 @@ from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid, SavedPsi
 UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
 BASE_BYTES = 480 * 2**20
 """Of a process with the program's libraries, its kernels compiled."""
-RAY_BYTES, WEIGHT_BYTES = 150, 26
+RAY_BYTES, WEIGHT_BYTES = 170, 26
 """Of a block, for each of its rays (views times samples), and for each of their weights (shots
-times stored colours). Measured: adaptive-fast on 240x240 samples, one and three shots, 141 and 184
-a ray beside Psi; on blocks of 190,000 samples, one shot, 169 with it."""
+times stored colours). Measured, Psi included: 169 a ray of adaptive-fast on blocks of 190,000
+samples, one shot; less for smaller ones, tv and adaptive."""
 READING_BYTES = 60
 """Of a capture's reading in the program itself: readings, deviation, usable, and copies."""
 WHOLE, COMPARED = 8, 4
