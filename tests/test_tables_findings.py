@@ -6,7 +6,7 @@ import pytest
 
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import METHODS, PARTS, Capture, Cell, cells_of
-from emmc_rig.study.tables.findings import CLAIMS, printed_figures, tested_claims
+from emmc_rig.study.tables.findings import CLAIMS, printed_figures, findings_from
 
 SCENES = ["dragons", "dice", "buttercup", "tulip"]
 FLAT = 25.0
@@ -32,18 +32,18 @@ def changed(cells, choose, **gains):
 
 
 def found(cells, name):
-    return {finding.claim.name: finding for finding in tested_claims(cells, SCENES)}[name]
+    return {finding.claim.name: finding for finding in findings_from(cells, SCENES)}[name]
 
 
 def test_a_tie_does_not_hold():
-    for finding in tested_claims(flat_cells(), SCENES):
+    for finding in findings_from(flat_cells(), SCENES):
         assert finding.verdict == "does not hold"
         assert finding.spread is not None
         assert finding.spread.mean_db == 0
 
 
 def test_without_cells_nothing_is_claimed():
-    for finding in tested_claims({}, SCENES):
+    for finding in findings_from({}, SCENES):
         assert finding.verdict == "not measured"
         assert finding.ours == {}
 
@@ -129,7 +129,7 @@ def test_an_infinite_figure_leaves_its_scene_out():
 
 
 def test_the_papers_own_numbers_hold_by_what_its_tables_say():
-    findings = {f.claim.name: f for f in tested_claims(printed_figures(), list(paper.TITLES))}
+    findings = {f.claim.name: f for f in findings_from(printed_figures(), list(paper.TITLES))}
     noise = findings["cfa-noise"].printed
     # Dragon: min(30.22 - 28.40, 30.52 - 26.68) - (27.98 - 27.82) = 1.66; Fish 0.06.
     assert noise is not None

@@ -291,7 +291,7 @@ def printed_figures() -> dict[Cell, dict[str, object]]:
     }
 
 
-def tested_claims(measured: Measured, scenes: Sequence[str]) -> list[Finding]:
+def findings_from(measured: Measured, scenes: Sequence[str]) -> list[Finding]:
     """Return all claims tested on cells of the given scenes."""
     printed = printed_figures()
     findings = []

@@ -21,7 +21,7 @@ from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import METHOD_TITLES, PARTS, Cell, Part, cells_of, chosen_parts
 from emmc_rig.study.tables.charts import draw_charts
 from emmc_rig.study.tables.figures import draw_figures
-from emmc_rig.study.tables.findings import Finding, tested_claims
+from emmc_rig.study.tables.findings import Finding, findings_from
 from emmc_rig.study.tables.grids import Grid, Pair, grids
 from emmc_rig.study.tables.library import Given, LeaveOneOut, Library, Source, scene_specs
 from reconstruction.methods import METHODS
@@ -190,7 +190,7 @@ def run_tables(
         results = sweep.measure(watcher)
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)
-        findings = tested_claims(results, library.names)
+        findings = findings_from(results, library.names)
         outcome = TablesOutcome(found, findings, folder / PAGE, clock() - started)
         more = {
             **{f"Scene {name}": spec for name, spec in library.specs.items()},
