@@ -6,7 +6,7 @@ import pytest
 
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import METHODS, PARTS, Capture, Cell, cells_of
-from emmc_rig.study.tables.findings import CLAIMS, printed_figures, findings_from
+from emmc_rig.study.tables.findings import CLAIMS, findings_from, printed_figures
 
 SCENES = ["dragons", "dice", "buttercup", "tulip"]
 FLAT = 25.0
