@@ -32,7 +32,7 @@ from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import RunEnd, Sequencer
 from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -399,7 +399,7 @@ def capture(
     """
     description = None if rig is None else rig.description
     folder = None if out is None else Path(out)
-    told = watcher or Unwatched()
+    told = watcher or CaptureWatcher()
     if on_event is not None:
         told = EventWatcher(on_event, told)
     captured = capture_session(

@@ -8,7 +8,7 @@ before it is acted on, so that a resume goes on with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from calibration.shadow import shadow_mask
 from emmc_rig.capture.enough import METHOD, Judgement, judged
@@ -21,6 +21,7 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session, wall_time
 from reconstruction.methods import reconstruct
+from reconstruction.result import Progress, Reconstruction
 
 PLANNED_BY = "`emmc-rig calibrate --plan` writes a plan that has them"
 SMALLEST = (16, 16)
@@ -131,7 +132,24 @@ class Until:
 
     def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
         self._scale = self._scale or session_scale(self._session)
-        taken = scaled_readings(self._session, self._scale, shots)
-        sigma = taken.noise_sigma
-        result = reconstruct(METHOD, taken.psi, taken.readings, sigma, usable=taken.usable)
+        result, sigma = light_field_so_far(self._session, self._scale, shots)
+        self._watcher.light_field(shots, result)
         return judged(self._scale.psi, result, shots, sigma, target_db)
+
+
+def light_field_so_far(
+    session: Session,
+    scale: Scale,
+    shots: Sequence[int],
+    on_step: Callable[[Progress], object] | None = None,
+) -> tuple[Reconstruction, float]:
+    """Return the light field that some shots of a session give by METHOD, and their noise.
+
+    Raises AppError, CalibrationError or ReconstructionError.
+    """
+    taken = scaled_readings(session, scale, shots)
+    sigma = taken.noise_sigma
+    result = reconstruct(
+        METHOD, taken.psi, taken.readings, sigma, usable=taken.usable, on_step=on_step
+    )
+    return result, sigma
