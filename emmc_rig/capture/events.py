@@ -61,7 +61,7 @@ class EventWatcher(CaptureWatcher):
     def __init__(self, on_event: OnEvent, other: CaptureWatcher | None = None) -> None:
         self._on_event: OnEvent | None = on_event
         self._other = other or CaptureWatcher()
-        self._began_s = time.perf_counter()
+        self._began_s = self._asked_s = time.perf_counter()
         self._lock = threading.RLock()
         self._done = self._planned = 0
 
@@ -111,6 +111,15 @@ class EventWatcher(CaptureWatcher):
         """How long the rest will take."""
         self._other.left(seconds, guessed)
         self._emit("left", seconds=round(seconds, 3), guessed=guessed)
+
+    def asked(self, what: str) -> None:
+        """Somebody has to do something at the bench: a pause."""
+        self._other.asked(what)
+        if what:
+            self._asked_s = time.perf_counter()
+            self._emit("pause", reason=f"please {what}")
+        else:
+            self._emit("resume", seconds=round(time.perf_counter() - self._asked_s, 3))
 
     def paused(self, reason: str) -> None:
         """The capture waits."""

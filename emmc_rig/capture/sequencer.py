@@ -154,7 +154,7 @@ class Sequencer:
             self._watcher.begin(needed - len(missing), needed)
             refuse_impossible(self._rig, missing)
             self._left_of_shot = self._missing_of_shots()
-            frames = self._next()
+            frames = self._choose(self._now_s) or self._next()
             if frames:
                 self._retrying("home", self._home)
                 self._compare_with_last_good()

@@ -141,7 +141,7 @@ def light_field_so_far(
     session: Session,
     scale: Scale,
     shots: Sequence[int],
-    on_step: Callable[[Progress], object] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
 ) -> tuple[Reconstruction, float]:
     """Return the light field that some shots of a session give by METHOD, and their noise.
 

@@ -47,6 +47,9 @@ class CaptureWatcher:
     def light_field(self, shots: Sequence[int], result: Reconstruction) -> None:
         """What these shots give so far."""
 
+    def asked(self, what: str) -> None:
+        """Somebody has to do this at the bench; "": it is done."""
+
     def paused(self, reason: str) -> None:
         """The capture waits."""
 

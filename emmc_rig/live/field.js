@@ -24,9 +24,9 @@ function drawField() {
   if (!told) return;
   const parts = [told.stage];
   if (told.shots[1] > 1) parts.push(`${told.shots[0]} of ${told.shots[1]} shots`);
-  if (told.pictures && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
+  if (told.latency_s !== undefined && told.pictures && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
   if (told.why) parts.push(told.why);
-  parts.push(told.verdict ? told.verdict.words : "no verdict yet");
+  if (told.verdict !== undefined) parts.push(told.verdict?.words || "no verdict yet");
   write("field-stage", parts.join("; "));
   $("field-stage").classList.toggle("bad", told.verdict?.level === "do not use");
   $("field-stage").classList.toggle("good", told.verdict?.level === "trust");

@@ -30,7 +30,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 PATIENCE_S = 10.0
@@ -239,7 +239,7 @@ def application(
                 response = await answer(request)
             except _RefusedError as refusal:
                 response = PlainTextResponse(f"{refusal}\n", refusal.status)
-            except AppError as fault:
+            except ERRORS as fault:
                 response = PlainTextResponse(f"{fault}\n", 400)
             response.headers.update(HEADERS)
             return response
