@@ -197,6 +197,8 @@ class Sequencer:
         for name in ids:
             self._session.discard(name, "wanted once more")
         self._left_of_shot = self._missing_of_shots()
+        # A simulated frame may come out as it was before.
+        self._before = None
         self._more += len(ids)
         self._watcher.more(len(self._session.needed) + self._more)
         self._watcher.tell(f"taken once more: {', '.join(ids)}")

@@ -16,7 +16,8 @@ function draw(before) {
   $("waiting").hidden = !state.paused;
   write("waiting", state.paused ? `Waiting: ${state.paused.reason}` : "");
   for (const one of document.querySelectorAll(".steers")) one.hidden = state.read_only || state.ended;
-  write("pause", state.paused ? "go on" : "pause");
+  write("pause", state.held ? "go on" : "pause");
+  $("pause").hidden = state.paused !== null && !state.held;
   drawMessages();
   drawEnd();
   drawFrames();
@@ -100,8 +101,8 @@ async function show() {
   if (wanted) { wanted = false; show(); }
 }
 
-$("pause").addEventListener("click", () => act(state.paused ? "resume" : "pause"));
-$("stop").addEventListener("click", () => act("stop"));
+$("pause").addEventListener("click", () => act(state.held ? "resume" : "pause"));
+$("finish").addEventListener("click", () => act("stop"));
 $("retake").addEventListener("click", async () => {
   const ids = [...chosen];
   chosen = new Set();

@@ -66,12 +66,15 @@ class SessionPage(EventWatcher):
         self._wanted, self._retaken = False, 0
         self._pictures: Pictures | None = None
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._reconstruct, name="page light field")
+        self._thread = threading.Thread(
+            target=self._reconstruct, name="page light field", daemon=True
+        )
         self._state: dict[str, Any] = {
             "version": 0,
             "title": folder.name,
             "step": "",
             "paused": None,
+            "held": False,
             "wish": "",
             "done": 0,
             "planned": 0,
@@ -224,7 +227,7 @@ class SessionPage(EventWatcher):
 
     def _wish(self, words: str, ask: Callable[[], None]) -> None:
         ask()
-        self._publish(wish=words)
+        self._publish(wish=words, held=self._control.paused)
 
     def _retake(self, ids: list[str]) -> None:
         for name in ids:
