@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
-from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.pictures import Pictures, Piece, pictures_of, telling_lines, telling_pieces
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (
@@ -26,7 +26,7 @@ from emmc_rig.study.tables.cells import (
     scenes_of,
 )
 from emmc_rig.study.tables.demosaic import demosaiced_rggb
-from emmc_rig.study.tables.mosaic import FRAMES, Piece, Tile, screen, telling_pieces, write_mosaic
+from emmc_rig.study.tables.mosaic import FRAMES, Tile, screen, write_mosaic
 from emmc_rig.study.tables.shots import Sensors, Shots
 
 Array = NDArray[np.floating]
