@@ -44,7 +44,14 @@ def stability_verdicts(
             f"stopped by Ctrl-C; what is measured is kept in {out}: run it again"
         ) from stop
     table = Table(
-        "fault", "method", "broken: flagged", "good: flagged", "between", "poor", box=SIMPLE
+        "fault",
+        "method",
+        "broken: flagged",
+        "good: flagged",
+        "between",
+        "poor",
+        "cannot tell",
+        box=SIMPLE,
     )
     for (name, method), tally in tables(results).items():
         table.add_row(
@@ -54,6 +61,7 @@ def stability_verdicts(
             f"{tally.good_flagged} of {tally.good}",
             f"{tally.between_flagged} of {tally.between}",
             f"{tally.poor_flagged} of {tally.poor}",
+            str(tally.untold),
         )
     Console().print(table)
     for one in wrong(results):

@@ -162,13 +162,14 @@ class CaseResult:
 
     @property
     def wrong(self) -> bool:
-        """Whether it is broken and trusted, or good and not."""
-        return self.kind in ("broken", "good") and self.flagged != (self.kind == "broken")
+        """Whether it is broken and trusted, or good and flagged."""
+        trusted = self.verdict.level == "trust"
+        return (self.kind == "broken" and trusted) or (self.kind == "good" and self.flagged)
 
     @property
     def flagged(self) -> bool:
-        """Whether the verdict is not trust."""
-        return self.verdict.level != "trust"
+        """Whether the verdict speaks against it."""
+        return self.verdict.level in ("doubt", "do not use")
 
 
 @dataclass
@@ -246,7 +247,10 @@ def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
 
 @dataclass(frozen=True)
 class Tally:
-    """How many results were of each kind, and how many of those were flagged."""
+    """How many results were of each kind, and how many of those were flagged.
+
+    untold: of all kinds, how many could not be told.
+    """
 
     broken: int = 0
     broken_flagged: int = 0
@@ -256,6 +260,7 @@ class Tally:
     good_flagged: int = 0
     poor: int = 0
     poor_flagged: int = 0
+    untold: int = 0
 
     @property
     def detected(self) -> float | None:
@@ -274,6 +279,7 @@ def tallied(results: Iterable[CaseResult]) -> Tally:
     for one in results:
         counts[one.kind] += 1
         counts[f"{one.kind}_flagged"] += one.flagged
+        counts["untold"] += one.verdict.level == "cannot tell"
     return Tally(**counts)
 
 
