@@ -25,11 +25,11 @@ from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
+from emmc_rig.study.stability.fault_sweep import named_methods
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
 from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Fault, Trial
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import find_method
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
@@ -70,12 +70,10 @@ def detector_settings(
     """
     for name in faults or ():
         find_fault(name)
-    for name in methods or ():
-        find_method(name)
     given = {
         "cameras": (camera,) if camera else (),
         "faults": tuple(faults or ()),
-        "methods": tuple(methods or ()),
+        "methods": named_methods(methods, fast) if methods else (),
         "size": size,
     }
     chosen = {key: value for key, value in given.items() if value}
