@@ -19,7 +19,7 @@ class AdaptiveSettings(Settings):
         default=24.0, gt=0, description="largest disparity searched, to both sides"
     )
     step_px: float = Field(default=0.125, gt=0, description="between disparities compared")
-    stride: int = Field(default=4, ge=1, description="pixels between patches that are compared")
+    stride: int = Field(default=6, ge=1, description="pixels between patches that are compared")
     lengths_px: tuple[Length, ...] = Field(
         default=(3.0, 1.5), min_length=1, description="correlation lengths of a patch's texture"
     )
@@ -73,7 +73,7 @@ class AdaptiveSettings(Settings):
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
     quick = settings.texture.model_copy(
-        update={"steps": 6, "refine_steps": 2, "block_step": 6, "sweeps": ()}
+        update={"steps": 6, "refine_steps": 3, "block_step": 6, "sweeps": ()}
     )
     coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
