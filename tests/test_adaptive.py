@@ -285,7 +285,9 @@ def test_a_mask_that_treats_all_views_alike_leaves_the_evidence_flat():
 
 
 def quick():
-    return AdaptiveSettings(texture=TextureSettings(steps=3, refine_steps=0), free=False)
+    return AdaptiveSettings(
+        texture=TextureSettings(steps=3, refine_steps=0, fit_steps=6), free=False
+    )
 
 
 def test_frames_of_another_psi_are_not_passed_over_in_silence(bayer, planted):

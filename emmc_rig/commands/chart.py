@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from emmc_rig.commands.chart_ablation import chart_ablation
+from emmc_rig.commands.chart_ablation import chart_ablation, chart_constants
 from emmc_rig.commands.chart_guard import chart_guard
 from emmc_rig.commands.chart_kernels import chart_kernels
 from emmc_rig.commands.chart_live import chart_live
@@ -57,6 +57,9 @@ def chart(
     ablation: Annotated[
         bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
     ] = False,
+    constants: Annotated[
+        bool, typer.Option("--constants", help="with --ablation: instead 2x, 0.5x of its constants")
+    ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
@@ -101,6 +104,11 @@ def chart(
         chart_live(one_camera, (scene or [DEFAULT_SCENE])[0], shape, out or Path("emmc-live"))
     elif stated:
         chart_stated(scene or [], camera, shape, out or Path("emmc-stated"))
+    elif constants:
+        from simulators.scenes import SCENES
+
+        cut, place = shape or STUDIED_SIZE, out or Path("emmc-constants")
+        chart_constants(scene or list(SCENES), one_camera, cut, seed, place)
     elif ablation:
         seen, cut = (scene or [DEFAULT_SCENE])[0], shape or STUDIED_SIZE
         chart_ablation(seen, one_camera, cut, seed, out or Path("emmc-ablation"))

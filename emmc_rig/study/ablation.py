@@ -86,6 +86,17 @@ class Exposure:
         """What every row reconstructs from."""
         return self.camera.expose(self.truth, self.seed, self.psi)
 
+    @property
+    def inputs(self) -> dict[str, object]:
+        """What the frames depend on, as plain data."""
+        return {
+            "camera": self.camera.model_dump(mode="json"),
+            "scene": self.scene,
+            "sum": float(np.sum(self.truth, dtype=np.float64)),
+            "size": self.size,
+            "seed": self.seed,
+        }
+
 
 @dataclass
 class AblationSweep(Sweep[str]):
@@ -98,16 +109,11 @@ class AblationSweep(Sweep[str]):
 
     def inputs(self, point: str) -> dict[str, object]:
         """Return everything that a row depends on, as plain data."""
-        given = self.settings
         return {
             "row": point,
             "settings": _settings(point).model_dump(mode="json"),
             "machine": machine(),
-            "camera": given.camera.model_dump(mode="json"),
-            "scene": given.scene,
-            "sum": float(np.sum(given.truth, dtype=np.float64)),
-            "size": given.size,
-            "seed": given.seed,
+            **self.settings.inputs,
         }
 
     def prepare(self, points: Sequence[str], watcher: Watcher) -> None:

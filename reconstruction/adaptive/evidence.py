@@ -30,6 +30,7 @@ from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 PROBES = 4
+"""Of the disparities, at which the kinds of texture are compared."""
 
 
 @dataclass(frozen=True)
@@ -145,14 +146,12 @@ def patch_evidence(
     places: NDArray[np.int64],
     disparities: NDArray[np.floating],
     prior: TexturePrior,
-    probes: int = PROBES,
 ) -> PatchEvidence:
     """Return how well textures at these disparities explain each patch.
 
     data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
     pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
-    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. probes: at how many of the
-    disparities the kinds of texture are compared.
+    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`.
     """
     count = len(corners)
     short = -count % LANES
@@ -174,7 +173,7 @@ def patch_evidence(
     tables = np.concatenate(tables, axis=1).astype(np.float32)
     evaluated = tables.shape[1]
     tables = np.pad(tables, ((0, 0), (0, -evaluated % TERMS), (0, 0)))
-    probed = np.unique(np.linspace(0, len(disparities) - 1, probes + 2).round()[1:-1])
+    probed = np.unique(np.linspace(0, len(disparities) - 1, PROBES + 2).round()[1:-1])
     out = np.empty((len(filled), evaluated), dtype=np.float32)
     chosen = np.zeros(len(filled), dtype=np.int64)
     noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)

@@ -60,8 +60,10 @@ class AdaptiveSettings(Settings):
         default=("top", "bottom", "left", "right"),
         description="sides that may be dark because views do not reach them",
     )
-    brightness: float | None = Field(
-        default=None, gt=0, description="mean of the scene that this is a part of; None: its own"
+    contrast: float | None = Field(
+        default=None,
+        gt=0,
+        description="deviation of the values of the scene that this is a part of; None: its own",
     )
     plane: tuple[float, float, float] | None = Field(
         default=None,
