@@ -33,7 +33,7 @@ WRITERS = {
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
     "chart --ablation": (*SIZE,),
-    "chart --ablation --constants": (*SIZE,),
+    "chart --constants": (*SIZE,),
     "chart --guard": (*SIZE,),
     "chart --kernels": (*SIZE,),
     "chart --live": (*SIZE,),
@@ -73,7 +73,7 @@ READERS = {
 JOURNALS = {
     "calibrate --check": "checks.jsonl",
     "chart --ablation": "ablation.jsonl",
-    "chart --ablation --constants": "constants.jsonl",
+    "chart --constants": "constants.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
     "design": "simulations.jsonl",

@@ -58,7 +58,10 @@ def chart(
         bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
     ] = False,
     constants: Annotated[
-        bool, typer.Option("--constants", help="with --ablation: instead 2x, 0.5x of its constants")
+        bool,
+        typer.Option(
+            "--constants", help="instead: cost of 2x, 0.5x of each constant of `adaptive`"
+        ),
     ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")

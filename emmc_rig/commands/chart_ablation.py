@@ -1,4 +1,4 @@
-"""`emmc-rig chart --ablation`: gain and cost of each part of the adaptive method, or constant."""
+"""`emmc-rig chart --ablation`, `--constants`: what parts of `adaptive` and its constants buy."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def chart_constants(
     from emmc_rig.study.sweep import sweep_folder
 
     seen = emmc.camera(camera)
-    command = "chart --ablation --constants"
+    command = "chart --constants"
     with sweep_folder(out, ConstantSweep.journal, command) as folder, shown_bars() as bars:
         exposures = [Exposure(scene, seen, size, seed) for scene in scenes]
         costs, left_out = constant_costs(exposures, folder, bars)
