@@ -86,7 +86,7 @@ class Exposure:
         """What every row reconstructs from."""
         return self.camera.expose(self.truth, self.seed, self.psi)
 
-    @property
+    @cached_property
     def inputs(self) -> dict[str, object]:
         """What the frames depend on, as plain data."""
         return {

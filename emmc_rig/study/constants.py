@@ -13,6 +13,7 @@ import pkgutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -103,7 +104,8 @@ def _compiled(module: ModuleType) -> set[str]:
     return {name for kernel in kernels if kernel for name in kernel.__code__.co_names}
 
 
-def constants() -> list[Constant]:
+@cache
+def constants() -> tuple[Constant, ...]:
     """Return the constants and numerical settings of the adaptive method."""
     found, frozen = [], set().union(*map(_compiled, _modules()))
     for module in _modules():
@@ -123,7 +125,7 @@ def constants() -> list[Constant]:
     settings = AdaptiveSettings()
     for module, part in (("settings", settings), ("settings.texture", settings.texture)):
         found += [Constant(module, name, value) for name, value in part if _is_number(value)]
-    return found
+    return tuple(found)
 
 
 def _times(value: Value, factor: float) -> Value:

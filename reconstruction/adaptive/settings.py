@@ -73,10 +73,13 @@ class AdaptiveSettings(Settings):
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
-    """Return the settings of `adaptive-fast`: coarser patches of one texture, fewer steps."""
+    """Return the settings of `adaptive-fast`: one texture of patches, fewer disparities and steps.
+
+    Patches 8 pixels apart instead cost 0.5 dB on 96x96 crops of group A.
+    """
     quick = settings.texture.model_copy(
-        update={"steps": 6, "refine_steps": 3, "block_step": 6, "sweeps": ()}
+        update={"steps": 8, "refine_steps": 5, "block_step": 6, "sweeps": ()}
     )
-    coarser = {"step_px": 0.25, "stride": 8, "lengths_px": (2.0,)}
+    coarser = {"step_px": 0.25, "lengths_px": (2.0,)}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
     return settings.model_copy(update=coarser | fewer)
