@@ -59,7 +59,7 @@ def one_plane(volume: Volume, pixels: tuple[int, int]) -> Plane | None:
     """
     labels = volume.disparities
     decisive = volume.decisive
-    if len(labels) < 2 or not decisive.any():
+    if len(labels) < 3 or not decisive.any():
         return None
     best = volume.evidence.max(axis=-1, keepdims=True)
     lost = np.minimum(best - volume.evidence, UNLIKELY)[decisive].astype(np.float64)
@@ -75,10 +75,11 @@ def one_plane(volume: Volume, pixels: tuple[int, int]) -> Plane | None:
         wanted = plane[0] + plane[1] * rows + plane[2] * columns
         last = unlikely.shape[1] - 1
         at = np.clip((wanted - labels[0]) / step + 1, 0, last)
-        below = np.minimum(at.astype(np.int64), last - 1)
-        share = at - below
-        each = np.arange(len(rows))
-        return (1 - share) * unlikely[each, below] + share * unlikely[each, below + 1]
+        # A parabola through the three labels nearest: a straight line is least at a label.
+        middle = np.clip(np.rint(at).astype(np.int64), 1, last - 1)
+        each, off = np.arange(len(rows)), at - middle
+        below, here, above = (unlikely[each, middle + one] for one in (-1, 0, 1))
+        return here + off / 2 * (above - below) + off**2 / 2 * (above - 2 * here + below)
 
     chosen = labels[lost.argmin(axis=-1)]
     begin = _fitted(chosen, rows, columns)
