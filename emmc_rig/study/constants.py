@@ -62,7 +62,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scaled:
-    """A setup, by its place, reconstructed with a constant times a factor; None: all as they are."""
+    """A setup, by its place, and a factor of a constant; None: all constants as they are."""
 
     setup: int
     constant: Constant | None = None
