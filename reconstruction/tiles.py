@@ -47,7 +47,7 @@ REACH = 48
 """Samples of halo for methods that carry information from sample to sample: steps of the
 variational methods move it by one, and what lies further hardly matters."""
 TEXTURE_REACH = 16
-"""Samples of halo for `adaptive` beyond the parallax: patches, stacks of blocks, windows."""
+"""Pixels of halo for `adaptive` beyond the parallax: patches, stacks of blocks, windows."""
 STEPS = 100
 """Of the variational methods, in every block alike; the rule by change would differ between
 blocks."""
@@ -453,7 +453,7 @@ def surveyed(
                     _sample_disparity(window, read[part], noise_sigma, use[part], settings, place)
                 )
         largest = max((one.largest_px for one in disparities), default=0.0)
-        halo = TEXTURE_REACH + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
+        halo = TEXTURE_REACH * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
         flat = flat_psi(mosaic)
         picture = smooth_guess(flat, read, use).astype(np.float32)
         noise = np.full(read.shape, noise_sigma**2)

@@ -1,5 +1,7 @@
 """Parsimony of the adaptive method: one plane, no colour, no surface, where frames say so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_adaptive import plane_scene, quick
@@ -57,6 +59,19 @@ def test_disparity_0_comes_before_any_plane_and_relief_before_both():
     assert one_plane(volume_of(step), (48, 56)) is None
     undecided = volume_of(step, np.zeros((10, 12), bool))
     assert one_plane(undecided, (48, 56)) is None
+
+
+def test_no_plane_lies_where_no_disparity_was_evaluated():
+    near = volume_of(np.full((10, 12), 0.02))
+    for missing in (np.abs(LABELS) < 0.4, LABELS < 0.4):  # a gap about 0, and beyond the range
+        left = replace(
+            near,
+            disparities=LABELS[~missing],
+            evidence=near.evidence[..., ~missing] * 0.01,
+            probability=near.probability[..., ~missing],
+        )
+        found = one_plane(left, (48, 56))
+        assert found is None or abs(found.middle) > 0.3
 
 
 def test_colour_is_needed_only_beyond_chance():

@@ -32,6 +32,7 @@ from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.reconstruct.memory import task_bytes
 from emmc_rig.reconstruct.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
@@ -284,20 +285,30 @@ def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of a capture, all done: their grid, what was settled, and what each says."""
+    """The blocks of a capture, all done: their grid, what was settled, and what each says.
+
+    workers: how many computed at a time.
+    """
 
     grid: Grid
     survey: Survey
     tasks: Mapping[str, BlockTask]
     done: Mapping[str, DoneBlock]
     seconds: float
+    workers: int
 
     def metrics(self) -> dict[str, Any]:
-        """Return what metrics.json has of the blocks: peak_gib is the largest of a worker."""
+        """Return what metrics.json has of the blocks.
+
+        peak_gib: the largest resident memory of a worker, workers: at a time, program_peak_gib: of
+        this process, all measured.
+        """
         return {
             "blocks": list(self.grid.shape),
             "block_seconds": [one.seconds for one in self.done.values()],
+            "workers": self.workers,
             "peak_gib": max(one.peak_mib for one in self.done.values()) / 2**10,
+            "program_peak_gib": peak_memory_mib() / 2**10,
         }
 
     def result(self) -> Reconstruction:
@@ -398,8 +409,10 @@ def run_capture(
     psi, dictionary = capture.psi, capture.opened_dictionary()
     multiple = multiple_of(psi.binning, dictionary, capture.settings)
     grid = Grid(psi.size, multiple, 0, capture.settings.blocks)
+    pool.fit(task_bytes(psi, grid))
     survey = _settle(capture, frames, pool, len(grid) == 1)
     grid = replace(grid, halo=survey.halo)
+    pool.fit(task_bytes(psi, grid))
     tasks = {block.name: BlockTask(capture, survey.settings, block) for block in grid}
     done = {name: one for name, task in tasks.items() if (one := done_block(task)) is not None}
     left = [task for name, task in tasks.items() if name not in done]
@@ -418,4 +431,4 @@ def run_capture(
         if on_block is not None:
             on_block(len(done), len(tasks))
     ordered = {name: done[name] for name in tasks}
-    return Blocks(grid, survey, tasks, ordered, time.perf_counter() - started)
+    return Blocks(grid, survey, tasks, ordered, time.perf_counter() - started, pool.size)

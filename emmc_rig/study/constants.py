@@ -13,21 +13,24 @@ import pkgutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 import reconstruction.adaptive
-from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.progress import Watcher
-from emmc_rig.study.ablation import Exposure
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
+from emmc_rig.study.trial import Setup, Trial, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
+from simulators.scenes import SCENES
 
 FACTORS = (2.0, 0.5)
 ELSEWHERE = ("method", "models", "planning", "uncertainty")
@@ -59,10 +62,10 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Scaled:
     """A capture reconstructed with a constant times a factor; None: with all as they are."""
 
-    exposure: int
+    capture: int
     constant: Constant | None = None
     factor: float = 1.0
 
@@ -169,44 +172,53 @@ def _with(constant: Constant | None, factor: float) -> Iterator[AdaptiveSettings
 
 
 @dataclass
-class ConstantSweep(Sweep[Trial]):
-    """The PSNR of trials; settings: the exposures, a tuple of Exposure."""
+class ConstantSweep(Sweep[Scaled]):
+    """The PSNR of captures with a constant scaled; settings: the captures, a tuple of Setup."""
 
     journal = "constants.jsonl"
-    noun = "trials"
+    noun = "captures"
     stage = "reconstruct"
     revision = 1
 
-    def inputs(self, point: Trial) -> dict[str, object]:
+    def inputs(self, point: Scaled) -> dict[str, object]:
         """Return everything that a trial depends on, as plain data."""
+        given: Setup = self.settings[point.capture]
         return {
-            **self.settings[point.exposure].inputs,
+            "camera": given.camera.model_dump(mode="json"),
+            "scene": given.scene,
+            "sum": float(np.sum(self.trials[point.capture].truth, dtype=np.float64)),
+            "size": given.size,
+            "seed": given.seed,
             "constants": {one.label: one.value for one in constants()},
             "constant": point.label,
         }
 
-    def measured(self, points: Sequence[Trial], watcher: Watcher) -> Results:
-        """Yield the PSNR of each trial."""
+    @cached_property
+    def trials(self) -> list[Trial]:
+        """What is reconstructed."""
+        return [trial_of(one) for one in self.settings]
+
+    def measured(self, points: Sequence[Scaled], watcher: Watcher) -> Results:
+        """Yield the PSNR of each point."""
         for point in points:
-            given: Exposure = self.settings[point.exposure]
-            frames = given.frames
+            given = self.trials[point.capture]
             with _with(point.constant, point.factor) as settings:
                 result = reconstruct_adaptive(
-                    given.psi, frames.readings, frames.noise_sigma, settings, frames.usable
+                    given.psi, given.readings, given.noise_sigma, settings, given.usable
                 )
-            yield {"psnr_db": psnr_db(result.light_field, given.truth)}
+            yield {"psnr_db": given.psnr_db(result.light_field)}
 
 
 def constant_costs(
-    exposures: Sequence[Exposure], folder: Path, watcher: Watcher
+    captures: Sequence[Setup], folder: Path, watcher: Watcher
 ) -> tuple[list[Cost], list[str]]:
     """Return what each factor of each constant costs, the dearest first, and what was left out.
 
     Trials that the folder holds are not measured again; see `Sweep.run`.
     """
-    whole = [Trial(at) for at in range(len(exposures))]
+    whole = [Scaled(at) for at in range(len(captures))]
     scaled = [(one, factor) for one in constants() for factor in FACTORS]
-    sweep = ConstantSweep(tuple(exposures), folder)
+    sweep = ConstantSweep(tuple(captures), folder)
     trials = [replace(at, constant=one, factor=by) for one, by in scaled for at in whole]
     results = sweep.run([*whole, *trials], watcher)
     costs = []
@@ -221,3 +233,22 @@ def constant_costs(
             costs.append(Cost(one.label, value, factor, sum(lost) / len(lost), max(lost)))
     costs.sort(key=lambda cost: -abs(cost.mean_db))
     return costs, sorted(set(sweep.left_out.values()))
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure twice and half of each constant (`chart --constants`)."""
+    scenes, size = asked.scenes or tuple(SCENES), asked.size or (96, 96)
+    captures = [Setup(scene, asked.described, size, asked.seed) for scene in scenes]
+    costs, left_out = constant_costs(captures, folder, show)
+    show.table(
+        ("constant", "value", "times", "costs dB", "at most"),
+        [
+            (one.constant, one.value, f"{one.factor:g}", f"{one.mean_db:+.2f}",
+             f"{one.worst_db:+.2f}")
+            for one in costs
+        ],
+    )  # fmt: skip
+    for line in left_out:
+        show.note("left out", line)
+    about = {"scenes": list(scenes), "camera": asked.camera, "size": list(size)}
+    return {**about, "rows": [one.as_dict() for one in costs], "left_out": left_out}
