@@ -62,7 +62,7 @@ def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp
         return reconstruct("tv", psi, frames, noise_sigma, settings=QUICK, usable=usable)
 
     monkeypatch.setattr(constants, "reconstruct_adaptive", reconstructed)
-    given = [Setup("deep-occlusions", find_camera(CAMERA), SIZE, 0)]
+    given = [Setup("deep-occlusions", find_camera(CAMERA), SIZE)]
     costs, left_out = constants.constant_costs(given, tmp_path, Silent())
     own = DECISIVE, DECISIVE, 0.5
     assert sorted(seen) == sorted(

@@ -45,10 +45,7 @@ def chart(
         bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
     ] = False,
     constants: Annotated[
-        bool,
-        typer.Option(
-            "--constants", help="instead: cost of 2x, 0.5x of each constant of `adaptive`"
-        ),
+        bool, typer.Option("--constants", help="instead: cost of 2x, 0.5x of each constant of it")
     ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
@@ -81,7 +78,8 @@ def chart(
 
     shape = parse_size(size)
     instead = {
-        "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation, "constants": constants,
+        "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation,
+        "constants": constants,
         "next-shot": next_shot, "guard": guard, "live": live, "stated": stated,
     }  # fmt: skip
     for name in (name for name, wanted in instead.items() if wanted):

@@ -13,6 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.running import Asked, Show
@@ -73,11 +75,16 @@ class AblationSweep(Sweep[str]):
 
     def inputs(self, point: str) -> dict[str, object]:
         """Return everything that a row depends on, as plain data."""
+        given = self.settings
         return {
             "row": point,
             "settings": _settings(point).model_dump(mode="json"),
             "machine": machine(),
-            **self.settings.inputs(),
+            "camera": given.camera.model_dump(mode="json"),
+            "scene": given.scene,
+            "sum": float(np.sum(self.trial.truth, dtype=np.float64)),
+            "size": given.size,
+            "seed": given.seed,
         }
 
     def prepare(self, points: Sequence[str], watcher: Watcher) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 import reconstruction.adaptive
@@ -62,9 +63,9 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scaled:
-    """A setup, by its place, and a factor of a constant; None: all constants as they are."""
+    """A capture reconstructed with a constant times a factor; None: with all as they are."""
 
-    setup: int
+    capture: int
     constant: Constant | None = None
     factor: float = 1.0
 
@@ -172,30 +173,35 @@ def _with(constant: Constant | None, factor: float) -> Iterator[AdaptiveSettings
 
 @dataclass
 class ConstantSweep(Sweep[Scaled]):
-    """The PSNR of trials; settings: a tuple of Setup."""
+    """The PSNR of captures with a constant scaled; settings: the captures, a tuple of Setup."""
 
     journal = "constants.jsonl"
-    noun = "trials"
+    noun = "captures"
     stage = "reconstruct"
     revision = 1
 
-    @cached_property
-    def trials(self) -> list[Trial]:
-        """What each setup's reconstructions start from."""
-        return [trial_of(one) for one in self.settings]
-
     def inputs(self, point: Scaled) -> dict[str, object]:
         """Return everything that a trial depends on, as plain data."""
+        given: Setup = self.settings[point.capture]
         return {
-            **self.settings[point.setup].inputs(),
+            "camera": given.camera.model_dump(mode="json"),
+            "scene": given.scene,
+            "sum": float(np.sum(self.trials[point.capture].truth, dtype=np.float64)),
+            "size": given.size,
+            "seed": given.seed,
             "constants": {one.label: one.value for one in constants()},
             "constant": point.label,
         }
 
+    @cached_property
+    def trials(self) -> list[Trial]:
+        """What is reconstructed."""
+        return [trial_of(one) for one in self.settings]
+
     def measured(self, points: Sequence[Scaled], watcher: Watcher) -> Results:
-        """Yield the PSNR of each trial."""
+        """Yield the PSNR of each point."""
         for point in points:
-            given = self.trials[point.setup]
+            given = self.trials[point.capture]
             with _with(point.constant, point.factor) as settings:
                 result = reconstruct_adaptive(
                     given.psi, given.readings, given.noise_sigma, settings, given.usable
@@ -204,15 +210,15 @@ class ConstantSweep(Sweep[Scaled]):
 
 
 def constant_costs(
-    setups: Sequence[Setup], folder: Path, watcher: Watcher
+    captures: Sequence[Setup], folder: Path, watcher: Watcher
 ) -> tuple[list[Cost], list[str]]:
     """Return what each factor of each constant costs, the dearest first, and what was left out.
 
     Trials that the folder holds are not measured again; see `Sweep.run`.
     """
-    whole = [Scaled(at) for at in range(len(setups))]
+    whole = [Scaled(at) for at in range(len(captures))]
     scaled = [(one, factor) for one in constants() for factor in FACTORS]
-    sweep = ConstantSweep(tuple(setups), folder)
+    sweep = ConstantSweep(tuple(captures), folder)
     trials = [replace(at, constant=one, factor=by) for one, by in scaled for at in whole]
     results = sweep.run([*whole, *trials], watcher)
     costs = []
@@ -230,10 +236,10 @@ def constant_costs(
 
 
 def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
-    """Measure `adaptive` with twice and half of each constant (`chart --constants`)."""
-    scenes, size = list(asked.scenes or SCENES), asked.size or (128, 160)
-    setups = [Setup(scene, asked.described, size, asked.seed) for scene in scenes]
-    costs, left_out = constant_costs(setups, folder, show)
+    """Measure twice and half of each constant (`chart --constants`)."""
+    scenes, size = asked.scenes or tuple(SCENES), asked.size or (96, 96)
+    captures = [Setup(scene, asked.described, size, asked.seed) for scene in scenes]
+    costs, left_out = constant_costs(captures, folder, show)
     show.table(
         ("constant", "value", "times", "costs dB", "at most"),
         [
@@ -244,8 +250,5 @@ def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     )  # fmt: skip
     for line in left_out:
         show.note("left out", line)
-    figures = [cost.as_dict() for cost in costs]
-    return {
-        "scenes": scenes, "camera": asked.camera, "size": list(size), "rows": figures,
-        "left_out": left_out,
-    }  # fmt: skip
+    about = {"scenes": list(scenes), "camera": asked.camera, "size": list(size)}
+    return {**about, "rows": [one.as_dict() for one in costs], "left_out": left_out}

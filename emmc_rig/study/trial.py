@@ -68,17 +68,6 @@ class Setup:
             return _opened(self.scene, self.size, views, self.seed, self.zoom)
         return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
 
-    def inputs(self) -> dict[str, object]:
-        """Return what the frames depend on, as plain data."""
-        truth = self.scene_seen().light_field
-        return {
-            "camera": self.camera.model_dump(mode="json"),
-            "scene": self.scene,
-            "sum": float(np.sum(truth, dtype=np.float64)),
-            "size": self.size,
-            "seed": self.seed,
-        }
-
     def with_camera(self, **changed: object) -> Setup:
         """Return the setup with some fields of the camera replaced."""
         return dataclasses.replace(self, camera=self.camera.model_copy(update=changed))
