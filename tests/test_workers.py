@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import numba
 import numpy as np
 import pytest
@@ -51,11 +52,11 @@ def place(tmp_path_factory):
     return folder
 
 
-def here(folder, out, pool=None, frames="frames", settings="blocks.yaml", **more):
+def here(folder, out, pool=None, frames="frames", settings="blocks.yaml", method="tv", **more):
     """Reconstruct in this process; return the metrics."""
     with result_folder(folder / out, "reconstruct", resumes=True) as new:
         return reconstruct_folder(
-            folder / frames, new, "tv", settings=load_settings(folder / settings),
+            folder / frames, new, method, settings=load_settings(folder / settings),
             pool=pool or Here(), **more,
         )  # fmt: skip
 
@@ -84,6 +85,18 @@ def test_the_truth_and_the_verdict_cover_all_blocks(place):
     assert 10 < metrics["psnr_db"] < 40
     assert metrics["verdict"]["features"]["kept"] > 30
     assert content(place / "compared") == content(place / "alone")
+
+
+def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
+    (place / "wide.yaml").write_text(yaml.safe_dump({"blocks": {"whole": 1000, "side": 64}}))
+    metrics = here(place, "stated", settings="wide.yaml", method="adaptive-fast")
+    assert metrics["blocks"] == [1, 2]
+    with h5py.File(place / "stated/maps.h5") as maps:
+        sigma = np.asarray(maps["sigma"], dtype=np.float64)
+    # The map is blended between blocks, the sum is of each block's own part.
+    expected = -10 * np.log10(np.mean(np.square(sigma)))
+    assert metrics["stated_db"] == pytest.approx(expected, abs=0.3)
+    assert json.loads((place / "alone/metrics.json").read_text())["stated_db"] is None
 
 
 def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others(place):

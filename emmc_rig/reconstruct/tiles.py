@@ -53,6 +53,7 @@ from reconstruction.tiles import (
     solve_block,
     summed_up,
     surveyed,
+    within,
 )
 from reconstruction.verdict.blocks import judged_together
 from reconstruction.verdict.evidence import Evidence
@@ -203,10 +204,19 @@ def block_task(task: BlockTask) -> None:
                 for key in ("status", "advice", "steps", "parameters", "left_out")
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
+            "variance": _variance(task.block, solved.arrays),
             "seconds": time.perf_counter() - started,
             "peak_mib": peak_memory_mib(),
         },
     )
+
+
+def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
+    """Return the sum of the light field's variance over a block's inner part; None without one."""
+    if "sigma" not in arrays:
+        return None
+    inner = arrays["sigma"][:, :, *within(block.inner, block.part)]
+    return float(np.sum(np.square(inner, dtype=np.float64)))
 
 
 def _solved(task: BlockTask) -> SolvedBlock:
@@ -227,10 +237,11 @@ def _solved(task: BlockTask) -> SolvedBlock:
 
 @dataclass(frozen=True)
 class DoneBlock:
-    """What a block says of itself, without its arrays."""
+    """What a block says of itself, without its arrays; variance: see `_variance`."""
 
     result: Reconstruction
     verdict: Verdict | None
+    variance: float | None
     seconds: float
     peak_mib: float
 
@@ -254,7 +265,7 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     verdict = (
         None if kept["evidence"] is None else verdict_from(Evidence.from_dict(kept["evidence"]))
     )
-    return DoneBlock(result, verdict, kept["seconds"], kept["peak_mib"])
+    return DoneBlock(result, verdict, kept.get("variance"), kept["seconds"], kept["peak_mib"])
 
 
 def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey:
@@ -305,11 +316,22 @@ class Blocks:
         """
         return {
             "blocks": list(self.grid.shape),
+            "stated_db": self.stated_db,
             "block_seconds": [one.seconds for one in self.done.values()],
             "workers": self.workers,
             "peak_gib": max(one.peak_mib for one in self.done.values()) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
+
+    @property
+    def stated_db(self) -> float | None:
+        """The PSNR that the deviations of all blocks stand for; None where one has none."""
+        each = [one.variance for one in self.done.values()]
+        views = int(np.prod(next(iter(self.tasks.values())).capture.psi.views))
+        if None in each:
+            return None
+        mean = sum(one for one in each if one is not None) / (views * np.prod(self.grid.size))
+        return float(-10 * np.log10(mean))
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""
