@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
@@ -44,7 +45,6 @@ from reconstruction.tiles import (
     Block,
     Grid,
     Place,
-    SavedPsi,
     SolvedBlock,
     Survey,
     assembled,
@@ -82,7 +82,7 @@ class Capture:
     @cached_property
     def psi(self) -> SavedPsi:
         """Psi, read window by window."""
-        return SavedPsi(self.psi_path)
+        return open_psi(self.psi_path)
 
     def opened_dictionary(self) -> Dictionary | None:
         """Return the dictionary where the method needs one."""
