@@ -11,6 +11,7 @@ from emmc_rig.session.session import Session
 from emmc_rig.study import ablation, next_shot
 from emmc_rig.study.oracle import STEP_PX, matched_disparity
 from emmc_rig.study.sweep import open_folder
+from emmc_rig.study.trial import Setup
 from simulators.scenes import render
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
@@ -20,7 +21,7 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkey
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
-    given = ablation.Exposure("deep-occlusions", find_camera(CAMERA), SIZE, 0)
+    given = Setup("deep-occlusions", find_camera(CAMERA), SIZE)
     rows = ablation.ablations(given, tmp_path, Silent())
     assert [row.name for row in rows] == [
         "adaptive",

@@ -10,8 +10,8 @@ from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
-from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
-from emmc_rig.study.chart.lock import timing_lock
+from emmc_rig.study.chart.chart_sweep import timing_lock
+from emmc_rig.study.chart.front import POOLED, Mark, charts, growths, pareto_front
 from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import (
     ChartSettings,
@@ -20,7 +20,6 @@ from emmc_rig.study.chart.points import (
     charted_points,
     scalings,
 )
-from emmc_rig.study.chart.scaling import growths
 from emmc_rig.study.chart.scores import angular_snr_db, scored, swept_disparity
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct

@@ -7,7 +7,7 @@ import numpy as np
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.study.stability.trial import Setup
+from emmc_rig.study.trial import Setup
 from reconstruction.method import Given
 
 ROOT = Path(__file__).parents[1]

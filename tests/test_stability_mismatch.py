@@ -9,10 +9,15 @@ import pytest
 from calibration.drift import DriftSettings
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.study.stability import mismatch
-from emmc_rig.study.stability.fault_points import stability_settings
+from emmc_rig.study.stability.fault_sweep import stability_settings
 from emmc_rig.study.stability.faults import FAULTS, trial
-from emmc_rig.study.stability.mismatch import Mismatch, corrected, measure_mismatch
-from emmc_rig.study.stability.mismatch_section import mismatch_sections, recovered_share
+from emmc_rig.study.stability.mismatch import (
+    Mismatch,
+    corrected,
+    measure_mismatch,
+    mismatch_sections,
+    recovered_share,
+)
 from emmc_rig.study.sweep import NotApplicableError
 
 SIZE = (48, 56)

@@ -16,11 +16,10 @@ from emmc_rig.progress import Silent
 from emmc_rig.study.tables import reproducing
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import PARTS, cells_of, distinct
-from emmc_rig.study.tables.console import shown
+from emmc_rig.study.tables.figures import Piece, Tile, composed, telling_pieces
 from emmc_rig.study.tables.grids import MEAN
 from emmc_rig.study.tables.library import Cut
-from emmc_rig.study.tables.mosaic import Piece, Tile, composed, telling_pieces
-from emmc_rig.study.tables.reproducing import COLUMNS, run_tables
+from emmc_rig.study.tables.reproducing import COLUMNS, run_tables, shown
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.methods import MethodSettings

@@ -17,17 +17,19 @@ from emmc_rig.study.sweep import Journal, SweepStopped, digest_of, open_folder
 from emmc_rig.study.tables.cell_sweep import FAST, Forecast, TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import PARTS, Capture, Cell, Part
 from emmc_rig.study.tables.colour_scores import scored
-from emmc_rig.study.tables.demosaic import demosaiced_rggb
-from emmc_rig.study.tables.dictionaries import (
+from emmc_rig.study.tables.library import (
+    Cut,
     Given,
     LeaveOneOut,
+    Library,
     TrainingSettings,
     check_not_trained_on,
+    middle,
+    scene_specs,
     trained_on,
 )
-from emmc_rig.study.tables.library import Cut, Library, middle, scene_specs
 from emmc_rig.study.tables.reproducing import cells_csv
-from emmc_rig.study.tables.shots import Sensors
+from emmc_rig.study.tables.shots import Sensors, demosaiced_rggb
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.learning import LearningSettings

@@ -34,10 +34,12 @@ from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
+from simulators.scenes import SCENES
 
 ROWS, SESSIONS = "next_shots.jsonl", "sessions"
 PLANNED, MOST = 6, 5
@@ -286,3 +288,34 @@ def total_savings(rows: Sequence[Saving]) -> Iterator[str]:
             f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it "
             f"in truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
         )
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure how many shots scenes need for a PSNR, chosen or in order (`chart --next-shot`)."""
+    size, targets_db = asked.size or (128, 160), sorted(asked.targets_db or [30.0])
+    scenes = asked.scenes or list(SCENES)
+    found = next_shots(scenes, asked.camera, asked.described, size, asked.seed, folder, show)
+    rows = [one for scene in found for one in savings(scene, targets_db)]
+    show.table(
+        ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number"),
+        [
+            (
+                one.scene,
+                f"{one.target_db:g}",
+                f"{one.stopped.count}{'' if one.reached else ', short'}",
+                f"{one.stopped.stated_db:.2f}",
+                f"{one.stopped.psnr_db:.2f}",
+                "-" if one.fixed is None else str(one.fixed),
+            )
+            for one in rows
+        ],
+    )
+    for line in total_savings(rows):
+        show.line(line)
+    return {
+        "camera": asked.camera,
+        "size": list(size),
+        "seed": asked.seed,
+        "rows": [row.as_dict() for row in rows],
+        "scenes": [asdict(scene) for scene in found],
+    }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import socket
 import statistics
 import subprocess
@@ -17,6 +18,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import uvicorn
@@ -31,6 +34,7 @@ from emmc_rig.live.server import application, new_token
 from emmc_rig.live.watch import Watch
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 
 CLIENTS, STOPS = 100, 20
@@ -290,3 +294,35 @@ def _seconds(call: Callable[[], object]) -> float:
     started_s = time.perf_counter()
     call()
     return time.perf_counter() - started_s
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Time stopping among many pages, pictures of 24 MP, and live light fields (`chart --live`)."""
+    scene, fields = (*asked.scenes, "deep-occlusions")[0], []
+    stop = stop_timing()
+    show.line(
+        f"stop among {stop.clients} pages: {stop.median_ms:.0f} ms, at most {stop.worst_ms:.0f} ms"
+    )
+    shown = shown_timing()
+    show.line(
+        f"{shown.megapixels:.0f} MP: {shown.frames_per_s:.1f} frames/s to a page, "
+        f"{shown.kilobytes:.0f} kB each, {shown.cpu_s_per_frame:.2f} s of computing"
+    )
+    for rows, columns in (asked.size,) if asked.size else SIZES:
+        field = field_timing(asked.described, (rows, columns), scene)
+        fields.append(field.as_dict())
+        show.line(
+            f"light field of {rows}x{columns}: {field.frame_s:.2f} s after its frame "
+            f"({field.frames_per_s:.1f}/s, {field.cpu_s:.2f} s of computing, the first "
+            f"{field.first_s:.2f} s), {field.psnr_db:.1f} dB, the copied centre view "
+            f"{field.copied_db:.1f} dB"
+        )
+    return {
+        "camera": asked.camera,
+        "scene": scene,
+        "stop": stop.as_dict(),
+        "shown": shown.as_dict(),
+        "light_fields": fields,
+        "load": os.getloadavg()[0],
+        "cores": os.cpu_count(),
+    }

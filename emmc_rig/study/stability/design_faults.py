@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
-from emmc_rig.study.stability.fault import DESIGN, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import DESIGN, Fault, Setup, Trial, trial_of
 
 
 def _near_mask(camera: Camera) -> tuple[str, Mask]:

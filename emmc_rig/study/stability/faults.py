@@ -14,9 +14,8 @@ from emmc_rig.study.stability import (
     sensor_faults,
     shot_faults,
 )
-from emmc_rig.study.stability.fault import Fault
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import Fault, Setup, Trial, trial_of
 
 KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults, design_faults)
 FAULTS = {fault.name: fault for module in KINDS for fault in module.FAULTS}

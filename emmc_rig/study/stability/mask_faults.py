@@ -14,9 +14,8 @@ from calibration.placement import Placement, designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.stability.fault import MASK, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import MASK, Fault, Setup, Trial, trial_of
 from simulators.flaws import OpticsFlaws
 
 

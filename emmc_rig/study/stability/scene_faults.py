@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emmc_rig.study.stability.fault import SCENE, Fault
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import SCENE, Fault, Setup, Trial, trial_of
 from simulators import changes
 from simulators.scenes import SCENES
 

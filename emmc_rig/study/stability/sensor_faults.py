@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.camera import build_imaging_matrix, pixel_light
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.study.stability.fault import SENSOR, Fault
-from emmc_rig.study.stability.trial import Array, Setup, Trial, trial_of
+from emmc_rig.study.trial import SENSOR, Array, Fault, Setup, Trial, trial_of
 from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02

@@ -10,9 +10,8 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
-from emmc_rig.study.stability.fault import SEVERAL, SHOTS, Fault
-from emmc_rig.study.stability.trial import Array, Setup, Trial, trial_of
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import SEVERAL, SHOTS, Array, Fault, Setup, Trial, trial_of
 from simulators import changes
 from simulators.raycaster import World
 

@@ -22,11 +22,11 @@ from emmc_rig.pages.drawing import (
     titled,
 )
 from emmc_rig.pages.page import Section, embedded, fragment, number
-from emmc_rig.study.stability.breaking import Span, below_best, span_words, strength_at
-from emmc_rig.study.stability.curve_drawing import shown
-from emmc_rig.study.stability.fault import Fault
+from emmc_rig.study.stability.curves import Span, below_best, span_words, strength_at
 from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.stability_page import shown
 from emmc_rig.study.stability.theory import TheoryPoint
+from emmc_rig.study.trial import Fault
 
 BOUND, FOUND, ORACLE = "bound_db", "found_db", "oracle_db"
 DRAWN_AS = {

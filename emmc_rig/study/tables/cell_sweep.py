@@ -19,8 +19,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import Results, Sweep, digest_of
 from emmc_rig.study.tables.cells import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
 from emmc_rig.study.tables.colour_scores import scored
-from emmc_rig.study.tables.dictionaries import Source, TrainingSettings
-from emmc_rig.study.tables.library import Array, Cut, Library
+from emmc_rig.study.tables.library import Array, Cut, Library, Source, TrainingSettings
 from emmc_rig.study.tables.shots import Sensors, Shots
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
