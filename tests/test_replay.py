@@ -22,7 +22,7 @@ def test_the_next_task_goes_to_the_worker_that_is_free_first():
 
 
 def test_computing_idling_and_scheduling_are_all_of_the_workers_time():
-    found = Replayed(4, 8, computed_s=360, best_s=95, scheduler_s=5)
+    found = Replayed(4, 8, computed_s=360, best_s=95, scheduler_s=5, replay_s=1)
     assert found.total_s == 100
     shares = found.efficiency, found.idle_share, found.scheduler_share
     assert shares == pytest.approx((0.9, 0.05, 0.05))
@@ -34,6 +34,7 @@ def test_a_replay_takes_at_least_the_tasks_time_and_leaves_none_out():
     found = replayed([10.0] * 8, 5000, 4, speed_up=100)
     assert found.tasks == 8
     assert found.best_s == 20
+    assert found.replay_s >= 0.2
     assert found.scheduler_s >= 0
     assert found.efficiency <= 1
 
