@@ -7,7 +7,7 @@ from scipy.stats import multivariate_t
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.lightfield import OPPONENT, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import assembly
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
@@ -25,7 +25,6 @@ from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
-from reconstruction.problem import OPPONENT
 from reconstruction.tv import reconstruct_tv
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.search import DECISIVE, Volume
-from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
 UNLIKELY = 20.0

@@ -43,7 +43,7 @@ ERRORS = (
 UNMOVED = ("mask-shift", 0.0)
 QUICK_ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 25.0))
 QUICK_DRIFT = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)
-METHODS_JUDGED = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
+MISMATCH_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 QUICK_METHODS = ("tv", "dict-omp", "adaptive-fast")
 LEAST_DB = 0.2
 """Loss below which a recovered share would be that of noise."""
@@ -196,7 +196,7 @@ def measure_mismatch(
     methods: none takes those of the protocol. Raises what scenes and cameras do for wrong input,
     NotApplicableError for cameras without a mask that can sit otherwise.
     """
-    methods = methods or (QUICK_METHODS if settings.fast else METHODS_JUDGED)
+    methods = methods or (QUICK_METHODS if settings.fast else MISMATCH_METHODS)
     errors = QUICK_ERRORS if settings.fast else ERRORS
     sweep = MismatchSweep(settings, folder)
     sweep.run(
