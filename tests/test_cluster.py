@@ -18,11 +18,11 @@ from programs import program
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.reconstruct import block_tasks
 from emmc_rig.reconstruct import pool as pools
-from emmc_rig.reconstruct import tiles
+from emmc_rig.reconstruct.block_tasks import BlockTask, Capture
 from emmc_rig.reconstruct.pool import WorkersError, opened_pool
 from emmc_rig.reconstruct.solve import reconstruct_folder
-from emmc_rig.reconstruct.tiles import BlockTask, Capture
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tiles import Grid
 from reconstruction.tv import TVSettings
@@ -113,14 +113,14 @@ def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
         "reconstruct", frames, "--method", "tv", "--settings", settings, "--out", tmp_path / "out",
         "--cluster", cluster.scheduler_address,
     )  # fmt: skip
-    written, first = tiles._write_arrays, threading.Lock()
+    written, first = block_tasks._write_arrays, threading.Lock()
 
     def write_arrays(path, arrays):
         if path.name.startswith("block-") and first.acquire(blocking=False):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return written(path, arrays)
 
-    monkeypatch.setattr(tiles, "_write_arrays", write_arrays)
+    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
     code, _, err = program(*given)
     assert (code, "No space left" in err, "Traceback" in err) == (1, True, False), err
     assert not (tmp_path / "out/light_field.h5").exists()

@@ -22,7 +22,7 @@ from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.reconstruct import tiles
+from emmc_rig.reconstruct import block_tasks
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.memory import parse_memory
 from emmc_rig.reconstruct.solve import reconstruct_folder
@@ -224,14 +224,14 @@ def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
 
 
 def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, monkeypatch):
-    pool, written = Here(), tiles._write_arrays
+    pool, written = Here(), block_tasks._write_arrays
 
     def write_arrays(path, arrays):
         if len(pool.done) == 4:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return written(path, arrays)
 
-    monkeypatch.setattr(tiles, "_write_arrays", write_arrays)
+    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
     with pytest.raises(AppError, match="No space left"):
         here(place, "full", pool)
     monkeypatch.undo()
@@ -243,14 +243,14 @@ def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, mon
 
 
 def test_a_block_that_fails_is_named_and_the_others_are_kept(place, monkeypatch):
-    pool, solved = Here(), tiles.solve_block
+    pool, solved = Here(), block_tasks.solve_block
 
     def solve_block(*given):
         if len(pool.done) == 4:
             raise ReconstructionError("the frames hold values that are not finite: exclude them")
         return solved(*given)
 
-    monkeypatch.setattr(tiles, "solve_block", solve_block)
+    monkeypatch.setattr(block_tasks, "solve_block", solve_block)
     with pytest.raises(AppError, match=r"rows 0 to 32, columns 54 to 80 .* not finite"):
         here(place, "bad-block", pool)
     assert len(list(kept(place, "bad-block").glob("block-*.json"))) == 2

@@ -24,11 +24,11 @@ from emmc_rig.files.shards import opened_array
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.reconstruct.block_tasks import Capture, fingerprint_of, run_capture
 from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.pool import Pool, opened_pool
 from emmc_rig.reconstruct.result import Result, compared, figures
-from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
 from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
