@@ -186,10 +186,7 @@ def drift_settings(fast: bool) -> DriftSettings:
 
 
 def measure_mismatch(
-    settings: StabilitySettings,
-    folder: Path,
-    watcher: Watcher,
-    methods: Sequence[str] = (),
+    settings: StabilitySettings, folder: Path, watcher: Watcher, methods: Sequence[str] = ()
 ) -> list[Mismatch]:
     """Return every row, those that the folder does not hold measured and kept there.
 

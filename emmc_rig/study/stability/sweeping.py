@@ -278,6 +278,6 @@ def _about(sweep: StabilitySweep, left_out: Sequence[str]) -> list[str]:
     size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(sweep.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
-        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}.",
+        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
     return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]

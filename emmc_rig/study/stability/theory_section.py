@@ -12,15 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from scipy.stats import spearmanr
 
-from emmc_rig.pages.drawing import (
-    COLOURS,
-    FAINT,
-    INK,
-    legend_below,
-    save_drawing,
-    sheet,
-    titled,
-)
+from emmc_rig.pages.drawing import COLOURS, FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment, number
 from emmc_rig.study.stability.curves import Span, below_best, span_words, strength_at
 from emmc_rig.study.stability.faults import FAULTS

@@ -10,13 +10,7 @@ from typing import Literal
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, shipped_cameras
-from emmc_rig.model.masks import (
-    AnyPattern,
-    GaussianColour,
-    RandomBinary,
-    RandomRGBW,
-    UniformColour,
-)
+from emmc_rig.model.masks import AnyPattern, GaussianColour, RandomBinary, RandomRGBW, UniformColour
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.paper import Scenario
 
