@@ -16,6 +16,7 @@ from emmc_rig.commands.design import design
 from emmc_rig.commands.devices import app as devices
 from emmc_rig.commands.export import export
 from emmc_rig.commands.live import live
+from emmc_rig.commands.modes import ModalCommand
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
@@ -42,7 +43,7 @@ for command in (
     capture, live, calibrate, demo, cameras, simulate, reconstruct, export, chart, train, tables,
     stability, design,
 ):  # fmt: skip
-    app.command()(command)
+    app.command(cls=ModalCommand)(command)
 
 
 @app.callback(invoke_without_command=True)
