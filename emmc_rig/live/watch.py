@@ -44,7 +44,7 @@ FASTEST_S = 0.04
 POLL_S = 0.2
 PATIENCE_S = 10.0
 """For the threads to end. A move under way is stopped first."""
-LEVEL_PIXELS = 1 << 20
+LEVEL_PIXELS = 1 << 18
 """Of a frame, evenly spread, for its histogram; saturated ones are counted in all."""
 SHIFT_PX = 1024
 LEAST_LIKENESS = 0.3
