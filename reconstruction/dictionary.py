@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.reading import one_line, stored_arrays
 from reconstruction.errors import DictionaryError
 
@@ -25,8 +26,6 @@ FORMAT = "emmc-rig dictionary 1"
 _NORM_TOLERANCE = 1e-3
 _CHUNK_BYTES = 1 << 20
 
-OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-"""Luminance and two chrominances (opponent colour, RGB), orthonormal."""
 _BLUR_PX, _CHROMA_BLUR_PX = 0.7, 1.0
 _SAME = 0.995
 

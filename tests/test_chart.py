@@ -20,7 +20,7 @@ from emmc_rig.study.chart.points import (
     charted_points,
     scalings,
 )
-from emmc_rig.study.chart.scores import angular_snr_db, scored, swept_disparity
+from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.methods import MethodSettings, installed_methods, reconstruct
 from simulators.scenes import render

@@ -40,6 +40,7 @@ WRITERS = {
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
     "chart --ablation": (*SIZE,),
+    "chart --constants": (*SIZE,),
     "chart --guard": (*SIZE,),
     "chart --kernels": (*SIZE,),
     "chart --live": (*SIZE,),
@@ -56,6 +57,7 @@ WRITERS = {
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
+    "figure": ("scene.h5",),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "reconstruct --tile": (8, "frames"),
@@ -80,6 +82,7 @@ READERS = {
 JOURNALS = {
     "calibrate --check": "checks.jsonl",
     "chart --ablation": "ablation.jsonl",
+    "chart --constants": "constants.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
     "design": "simulations.jsonl",

@@ -63,6 +63,9 @@ def stability(
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="processes that share the trials")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="folder to write (default: emmc-stability, -verdicts, -worst)"),
@@ -99,7 +102,9 @@ def stability(
         switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
         wanted = [name for name, on in switches.items() if on]
         beside = measure_beside(settings, wanted, out, bars)
-        outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
+        outcome = run_stability(
+            settings, out, bars, beside.sections, beside.metrics, workers=workers
+        )
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"
     shown = [(f"{row.title}, {row.unit}", *row.cells) for row in rows]

@@ -19,10 +19,10 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import number
-from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import angular_snr_db
+from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
 from emmc_rig.study.sweep import (
     Results,
@@ -229,7 +229,7 @@ class StabilitySweep(Sweep[Point]):
         truth = self.truth_picture(one)
         truth.parent.mkdir(exist_ok=True)
         if not truth.is_file():
-            save_thumbnail(truth, made.truth, telling_lines(made.truth))
+            save_thumbnail(truth, made.truth, epipolar_lines(made.truth))
         for point in points:
             yield self._measured(point, made)
 
@@ -248,7 +248,7 @@ class StabilitySweep(Sweep[Point]):
         estimate = result.light_field
         if not np.isfinite(estimate).all():
             return {"failed": "the estimate is not finite", "view_db": view_db}
-        save_thumbnail(self.picture(point), estimate, telling_lines(made.truth))
+        save_thumbnail(self.picture(point), estimate, epipolar_lines(made.truth))
         return {
             "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,

@@ -60,7 +60,7 @@ def _misplaced(setup: Setup, **changed: float) -> Trial:
 
 
 def _diagonal(px: float, setup: Setup) -> dict[str, float]:
-    """Return a shift by so many samples, at 30 degrees to the rows."""
+    """Return a shift in samples, at 30 degrees to the rows."""
     um = px * setup.camera.sensor.sample_pitch_um
     return {
         "offset_x_um": um * math.cos(math.pi / 6),
@@ -69,7 +69,7 @@ def _diagonal(px: float, setup: Setup) -> dict[str, float]:
 
 
 def shift(setup: Setup, px: float) -> Trial:
-    """The mask sits so many samples off, in a slanted direction."""
+    """The mask is shifted, at 30 degrees to the rows."""
     return _misplaced(setup, **_diagonal(px, setup))
 
 
@@ -79,12 +79,12 @@ def rotation(setup: Setup, degrees: float) -> Trial:
 
 
 def scale(setup: Setup, percent: float) -> Trial:
-    """The mask's cells are so many percent too large."""
+    """The mask's cells are too large."""
     return _misplaced(setup, scale=percent / 100)
 
 
 def distance(setup: Setup, percent: float) -> Trial:
-    """The mask stands so many percent further from the sensor."""
+    """The mask stands further from the sensor than designed."""
     return _misplaced(setup, distance_share=percent / 100)
 
 
@@ -94,7 +94,7 @@ def edge_blur(setup: Setup, px: float) -> Trial:
 
 
 def vignetting(setup: Setup, percent: float) -> Trial:
-    """The outermost ray loses so many percent, the others less, by a power of the cos^4 law."""
+    """The outermost ray loses a share of light, the others less, by a power of the cos^4 law."""
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     lens = setup.camera.lens

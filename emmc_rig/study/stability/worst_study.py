@@ -24,7 +24,7 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import swept_disparity
+from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
 from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES, named_methods
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
