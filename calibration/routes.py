@@ -44,7 +44,6 @@ from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, meas
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 
-MOST_PIXELS_WITH_DEVIATION = 2_000_000
 LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
@@ -189,11 +188,10 @@ def calibrate(
         if "combined" in routes and best is not None and few is not None:
             on_stage("Psi, combined")
             model = bare["mixed" if mixed is not None else "parametric"]
-            if np.isfinite(model.deviation).all():
-                both = combined(free, model, good)
-                calibrations["combined"] = both
-                judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
-                frames["combined"] = few.exposures
+            both = combined(free, model, good)
+            calibrations["combined"] = both
+            judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
+            frames["combined"] = few.exposures
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > AT_THE_NOISE:
@@ -389,12 +387,9 @@ def _calibration(
 ) -> Calibration:
     stages = shot_stages(camera)
     psi = one.psi(design, stages)
-    if np.prod(design.size) <= MOST_PIXELS_WITH_DEVIATION:
-        deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
-        if one.defects is not None and one.defects.count:
-            deviation = _counting_defects(deviation, one, design, stages)
-    else:
-        deviation = np.broadcast_to(np.float32(np.nan), psi.weights.shape)
+    deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
+    if one.defects is not None and one.defects.count:
+        deviation = _counting_defects(deviation, one, design, stages)
     white = np.stack([_white(boards, design, shot) for shot in range(design.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
 
