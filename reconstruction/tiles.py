@@ -25,7 +25,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.edges import SIDES, dark_edges
 from reconstruction.adaptive.parsimony import may_be_grey
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import TINY
+from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -395,12 +395,15 @@ def surveyed(
                 )
         largest = max((one.largest_px for one in disparities), default=0.0)
         halo = TEXTURE_REACH * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
-        picture = smooth_guess(mosaic, read, use)
+        flat = flat_psi(mosaic)
+        picture = smooth_guess(flat, read, use).astype(np.float32)
+        noise = np.full(read.shape, noise_sigma**2)
         plane = _joint_plane(disparities, psi.size, k) if settings.adaptive.parsimony else None
         grey = settings.adaptive.parsimony and may_be_grey(picture)
         adaptive = settings.adaptive.model_copy(
             update={
-                "brightness": settings.adaptive.brightness or max(float(picture.mean()), TINY),
+                "contrast": settings.adaptive.contrast
+                or contrast_of(flat, read, picture, noise, use),
                 "parsimony": plane is not None or grey,
                 "plane": plane,
                 "edges": _dark_sides(psi, frames, usable),

@@ -9,7 +9,6 @@ import typer
 
 from emmc_rig.commands.options import (
     DictionaryOption,
-    MethodsOption,
     ScenesOption,
     SeedOption,
     SizeOption,
@@ -27,7 +26,10 @@ def stability(
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
-    method: MethodsOption = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="only this one, or all that are installed; may repeat"),
+    ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
     ] = False,
@@ -138,9 +140,13 @@ def _verdicts(out: Path, *wanted: Any) -> None:
     with shown_bars() as bars:
         results = detector.run_detector(settings, out, bars)
     show_table(
-        ("fault", "method", "broken: flagged", "good: flagged", "between", "poor"),
+        ("fault", "method", "broken: flagged", "good: flagged", "between", "poor", "cannot tell"),
         [
-            (*names, *(f"{flagged} of {there}" for flagged, there in tally.pairs()))
+            (
+                *names,
+                *(f"{flagged} of {there}" for flagged, there in tally.pairs()),
+                str(tally.untold),
+            )
             for names, tally in detector.tables(results).items()
         ],
     )
