@@ -17,7 +17,7 @@ from reconstruction.methods import MethodSettings
 from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 
 UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
-BASE_BYTES = 480 * 2**20
+BASE_BYTES = 512 * 2**20
 """Of a process with the program's libraries, its kernels compiled."""
 RAY_BYTES, WEIGHT_BYTES = 170, 26
 """Of a block, for each of its rays (views times samples), and for each of their weights (shots
