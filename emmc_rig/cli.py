@@ -15,7 +15,9 @@ from emmc_rig.commands.demo import demo
 from emmc_rig.commands.design import design
 from emmc_rig.commands.devices import app as devices
 from emmc_rig.commands.export import export
+from emmc_rig.commands.figure import figure
 from emmc_rig.commands.live import live
+from emmc_rig.commands.modes import ModalCommand
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
@@ -39,10 +41,10 @@ app = typer.Typer(
 app.add_typer(devices, name="devices")
 app.add_typer(session, name="session")
 for command in (
-    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, chart, train, tables,
-    stability, design,
+    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart, train,
+    tables, stability, design,
 ):  # fmt: skip
-    app.command()(command)
+    app.command(cls=ModalCommand)(command)
 
 
 @app.callback(invoke_without_command=True)

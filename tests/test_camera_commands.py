@@ -21,7 +21,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text, preview
 from emmc_rig.rig import hardware
 from emmc_rig.rig.hardware import open_camera, scene_simulator
-from emmc_rig.study.benchmarks.ptp import picture_timing
+from emmc_rig.study.benchmarks.devices import picture_timing
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction
 from simulators.usb import SimulatedUsb

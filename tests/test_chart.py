@@ -10,8 +10,8 @@ from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
-from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
-from emmc_rig.study.chart.lock import timing_lock
+from emmc_rig.study.chart.chart_sweep import timing_lock
+from emmc_rig.study.chart.front import POOLED, Mark, charts, growths, pareto_front
 from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import (
     ChartSettings,
@@ -20,10 +20,9 @@ from emmc_rig.study.chart.points import (
     charted_points,
     scalings,
 )
-from emmc_rig.study.chart.scaling import growths
-from emmc_rig.study.chart.scores import angular_snr_db, scored, swept_disparity
+from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from reconstruction.dictionary import dct_dictionary
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings, installed_methods, reconstruct
 from simulators.scenes import render
 
 SETTINGS = ChartSettings(scenes=("dark",), cameras=("rgbw-bayer-1shot",), size=(24, 32))
@@ -103,7 +102,7 @@ def test_scores_of_the_truth_are_perfect_up_to_the_sweep():
 
 def test_every_method_is_planned_and_every_rival():
     planned = {point.configuration.method for point in charted_points(SETTINGS)}
-    assert planned == {*METHODS, *PEERS}
+    assert planned == {*installed_methods(), *PEERS}
     labels = [point.label for point in charted_points(SETTINGS)]
     assert len(set(labels)) == len(labels)
 

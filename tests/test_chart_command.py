@@ -16,16 +16,13 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
-from emmc_rig.study.chart import chart_sweep, lock, measure, points
+from emmc_rig.study.chart import chart_sweep, measure, points
 from emmc_rig.study.chart.captures import Capture, kept_capture
-from emmc_rig.study.chart.chart_sweep import ChartSweep
+from emmc_rig.study.chart.chart_sweep import ChartSweep, timing_lock, working
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
-from emmc_rig.study.chart.lock import timing_lock
-from emmc_rig.study.chart.measure import measured
+from emmc_rig.study.chart.measure import Reference, measured
 from emmc_rig.study.chart.peers import Peer
 from emmc_rig.study.chart.points import chart_settings
-from emmc_rig.study.chart.reference import Reference
-from emmc_rig.study.chart.worker import working
 from emmc_rig.study.sweep import SweepStopped, digest_of
 from simulators.scenes import render
 
@@ -46,7 +43,7 @@ def at_once(measure):
 @pytest.fixture(autouse=True)
 def lock_of_its_own(monkeypatch, tmp_path):
     """Nothing is timed here, so that a chart on this machine need not be waited for."""
-    monkeypatch.setattr(lock, "lock_path", lambda: tmp_path / "lock")
+    monkeypatch.setattr(chart_sweep, "lock_path", lambda: tmp_path / "lock")
 
 
 @pytest.fixture

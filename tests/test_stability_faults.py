@@ -11,8 +11,8 @@ from emmc_rig.model.lightfield import save_views
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.stability.mask_faults import misplaced_psi
 from emmc_rig.study.stability.shot_faults import flicker_gains
-from emmc_rig.study.stability.trial import Setup
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import Setup
 from simulators import changes
 from simulators.scenes import render
 

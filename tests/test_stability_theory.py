@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.study.stability import beside, fault_points, theory
-from emmc_rig.study.stability.fault_points import stability_settings
+from emmc_rig.model.lightfield import OPPONENT
+from emmc_rig.study.stability import fault_sweep, sweeping, theory
+from emmc_rig.study.stability.fault_sweep import stability_settings
 from emmc_rig.study.stability.faults import FAULTS, trial
 from emmc_rig.study.stability.theory import (
     Place,
@@ -27,9 +28,8 @@ from emmc_rig.study.stability.theory_section import (
     rank_correlation,
     theory_sections,
 )
-from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.patch import SIDE, PatchModel, Texture
 
 CAMERA = find_camera("rgbw-bayer-1shot").model_copy(update={"views": (3, 3)})
@@ -137,7 +137,7 @@ def test_rank_correlation_takes_infinity_as_largest():
 
 def test_points_are_kept_and_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(theory, "QUICK_SWEPT", ("exposure",))
-    for module in (theory, fault_points):
+    for module in (theory, fault_sweep):
         monkeypatch.setattr(module, "find_camera", lambda name: CAMERA)
     monkeypatch.setattr(theory, "QUICK_PATCHES", (4, 1))
     settings = stability_settings(True, ["near-planar"], (32, 40), camera="small")
@@ -161,9 +161,9 @@ def test_parts_are_measured_into_the_folder_of_the_sweeps(tmp_path, monkeypatch)
         TheoryPoint("exposure", "near-planar", s, {k: v - 5 * i for k, v in figures.items()})
         for i, s in enumerate((15_500.0, 500.0, 5.0))
     ]
-    monkeypatch.setattr(beside, "measure_theory", lambda *_: points)
+    monkeypatch.setattr(sweeping, "measure_theory", lambda *_: points)
     settings = stability_settings(True, ["near-planar"], None)
-    found = beside.measure_beside(settings, ["theory"], tmp_path / "out", Counted())
+    found = sweeping.measure_beside(settings, ["theory"], tmp_path / "out", Counted())
     assert [section.key for section in found.sections] == ["theory-near-planar"]
     assert "in 2 of 2 curves" in found.lines[0]
     metrics = found.metrics["theory"]
@@ -176,16 +176,16 @@ def test_parts_are_measured_into_the_folder_of_the_sweeps(tmp_path, monkeypatch)
 
 def test_nothing_is_written_for_a_wrong_camera_or_no_part(tmp_path):
     settings = stability_settings(True, ["near-planar"], None)
-    assert beside.measure_beside(settings, [], tmp_path / "out", Counted()).sections == []
+    assert sweeping.measure_beside(settings, [], tmp_path / "out", Counted()).sections == []
     wrong = settings.model_copy(update={"camera": "rgbw-mno"})
     with pytest.raises(CameraError, match="rgbw-mno"):
-        beside.measure_beside(wrong, ["theory"], tmp_path / "out", Counted())
+        sweeping.measure_beside(wrong, ["theory"], tmp_path / "out", Counted())
     assert not (tmp_path / "out").exists()
 
 
 def test_a_part_that_does_not_apply_is_left_out_in_words(tmp_path):
     settings = stability_settings(True, ["near-planar"], (32, 40), camera="rgbw-mono")
-    found = beside.measure_beside(settings, ["mismatch"], tmp_path / "out", Counted())
+    found = sweeping.measure_beside(settings, ["mismatch"], tmp_path / "out", Counted())
     assert found.sections == []
     assert "colour filter" in found.lines[0]
 
@@ -194,5 +194,5 @@ def test_the_command_has_a_switch_for_each_part():
     from emmc_rig.cli import app
 
     told = CliRunner().invoke(app, ["stability", "--help"], env={"COLUMNS": "200", "TERM": "dumb"})
-    for part in beside.PARTS:
+    for part in sweeping.PARTS:
         assert f"--{part}" in told.output

@@ -8,8 +8,8 @@ import pytest
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.study.stability.details import SHAPES, Detail, shown
 from emmc_rig.study.stability.sensor_faults import exposure
-from emmc_rig.study.stability.trial import Setup
 from emmc_rig.study.stability.worst import TILE_PX, confined, worst_perturbation
+from emmc_rig.study.trial import Setup
 
 SHAPE = (1, 2 * TILE_PX, 2 * TILE_PX)
 GREY = np.full((3, 3, 32, 40, 3), 0.4, dtype=np.float32)

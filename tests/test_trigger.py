@@ -23,7 +23,7 @@ from emmc_rig.rig.hardware import simulated_rig
 from emmc_rig.rig.rig_config import ImagedRig, opened_rig, rig_description
 from emmc_rig.rig.trigger import SimulatedTrigger, check_trigger
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.study.benchmarks.trigger import (
+from emmc_rig.study.benchmarks.devices import (
     EXPOSURE_S,
     MOVE_S,
     TriggeredRig,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -16,6 +17,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 from emmc_rig.errors import StoppedError
@@ -54,11 +56,31 @@ class Bars:
                 self._task, completed=progress.step, total=progress.total, detail=detail
             )
 
+    def line(self, text: str) -> None:
+        """Print a result in words."""
+        print(text, flush=True)
+
+    def note(self, label: str, text: object) -> None:
+        """Print what is missing, apart from the results."""
+        say(label, text)
+
+    def table(self, heads: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
+        """Print a table."""
+        show_table(heads, rows, title)
+
     def finish(self) -> None:
         """Fill the current bar: a solver may stop before its last step."""
         if self._task is not None:
             done = self._progress.tasks[-1].completed or 1
             self._progress.update(self._task, total=done, completed=done, detail="")
+
+
+def show_table(heads: Sequence[Any], rows: Iterable[Sequence[Any]], title: str = "") -> None:
+    """Print a table to standard output. heads: names, or columns of rich."""
+    table = Table(*heads, title=title or None, box=SIMPLE)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
 
 
 def say(label: str, message: object, style: str = "yellow") -> None:

@@ -136,18 +136,15 @@ def calibrate(
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
     if check is not None:
-        from rich.console import Console
-        from rich.table import Table
-
+        from emmc_rig.commands.bars import show_table
         from emmc_rig.study.checks.check_sweep import run_checks
 
         out = out or Path("emmc-checks")
         with shown_bars() as bars:
             metrics = run_checks(settings, check, out, bars)
-        table = Table("target", "measured", "asked", "")
-        for row in metrics["rows"]:
-            table.add_row(row["what"], row["measured"], row["asked"], row["verdict"])
-        Console().print(table)
+        names = ("what", "measured", "asked", "verdict")
+        rows = [tuple(row[name] for name in names) for row in metrics["rows"]]
+        show_table(("target", "measured", "asked", ""), rows)
         typer.echo(f"read {out / 'metrics.json'}")
         missed = [row["what"] for row in metrics["rows"] if row["verdict"] == "missed"]
         if missed:

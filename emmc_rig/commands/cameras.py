@@ -21,11 +21,8 @@ def cameras(
     ] = None,
 ) -> None:
     """List the cameras known, or draw one: masks, weights, sampling, condition."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
     import emmc_rig as emmc
+    from emmc_rig.commands.bars import show_table
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics
     from emmc_rig.pages.camera_sheet import (
@@ -35,17 +32,14 @@ def cameras(
     )
 
     if name is None:
-        table = Table("camera", "sensor", "shots", "masks", "sampling", "light", box=SIMPLE)
-        for row in camera_rows():
-            table.add_row(
-                f"[bold]{row.name}[/]\n{row.title}",
-                row.sensor,
-                str(row.shots),
-                str(row.masks),
-                row.sampling_rate,
-                f"{row.light_percent:.0f} %",
-            )
-        Console().print(table)
+        show_table(
+            ("camera", "sensor", "shots", "masks", "sampling", "light"),
+            [
+                (f"[bold]{row.name}[/]\n{row.title}", row.sensor, str(row.shots), str(row.masks),
+                 row.sampling_rate, f"{row.light_percent:.0f} %")
+                for row in camera_rows()
+            ],
+        )  # fmt: skip
         return
     camera = emmc.camera(name)
     figures = camera_figures(camera)
@@ -53,13 +47,13 @@ def cameras(
     with result_folder(folder_name, "cameras") as folder:
         draw_camera(camera, folder / "camera.png")
         write_metrics(folder, figures)
-    table = Table("figure", "value", title=camera.title)
+    rows = []
     for key, value in figures.items():
         if isinstance(value, dict):
             for mask, measured in value.items():
                 for what, figure in measured.items():
-                    table.add_row(f"{mask}: {what}", _shown(figure))
+                    rows.append((f"{mask}: {what}", _shown(figure)))
         else:
-            table.add_row(key, _shown(value))
-    Console().print(table)
+            rows.append((key, _shown(value)))
+    show_table(("figure", "value"), rows, camera.title)
     typer.echo(f"open {folder_name / 'camera.png'}")

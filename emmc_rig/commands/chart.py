@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emmc_rig.commands.chart_ablation import chart_ablation
-from emmc_rig.commands.chart_guard import chart_guard
-from emmc_rig.commands.chart_kernels import chart_kernels
-from emmc_rig.commands.chart_live import chart_live
-from emmc_rig.commands.chart_next_shot import chart_next_shot
-from emmc_rig.commands.chart_peers import chart_peers
-from emmc_rig.commands.chart_solvers import chart_solvers
-from emmc_rig.commands.chart_stated import chart_stated
 from emmc_rig.commands.options import (
-    DEFAULT_SCENE,
     DictionaryOption,
     MethodsOption,
     ScenesOption,
@@ -26,10 +17,6 @@ from emmc_rig.commands.options import (
 
 if TYPE_CHECKING:
     from emmc_rig.study.chart.points import ChartSettings
-
-ONE_SHOT = "rgbw-bayer-1shot"
-TIMED_SIZE, TIMED_CALLS = (593, 840), 7
-STUDIED_SIZE = (128, 160)
 
 
 def chart(
@@ -56,6 +43,9 @@ def chart(
     ] = False,
     ablation: Annotated[
         bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
+    ] = False,
+    constants: Annotated[
+        bool, typer.Option("--constants", help="instead: cost of 2x, 0.5x of each constant of it")
     ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
@@ -87,60 +77,62 @@ def chart(
     from emmc_rig.files.results import parse_size
 
     shape = parse_size(size)
-    one_camera = (camera or [ONE_SHOT])[0]
-    timed = shape or TIMED_SIZE, repeats or TIMED_CALLS
-    if solvers:
-        chart_solvers(one_camera, dictionary, out or Path("emmc-solvers"))
-    elif peers:
-        chart_peers(one_camera, *timed, out or Path("emmc-peers"))
-    elif kernels:
-        chart_kernels(one_camera, *timed, out or Path("emmc-kernels"))
-    elif guard:
-        chart_guard(scene or [], camera, shape, out or Path("emmc-guard"))
-    elif live:
-        chart_live(one_camera, (scene or [DEFAULT_SCENE])[0], shape, out or Path("emmc-live"))
-    elif stated:
-        chart_stated(scene or [], camera, shape, out or Path("emmc-stated"))
-    elif ablation:
-        seen, cut = (scene or [DEFAULT_SCENE])[0], shape or STUDIED_SIZE
-        chart_ablation(seen, one_camera, cut, seed, out or Path("emmc-ablation"))
-    elif next_shot:
-        from simulators.scenes import SCENES
-
-        place, targets = out or Path("emmc-next-shot"), sorted(until or [30.0])
-        cut = shape or STUDIED_SIZE
-        chart_next_shot(scene or list(SCENES), one_camera, cut, targets, seed, place)
-    else:
-        from emmc_rig.study.chart.points import chart_settings
-
-        settings = chart_settings(
-            fast, scene or [], camera or [], shape, repeats,
-            methods=tuple(method or []), scaling=scaling, dictionary=dictionary, seed=seed,
+    instead = {
+        "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation,
+        "constants": constants,
+        "next-shot": next_shot, "guard": guard, "live": live, "stated": stated,
+    }  # fmt: skip
+    for name in (name for name, wanted in instead.items() if wanted):
+        _benchmark(
+            name, out or Path(f"emmc-{name}"), (camera or [None])[0], scenes=scene or [],
+            size=shape, repeats=repeats, seed=seed, dictionary=dictionary, targets_db=until or [],
         )  # fmt: skip
-        _chart_methods(settings, out or Path("emmc-chart"))
+        return
+    from emmc_rig.study.chart.points import chart_settings
+
+    settings = chart_settings(
+        fast, scene or [], camera or [], shape, repeats,
+        methods=tuple(method or []), scaling=scaling, dictionary=dictionary, seed=seed,
+    )  # fmt: skip
+    _chart_methods(settings, out or Path("emmc-chart"))
+
+
+def _benchmark(name: str, out: Path, camera: str | None, **asked: Any) -> None:
+    from emmc_rig.commands.bars import shown_bars
+    from emmc_rig.errors import AppError
+    from emmc_rig.study.benchmarks.running import run_benchmark
+
+    with shown_bars() as bars:
+        metrics = run_benchmark(name, out, bars, camera, **asked)
+    if fallen := metrics.get("fell"):
+        raise AppError(
+            f"{len(fallen)} figure(s) fell: {'; '.join(fallen)}: fix the method, or store "
+            f"{out / 'guard.json'} where intended"
+        )
 
 
 def _chart_methods(settings: ChartSettings, place: Path) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.commands.bars import say, show_table, shown_bars
     from emmc_rig.study.chart.charting import run_chart
 
     with shown_bars() as bars:
         outcome = run_chart(settings, place, bars)
     for one in outcome.shown():
-        table = Table("the front", "s", "dB", title=one.title, box=SIMPLE)
-        for mark in one.front():
-            table.add_row(mark.configuration.label, f"{mark.seconds:.3g}", f"{mark.psnr_db:.2f}")
-        Console().print(table)
+        rows = [
+            (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in one.front()
+        ]
+        show_table(("the front", "s", "dB"), rows, one.title)
     if outcome.growths:
-        table = Table("growth", "against", "exponent", "expected", box=SIMPLE)
-        for growth in outcome.growths:
-            expected = "-" if growth.expected is None else f"{growth.expected:.2f}"
-            table.add_row(growth.label, growth.axis, f"{growth.exponent:.2f}", expected)
-        Console().print(table)
+        rows = [
+            (
+                g.label,
+                g.axis,
+                f"{g.exponent:.2f}",
+                "-" if g.expected is None else f"{g.expected:.2f}",
+            )
+            for g in outcome.growths
+        ]
+        show_table(("growth", "against", "exponent", "expected"), rows)
     for line in outcome.left_out:
         say("left out", line)
     typer.echo(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")

@@ -67,14 +67,8 @@ def design(
 
 
 def _show(found: Sequence[Simulated]) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
+    from emmc_rig.commands.bars import show_table
     from emmc_rig.study.design.design_page import simulated_table
 
     heads, rows = simulated_table(found)
-    table = Table(*heads, box=SIMPLE)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+    show_table(heads, rows)

@@ -16,11 +16,10 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
 
 from emmc_rig.capture.signals import ENDING, handled
+from emmc_rig.commands.bars import show_table
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.stage_scale import register as register_scale
@@ -63,29 +62,21 @@ def list_devices(rig: RigOption = None) -> None:
 
         simulated_protocol(rig)
         _list_cameras(simulated_bus(SYSTEM_CLOCK))
-        table = Table("stage", box=SIMPLE)
-        for protocol in PROTOCOLS:
-            table.add_row(f"--rig simulated:{protocol}")
-        Console().print(table)
+        show_table(("stage",), [(f"--rig simulated:{protocol}",) for protocol in PROTOCOLS])
         return
     _list_cameras()
     ports = list_serial_ports()
     if not ports:
         typer.echo("no serial port: plug a stage in, or try --rig simulated")
         return
-    table = Table("port", "USB id", "serial number", "description", "guess", "held by", box=SIMPLE)
+    rows = []
     for port in ports:
         known = port.vendor_id is not None and port.product_id is not None
         usb_id = f"{port.vendor_id:04x}:{port.product_id:04x}" if known else ""
-        table.add_row(
-            port.device,
-            usb_id,
-            port.serial_number,
-            port.description,
-            port.guess,
-            holder_of(port.device),
-        )
-    Console().print(table)
+        held_by = holder_of(port.device)
+        named = port.device, usb_id, port.serial_number, port.description
+        rows.append((*named, port.guess, held_by))
+    show_table(("port", "USB id", "serial number", "description", "guess", "held by"), rows)
 
 
 def _list_cameras(backend: Any = None) -> None:
@@ -105,11 +96,14 @@ def _list_cameras(backend: Any = None) -> None:
     if not found:
         typer.echo("no USB camera: plug one in and switch it on, or try --camera simulated")
         return
-    table = Table("camera", "maker", "model", "may be opened", box=SIMPLE)
-    for kind, one in found:
-        allowed = "yes" if one.accessible else "no: see `emmc-rig devices udev-rule`"
-        table.add_row(f"{kind}:{one.serial}", one.maker, one.model, allowed)
-    Console().print(table)
+    refused = "no: see `emmc-rig devices udev-rule`"
+    show_table(
+        ("camera", "maker", "model", "may be opened"),
+        [
+            (f"{kind}:{one.serial}", one.maker, one.model, "yes" if one.accessible else refused)
+            for kind, one in found
+        ],
+    )
 
 
 @app.command()
@@ -240,23 +234,24 @@ def bench(
     """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics
-    from emmc_rig.study.benchmarks.ptp import picture_timing
-    from emmc_rig.study.benchmarks.stages import stage_timings
-    from emmc_rig.study.benchmarks.trigger import capture_timing, trigger_timing
-    from emmc_rig.study.benchmarks.u3v import u3v_timings
+    from emmc_rig.study.benchmarks.devices import (
+        capture_timing,
+        picture_timing,
+        stage_timings,
+        trigger_timing,
+        u3v_timings,
+    )
 
     with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
         timings = stage_timings(repeats)
-        table = Table("stage", "command", "exchanges", "ms", "ms for each exchange")
-        for one in timings:
-            table.add_row(
-                one.protocol,
-                one.command,
-                f"{one.exchanges:g}",
-                f"{one.milliseconds:.3f}",
-                f"{one.milliseconds / one.exchanges:.3f}",
-            )
-        Console().print(table)
+        show_table(
+            ("stage", "command", "exchanges", "ms", "ms for each exchange"),
+            [
+                (one.protocol, one.command, f"{one.exchanges:g}", f"{one.milliseconds:.3f}",
+                 f"{one.milliseconds / one.exchanges:.3f}")
+                for one in timings
+            ],
+        )  # fmt: skip
         picture = picture_timing()
         typer.echo(
             f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
@@ -327,19 +322,13 @@ def signals_interrupt() -> Iterator[None]:
 def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
-    table = Table("axis", "homed", "position um", "limits um", "speed um/s", "up to", box=SIMPLE)
+    rows = []
     for axis in stage.axes:
         low_um, high_um = stage.limits_um(axis)
         try:
             homed, position = "yes", f"{stage.position_um(axis):.3f}"
         except NotHomedError:
             homed, position = "no", "unknown"
-        table.add_row(
-            axis,
-            homed,
-            position,
-            f"{low_um:g} to {high_um:g}",
-            f"{stage.speed_um_s(axis):g}",
-            f"{stage.top_speed_um_s(axis):g}",
-        )
-    Console().print(table)
+        speeds = f"{stage.speed_um_s(axis):g}", f"{stage.top_speed_um_s(axis):g}"
+        rows.append((axis, homed, position, f"{low_um:g} to {high_um:g}", *speeds))
+    show_table(("axis", "homed", "position um", "limits um", "speed um/s", "up to"), rows)

@@ -79,8 +79,9 @@ def reconstruct(
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
     from emmc_rig.commands.bars import console, shown_bars
-    from emmc_rig.reconstruct.captures import Request, parse_memory, reconstruct_captures
+    from emmc_rig.reconstruct.captures import Request, reconstruct_captures
     from emmc_rig.reconstruct.inputs import load_settings
+    from emmc_rig.reconstruct.memory import parse_memory
     from reconstruction.methods import DEFAULT_METHOD
 
     if list_methods:

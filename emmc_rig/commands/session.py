@@ -26,7 +26,8 @@ def list_sessions(
     since: Annotated[str, typer.Option("--since", help="begun then or later, 2026-11-22")] = "",
     before: Annotated[str, typer.Option("--before", help="begun before, 2026-11-22")] = "",
     verdict: Annotated[
-        str, typer.Option("--verdict", help="of the light field: trust, doubt or do not use")
+        str,
+        typer.Option("--verdict", help="of the light field: trust, cannot tell, doubt, do not use"),
     ] = "",
     psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
     json_lines: Annotated[bool, typer.Option("--json", help="as lines of JSON")] = False,
@@ -94,20 +95,15 @@ def compare(
     sessions: Annotated[list[Path], typer.Argument(help="two session folders, or more")],
 ) -> None:
     """Show in what sessions differ: plan, rig, exposures, verdict, PSNR stated."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
+    from emmc_rig.commands.bars import show_table
     from emmc_rig.session.listing import compared
     from emmc_rig.session.session import Session
 
     if len(sessions) < 2:
         raise typer.BadParameter("name two sessions, or more")
     opened = [Session(one) for one in sessions]
-    table = Table("", *(one.folder.name for one in opened), box=SIMPLE)
-    for name, values in compared(opened):
-        table.add_row(name, *values)
-    Console().print(table)
+    heads = ("", *(one.folder.name for one in opened))
+    show_table(heads, [(name, *values) for name, values in compared(opened)])
 
 
 @app.command()

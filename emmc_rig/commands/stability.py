@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from emmc_rig.commands.options import (
     DictionaryOption,
-    MethodsOption,
     ScenesOption,
     SeedOption,
     SizeOption,
 )
-from emmc_rig.commands.stability_verdicts import stability_verdicts
-from emmc_rig.commands.stability_worst import stability_worst
 
 
 def stability(
@@ -29,7 +26,10 @@ def stability(
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
-    method: MethodsOption = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="only this one, or all that are installed; may repeat"),
+    ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
     ] = False,
@@ -63,34 +63,32 @@ def stability(
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="processes that share the trials")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="folder to write (default: emmc-stability, -verdicts, -worst)"),
     ] = None,
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    from emmc_rig.commands.bars import say, shown_bars
+    from emmc_rig.commands.bars import say, show_table, shown_bars
     from emmc_rig.files.results import parse_size
-    from emmc_rig.study.stability.beside import measure_beside
     from emmc_rig.study.stability.curves import breaking_rows
-    from emmc_rig.study.stability.fault_points import CAMERA, planned, stability_settings
-    from emmc_rig.study.stability.sweeping import run_stability
+    from emmc_rig.study.stability.fault_sweep import CAMERA, planned, stability_settings
+    from emmc_rig.study.stability.sweeping import measure_beside, run_stability
 
     if faults:
         _list_faults()
         return
     if verdicts:
         place = out or Path("emmc-verdicts")
-        stability_verdicts(fast, scene, camera, fault, method, parse_size(size), seed, place)
+        _verdicts(place, fast, scene, camera, fault, method, parse_size(size), seed)
         return
     if worst:
-        stability_worst(
-            fast, scene or [], camera, method or [], parse_size(size), dictionary, seed,
+        _worst(
             out or Path("emmc-worst"),
+            fast, scene or [], camera, method or [], parse_size(size), dictionary, seed,
         )  # fmt: skip
         return
     out = out or Path("emmc-stability")
@@ -104,15 +102,13 @@ def stability(
         switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
         wanted = [name for name, on in switches.items() if on]
         beside = measure_beside(settings, wanted, out, bars)
-        outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
+        outcome = run_stability(
+            settings, out, bars, beside.sections, beside.metrics, workers=workers
+        )
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
-    table = Table(
-        "fault", *methods, box=SIMPLE,
-        title=f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view",
-    )  # fmt: skip
-    for row in rows:
-        table.add_row(f"{row.title}, {row.unit}", *row.cells)
-    Console().print(table)
+    title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"
+    shown = [(f"{row.title}, {row.unit}", *row.cells) for row in rows]
+    show_table(("fault", *methods), shown, title)
     for line in beside.lines:
         typer.echo(line)
     for line in outcome.left_out:
@@ -121,13 +117,59 @@ def stability(
 
 
 def _list_faults() -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Column, Table
+    from rich.table import Column
 
+    from emmc_rig.commands.bars import show_table
     from emmc_rig.study.stability.faults import FAULTS
 
-    table = Table(Column("fault", no_wrap=True), "unit", "strengths", "what happens", box=SIMPLE)
-    for one in FAULTS.values():
-        table.add_row(one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained)
-    Console().print(table)
+    show_table(
+        (Column("fault", no_wrap=True), "unit", "strengths", "what happens"),
+        [
+            (one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained)
+            for one in FAULTS.values()
+        ],
+    )
+
+
+def _verdicts(out: Path, *wanted: Any) -> None:
+    """Measure how often verdicts flag results that a fault broke, and good ones."""
+    from emmc_rig.commands.bars import say, show_table, shown_bars
+    from emmc_rig.study.stability import detector
+
+    settings = detector.detector_settings(*wanted)
+    with shown_bars() as bars:
+        results = detector.run_detector(settings, out, bars)
+    show_table(
+        ("fault", "method", "broken: flagged", "good: flagged", "between", "poor", "cannot tell"),
+        [
+            (
+                *names,
+                *(f"{flagged} of {there}" for flagged, there in tally.pairs()),
+                str(tally.untold),
+            )
+            for names, tally in detector.tables(results).items()
+        ],
+    )
+    for one in detector.wrong(results):
+        kind = "missed" if one.kind == "broken" else "false alarm"
+        say(kind, detector.case_words(one))
+    typer.echo(f"open {out / 'verdicts.csv'}")
+
+
+def _worst(out: Path, *wanted: Any) -> None:
+    """Measure what harms every method most, and which details it keeps, loses or invents."""
+    from emmc_rig.commands.bars import show_table, shown_bars
+    from emmc_rig.study.stability.worst_study import (
+        details_table,
+        noise_table,
+        run_worst,
+        worst_settings,
+    )
+
+    settings = worst_settings(*wanted)
+    with shown_bars() as bars:
+        outcome = run_worst(settings, out, bars)
+    for name in (Path(scene).stem for scene in settings.scenes):
+        show_table(*noise_table(name, outcome.noise), name)
+        show_table(*details_table(name, outcome.details), name)
+    typer.echo(f"open {outcome.page}")

@@ -35,8 +35,7 @@ def tables(
 
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.study.tables.cell_sweep import FAST, TablesSettings
-    from emmc_rig.study.tables.console import shown
-    from emmc_rig.study.tables.reproducing import run_tables
+    from emmc_rig.study.tables.reproducing import run_tables, shown
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
     with shown_bars() as bars:

@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from numba import get_num_threads
 
-from emmc_rig.errors import ERRORS, AppError, StoppedError, WrongUsageError
+from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.folders import KEPT, is_session, result_folder
-from emmc_rig.files.frames import PSI
+from emmc_rig.files.psi import open_psi, psi_beside
+from emmc_rig.reconstruct.memory import (
+    BASE_BYTES,
+    Ceiling,
+    assumed_grid,
+    own_bytes,
+    task_bytes,
+)
 from emmc_rig.reconstruct.pool import Pool, opened_pool
 from emmc_rig.reconstruct.solve import reconstruct_folder
 from emmc_rig.session.session import RECONSTRUCTION
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Progress
-from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, SavedPsi
-
-UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
-BASE_BYTES = 480 * 2**20
-"""Of a process with the program's libraries, its kernels compiled."""
-RAY_BYTES, WEIGHT_BYTES = 150, 26
-"""Of a block, for each of its rays (views times samples), and for each of their weights (shots
-times stored colours). Measured: adaptive-fast on 240x240 samples, one and three shots, 141 and 184
-a ray beside Psi; on blocks of 190,000 samples, one shot, 169 with it."""
-PARALLAX_PX = 3.0
-"""Disparity whose halo is reckoned with before a survey has found the capture's own."""
 
 
 @dataclass(frozen=True)
@@ -52,49 +46,27 @@ class Request:
     as_zarr: bool = False
 
 
-def parse_memory(text: str) -> int:
-    """Return the bytes of "2GiB" or "800MB"; raises WrongUsageError."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMG]?I?)B?", text.strip().upper())
-    if found is None or found[2] not in UNITS:
-        raise WrongUsageError(f"--memory {text}: write bytes with a unit, for instance 2GiB")
-    return int(float(found[1]) * UNITS[found[2]])
+def ceiling_for(memory: int, requests: Sequence[Request]) -> tuple[Ceiling, int, int]:
+    """Return a ceiling, and how many workers and captures at a time fit below it.
 
-
-def worker_bytes(shape: Sequence[int], settings: MethodSettings, disparity_px: float) -> int:
-    """Return the memory that a worker needs for a block of Psi of a shape (s, v, u, y, k, x).
-
-    disparity_px: the capture's largest, for the halo.
+    Workers become fewer where a survey finds larger disparities than assumed here. Raises AppError
+    where not even one worker fits.
     """
-    shots, v, u, rows, stored, columns = shape
-    blocks = settings.blocks
-    halo = TEXTURE_REACH + disparity_px * (max(v, u) // 2)
-    samples = rows * columns
-    if samples > blocks.whole:
-        sides = (min(side, blocks.side + 2 * (blocks.blend + halo)) for side in (rows, columns))
-        samples = max(int(np.prod(list(sides))), (SAMPLE * SAMPLES) ** 2)
-    return int(BASE_BYTES + samples * v * u * (RAY_BYTES + WEIGHT_BYTES * shots * stored))
-
-
-def workers_within(memory: int, requests: Sequence[Request], wanted: int) -> int:
-    """Return how many processes fit below a ceiling beside this one; raises AppError for none."""
-    need = 0
+    need = own = 0
     for request in requests:
         if is_session(request.folder) and request.psi is None:
             raise AppError(
                 f"{request.folder}: --memory needs Psi before the workers start; run `emmc-rig "
                 "calibrate` and give --psi"
             )
-        psi = SavedPsi(request.psi or request.folder / PSI)
+        psi = open_psi(request.psi or psi_beside(request.folder))
         settings = request.settings or MethodSettings()
-        need = max(need, worker_bytes(psi.shape, settings, PARALLAX_PX))
-    fitting = (memory - BASE_BYTES) // need if need else wanted
-    if fitting < 1:
-        raise AppError(
-            f"--memory of {memory / 2**30:.2f} GiB: this program and one worker need about "
-            f"{(BASE_BYTES + need) / 2**30:.2f} GiB for a block; give more, or smaller blocks by "
-            "--settings (blocks: side, whole)"
-        )
-    return int(min(fitting, wanted))
+        need = max(need, task_bytes(psi, assumed_grid(psi, settings)))
+        own = max(own, own_bytes(psi, settings, request.as_zarr, request.truth is not None))
+    one, two = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
+    if len(requests) > 1 and two.total - two.own >= 2 * need:
+        return two, two.workers(need), 2
+    return one, one.workers(need), 1
 
 
 def _one(request: Request, pool: Pool | None, on_step: Callable[[Progress], None]) -> dict:
@@ -125,15 +97,19 @@ def reconstruct_captures(
     """Yield each capture with its metrics, or with what it failed by, in the order they are done.
 
     workers: processes; None and one capture that is one block: this process and its threads.
-    memory: bytes of all processes together. on_step: called with the progress of a single capture,
-    or with the captures done. Raises WorkersError, AppError for a ceiling that is too low.
+    memory: bytes of all processes together, kept by computing less at a time. on_step: called with
+    the progress of a single capture, or with the captures done. Raises WorkersError, and AppError
+    for a ceiling that is too low.
     """
     alone = len(requests) == 1
-    count = workers or get_num_threads()
+    count, ceiling = workers or get_num_threads(), None
+    # One more than the pool computes at a time is read ahead, or written behind.
+    captures = len(requests)
     if memory is not None:
-        count = workers_within(memory, requests, count)
+        ceiling, most, captures = ceiling_for(memory, requests)
+        count = min(count, most)
     shared = not alone or workers is not None or cluster is not None or memory is not None
-    with opened_pool(count, cluster) if shared else nullcontext() as pool:
+    with opened_pool(count, cluster, ceiling) if shared else nullcontext() as pool:
         if alone:
             try:
                 yield requests[0], _one(requests[0], pool, on_step)
@@ -141,8 +117,7 @@ def reconstruct_captures(
                 yield requests[0], fault
             return
         assert pool is not None
-        # One more than the pool computes at a time is read ahead, or written behind.
-        with ThreadPoolExecutor(min(len(requests), pool.size + 1)) as threads:
+        with ThreadPoolExecutor(min(captures, pool.size + 1)) as threads:
             futures = {
                 threads.submit(_one, request, pool, lambda _: None): request for request in requests
             }

@@ -10,10 +10,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import platform
+import resource
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -22,6 +23,7 @@ from typing import Any, Protocol, TypeVar
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import one_line
+from emmc_rig.reconstruct.memory import Ceiling
 from emmc_rig.version import __version__
 
 Item = TypeVar("Item")
@@ -53,16 +55,30 @@ class Pool(Protocol):
         """
         ...
 
+    def fit(self, task_bytes: int) -> None:
+        """Compute from here on only as many tasks at a time as a ceiling of memory allows.
+
+        task_bytes: what a worker needs for one. Raises AppError where none fits.
+        """
+        ...
+
     def end(self) -> None:
         """Stop what is computed; later tasks are refused."""
         ...
 
 
-def _begin() -> None:
-    """Prepare a process of the pool: it ends with the program, which alone hears Ctrl-C."""
+def _begin(most_bytes: int | None) -> None:
+    """Prepare a process of the pool: it ends with the program, which alone hears Ctrl-C.
+
+    most_bytes: of data it may map, so that allocating more raises MemoryError. What is mapped but
+    never touched (220 MiB) outweighs the pages of libraries (150 MiB) that do not count.
+    """
     import cv2
 
     cv2.setNumThreads(1)
+    if most_bytes is not None:
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, hard))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -75,10 +91,13 @@ def _begin() -> None:
 
 
 class Processes:
-    """A pool of processes of this machine; safe to use from several threads."""
+    """A pool of processes of this machine; safe to use from several threads.
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    size: at most so many. ceiling: of their memory and this program's, kept by fewer processes.
+    """
+
+    def __init__(self, size: int, ceiling: Ceiling | None = None) -> None:
+        self.size, self.ceiling = size, ceiling
         self._lock = threading.Lock()
         self._executor: ProcessPoolExecutor | None = None
         self._mine: set[BaseProcess] = set()
@@ -92,8 +111,9 @@ class Processes:
             if self._ended:
                 raise WorkersError("the workers were stopped")
             if self._executor is None:
+                share = None if self.ceiling is None else self.ceiling.share(self.size)
                 self._executor = ProcessPoolExecutor(
-                    self.size, multiprocessing.get_context("spawn"), _begin
+                    self.size, multiprocessing.get_context("spawn"), _begin, (share,)
                 )
             before = set(multiprocessing.active_children())
             futures = {self._executor.submit(task, item): item for item in items}
@@ -119,16 +139,50 @@ class Processes:
                     yield item, result
             except BrokenProcessPool as fault:
                 self._replace(executor, fault)
+            except MemoryError as fault:
+                self._fewer(executor, fault)
+            except CancelledError:
+                continue  # another thread made the workers fewer
             finally:
                 for future in futures:
                     future.cancel()
+
+    def fit(self, task_bytes: int) -> None:
+        """Let fewer processes share the ceiling where a task needs more, see `Pool.fit`."""
+        if self.ceiling is None:
+            return
+        count = self.ceiling.workers(task_bytes)
+        with self._lock:
+            if count < self.size:
+                self.size = count
+                self._restart()
+
+    def _restart(self) -> None:
+        """End the processes once their tasks are done; the next task starts others."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, cancel_futures=True)
+            self._executor = None
+
+    def _fewer(self, executor: ProcessPoolExecutor, fault: MemoryError) -> None:
+        """Give the workers more memory each, after a task needed more than its share."""
+        with self._lock:
+            if self._executor is not executor:
+                return
+            if self.size == 1 or self.ceiling is None:
+                limit = "" if self.ceiling is None else f" {self.ceiling.share(1) / 2**20:.0f} MiB"
+                raise WorkersError(
+                    f"one worker alone needs more memory than the{limit} there is: give more by "
+                    "--memory, or smaller blocks by --settings (blocks: side, whole); the same "
+                    "command goes on"
+                ) from fault
+            self.size -= 1
+            self._restart()
 
     def _replace(self, broken: ProcessPoolExecutor | None, fault: BrokenProcessPool) -> None:
         """Give up an executor that lost a process; all threads that used it come here."""
         with self._lock:
             if self._executor is broken and broken is not None:
-                broken.shutdown(wait=True, cancel_futures=True)
-                self._executor = None
+                self._restart()
                 self._losses += 1
         if self._losses >= MOST_LOSSES:
             raise WorkersError(
@@ -138,12 +192,14 @@ class Processes:
 
     def end(self) -> None:
         """Stop the processes, whatever they do."""
+        self._ended = True
+        # Before the lock, too: its holder may wait for a task.
+        for process in list(self._mine):
+            process.terminate()
         with self._lock:
-            self._ended = True
             for process in self._mine:
                 process.terminate()
-            if self._executor is not None:
-                self._executor.shutdown(wait=True, cancel_futures=True)
+            self._restart()
 
 
 def fingerprint() -> dict[str, str]:
@@ -213,6 +269,9 @@ class Cluster:
             with suppress(Exception):
                 self._client.cancel(futures)
 
+    def fit(self, task_bytes: int) -> None:
+        """Leave memory to the cluster, which sets that of its workers."""
+
     def end(self) -> None:
         """Leave the cluster, which goes on."""
         with suppress(Exception):
@@ -237,10 +296,12 @@ def _connected(address: str) -> Cluster:
 
 
 @contextmanager
-def opened_pool(workers: int, cluster: str | None = None) -> Iterator[Pool]:
+def opened_pool(
+    workers: int, cluster: str | None = None, ceiling: Ceiling | None = None
+) -> Iterator[Pool]:
     """Yield so many processes of this machine, or a cluster's workers; they end with the block.
 
-    Processes start with the first task. Raises WorkersError.
+    Processes start with the first task. ceiling: of memory, see `Processes`. Raises WorkersError.
     """
     if cluster is not None:
         pool = _connected(cluster)
@@ -252,7 +313,7 @@ def opened_pool(workers: int, cluster: str | None = None) -> Iterator[Pool]:
         return
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    processes = Processes(workers)
+    processes = Processes(workers, ceiling)
     try:
         yield processes
     finally:

@@ -11,22 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.camera import Camera
-from emmc_rig.model.frames import Frames
-from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.progress import Watcher
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
 from emmc_rig.study.sweep import Results, Sweep, machine
+from emmc_rig.study.trial import Array, Setup, Trial, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings
 
 WHOLE = "adaptive"
 LEFT_OUT = {
@@ -61,40 +59,19 @@ class Ablation(Figures):
     costs_s: float
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """The frames of an ablation. scene: what `open_scene` takes. size: rows and columns."""
-
-    scene: str
-    camera: Camera
-    size: tuple[int, int]
-    seed: int
-
-    @cached_property
-    def truth(self) -> np.ndarray:
-        """The light field, (v, u, y, x, c)."""
-        scene = open_scene(self.scene, size=self.size, views=self.camera.views, seed=self.seed)
-        return scene.light_field
-
-    @cached_property
-    def psi(self) -> ImagingMatrix:
-        """The camera's imaging matrix."""
-        return self.camera.psi(self.size)
-
-    @cached_property
-    def frames(self) -> Frames:
-        """What every row reconstructs from."""
-        return self.camera.expose(self.truth, self.seed, self.psi)
-
-
 @dataclass
 class AblationSweep(Sweep[str]):
-    """The rows of an ablation by name; settings: Exposure."""
+    """The rows of an ablation by name; settings: Setup."""
 
     journal = "ablation.jsonl"
     noun = "rows"
     stage = "reconstruct"
     revision = 1
+
+    @cached_property
+    def trial(self) -> Trial:
+        """What every row reconstructs from."""
+        return trial_of(self.settings)
 
     def inputs(self, point: str) -> dict[str, object]:
         """Return everything that a row depends on, as plain data."""
@@ -105,7 +82,7 @@ class AblationSweep(Sweep[str]):
             "machine": machine(),
             "camera": given.camera.model_dump(mode="json"),
             "scene": given.scene,
-            "sum": float(np.sum(given.truth, dtype=np.float64)),
+            "sum": float(np.sum(self.trial.truth, dtype=np.float64)),
             "size": given.size,
             "seed": given.seed,
         }
@@ -114,13 +91,13 @@ class AblationSweep(Sweep[str]):
         """Run the method once, so that no row's seconds count its compiling."""
         if points:
             watcher.begin("compile", None)
-            _reconstructed(self.settings, WHOLE)
+            _reconstructed(self.trial, WHOLE)
 
     def measured(self, points: Sequence[str], watcher: Watcher) -> Results:
         """Yield the PSNR and the seconds of each row."""
         for point in points:
-            light_field, seconds = _reconstructed(self.settings, point)
-            yield {"psnr_db": psnr_db(light_field, self.settings.truth), "seconds": seconds}
+            light_field, seconds = _reconstructed(self.trial, point)
+            yield {"psnr_db": self.trial.psnr_db(light_field), "seconds": seconds}
 
 
 def _settings(row: str) -> MethodSettings:
@@ -128,32 +105,22 @@ def _settings(row: str) -> MethodSettings:
     return MethodSettings(adaptive=AdaptiveSettings.model_validate(changed))
 
 
-def _reconstructed(given: Exposure, row: str) -> tuple[np.ndarray, float]:
+def _reconstructed(given: Trial, row: str) -> tuple[Array, float]:
     """Return the light field of a row and the seconds that it took."""
-    frames, psi = given.frames, given.psi
     if row == COPIED:
         return replicate_centre(given.truth), 0.0
     if row == ORACLE:
         started = time.perf_counter()
         disparity = matched_disparity(given.truth)
         result = reconstruct_adaptive(
-            psi, frames.readings, frames.noise_sigma, usable=frames.usable, disparity=disparity
+            given.psi, given.readings, given.noise_sigma, usable=given.usable, disparity=disparity
         )
         return result.light_field, time.perf_counter() - started
-    dictionary = open_dictionary(None, given.camera.views, psi.binning)
-    result = reconstruct(
-        row if row in RIVALS else WHOLE,
-        psi,
-        frames.readings,
-        frames.noise_sigma,
-        dictionary,
-        _settings(row),
-        frames.usable,
-    )
+    result = given.solved(row if row in RIVALS else WHOLE, _settings(row))
     return result.light_field, result.seconds
 
 
-def ablations(given: Exposure, folder: Path, watcher: Watcher) -> list[Ablation]:
+def ablations(given: Setup, folder: Path, watcher: Watcher) -> list[Ablation]:
     """Return the whole method, then it without each part, its rivals, the oracle and the copy.
 
     Rows that the folder holds are not measured again; see `Sweep.run`.
@@ -165,3 +132,19 @@ def ablations(given: Exposure, folder: Path, watcher: Watcher) -> list[Ablation]
         Ablation(name, **one, buys_db=best - one["psnr_db"], costs_s=took - one["seconds"])
         for name, one in results.items()
     ]
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure `adaptive` without each of its parts (`chart --ablation`)."""
+    scene, size = (*asked.scenes, "deep-occlusions")[0], asked.size or (128, 160)
+    rows = ablations(Setup(scene, asked.described, size, asked.seed), folder, show)
+    show.table(
+        ("adaptive", "dB", "s", "buys dB", "costs s"),
+        [
+            (one.name, f"{one.psnr_db:.2f}", f"{one.seconds:.1f}", f"{one.buys_db:+.2f}",
+             f"{one.costs_s:+.1f}")
+            for one in rows
+        ],
+    )  # fmt: skip
+    figures = [row.as_dict() for row in rows]
+    return {"scene": scene, "camera": asked.camera, "size": list(size), "rows": figures}

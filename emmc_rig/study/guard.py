@@ -15,21 +15,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.methods import DEFAULT_METHOD, reconstruct
+from emmc_rig.model.files import write_text
+from emmc_rig.study.benchmarks.running import CFA, Asked, Show
+from emmc_rig.study.trial import Setup, Trial, trial_of
+from reconstruction.methods import DEFAULT_METHOD
 
 MOST_FALL_DB = 0.3
 """Below its stored figure, which fails."""
 STORED = "guard.json"
-CAMERA = "scenario-ii-cfa"
+CAMERA = CFA
 NOISES = (0.0005, 0.004)
 """Deviations of readings: next to none, and that of a short exposure."""
 BUILT_IN, BUILT_IN_SIZE = ("near-planar", "deep-occlusions", "wide-disparity"), (64, 80)
@@ -90,20 +87,16 @@ def cases(
     ]
 
 
-def captured(case: Case) -> tuple[ImagingMatrix, NDArray[np.float32], NDArray]:
-    """Return Psi, the frames (shot, pixel_y, pixel_x) and the true light field of a case."""
-    camera = find_camera(case.camera)
-    truth = open_scene(case.scene, size=case.size, views=camera.views, seed=SEED).light_field
-    psi = build_imaging_matrix(camera, case.size)
-    frames = psi.forward(truth.astype(np.float32))
-    noise = np.random.default_rng(SEED).normal(0, case.noise, frames.shape)
-    return psi, (frames + noise).astype(np.float32), truth
+def captured(case: Case) -> Trial:
+    """Return the frames of a case; raises what scene and camera do."""
+    setup = Setup(case.scene, find_camera(case.camera), case.size, SEED)
+    return trial_of(setup, white_noise=case.noise)
 
 
 def measured_db(case: Case) -> float:
     """Return the PSNR of the default method; raises what scene, camera and method do."""
-    psi, frames, truth = captured(case)
-    return psnr_db(reconstruct(DEFAULT_METHOD, psi, frames, case.noise).light_field, truth)
+    given = captured(case)
+    return given.psnr_db(given.solved(DEFAULT_METHOD).light_field)
 
 
 def stored_figures() -> dict[str, float]:
@@ -121,3 +114,17 @@ def merged_text(rows: Iterable[Row], stored: Mapping[str, float]) -> str:
     """Return the text of a file of figures: those stored, with those measured in their place."""
     new = {row.case.key: round(row.psnr_db, 2) for row in rows}
     return json.dumps({**stored, **new}, indent=2, sort_keys=True) + "\n"
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure fixed captures beside their stored figures (`chart --guard`); write the new ones."""
+    stored, rows, shown = stored_figures(), [], []
+    for row in guarded(cases(asked.scenes, asked.size, asked.camera), stored):
+        rows.append(row)
+        was = "-" if row.stored_db is None else f"{row.stored_db:.2f}"
+        word = "fell" if row.fell else "none stored" if row.stored_db is None else ""
+        shown.append((row.case.key, f"{row.psnr_db:.2f}", was, word))
+    show.table(("case", "dB", "stored dB", ""), shown)
+    write_text(folder / STORED, merged_text(rows, stored))
+    fell = [row.case.key for row in rows if row.fell]
+    return {"psnr_db": {row.case.key: row.psnr_db for row in rows}, "fell": fell}

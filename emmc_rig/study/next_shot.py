@@ -21,10 +21,10 @@ from calibration.shadow import shadow_mask
 from emmc_rig.calibrate.bench import WhiteboardBench
 from emmc_rig.calibrate.board_plan import capture_plan, parametric_plan, plan_light
 from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.capture.assessment import METHOD, Assessment, assessed
 from emmc_rig.capture.command import Wish, run_capture
-from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
@@ -34,10 +34,12 @@ from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.sweep import Results, Sweep
 from reconstruction.methods import reconstruct
 from reconstruction.result import Reconstruction
+from simulators.scenes import SCENES
 
 ROWS, SESSIONS = "next_shots.jsonl", "sessions"
 PLANNED, MOST = 6, 5
@@ -123,7 +125,7 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
     described = rig_description(SIMULATED, rig)
     wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
     with held(folder):
-        taken = run_capture(wish, Unwatched(), _nobody)
+        taken = run_capture(wish, CaptureWatcher(), _nobody)
     assert taken is not None
     session, outcome = taken
     if not outcome.complete:
@@ -151,13 +153,13 @@ def rows_of(
     on_row: Callable[[str], None],
 ) -> SceneRows:
     """Return what a session's shots give, chosen and in order, up to `most` of them."""
-    known: dict[tuple[int, ...], tuple[ShotRow, Judgement]] = {}
+    known: dict[tuple[int, ...], tuple[ShotRow, Assessment]] = {}
 
-    def row(shots: tuple[int, ...]) -> tuple[ShotRow, Judgement]:
+    def row(shots: tuple[int, ...]) -> tuple[ShotRow, Assessment]:
         if shots not in known:
             result, sigma = after(session, scale, shots)
             target_db = math.inf if len(shots) < most else 0.0
-            found = judged(scale.psi, result, shots, sigma, target_db)
+            found = assessed(scale.psi, result, shots, sigma, target_db)
             gain = None if found.next is None else found.expected_db[found.next] - found.stated_db
             achieved_db = psnr_db(result.light_field, truth)
             known[shots] = ShotRow(shots, found.stated_db, achieved_db, gain), found
@@ -286,3 +288,34 @@ def total_savings(rows: Sequence[Saving]) -> Iterator[str]:
             f"{target_db:g} dB: {taken} shots for {len(served)} scene(s), {met} of which meet it "
             f"in truth; {fixed * len(served)} with the fixed number that serves them all, {fixed}"
         )
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure how many shots scenes need for a PSNR, chosen or in order (`chart --next-shot`)."""
+    size, targets_db = asked.size or (128, 160), sorted(asked.targets_db or [30.0])
+    scenes = asked.scenes or list(SCENES)
+    found = next_shots(scenes, asked.camera, asked.described, size, asked.seed, folder, show)
+    rows = [one for scene in found for one in savings(scene, targets_db)]
+    show.table(
+        ("scene", "wanted, dB", "shots", "stated, dB", "in truth, dB", "fixed number"),
+        [
+            (
+                one.scene,
+                f"{one.target_db:g}",
+                f"{one.stopped.count}{'' if one.reached else ', short'}",
+                f"{one.stopped.stated_db:.2f}",
+                f"{one.stopped.psnr_db:.2f}",
+                "-" if one.fixed is None else str(one.fixed),
+            )
+            for one in rows
+        ],
+    )
+    for line in total_savings(rows):
+        show.line(line)
+    return {
+        "camera": asked.camera,
+        "size": list(size),
+        "seed": asked.seed,
+        "rows": [row.as_dict() for row in rows],
+        "scenes": [asdict(scene) for scene in found],
+    }

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from emmc_rig.advice.trial import SURE_DB, Prospect, prospects
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.study.guard import Case, captured
-from reconstruction.methods import reconstruct
+from emmc_rig.pages.page import number
+from emmc_rig.study.benchmarks.running import Asked, Show
+from emmc_rig.study.guard import Case, captured, cases
 
 
 @dataclass(frozen=True)
@@ -52,20 +54,19 @@ class Stated:
         }
 
 
-def stated(cases: Iterable[Case]) -> Iterator[Stated]:
+def stated(chosen: Iterable[Case]) -> Iterator[Stated]:
     """Yield every method of the trial on every case; raises what scene, camera and method do."""
-    for case in cases:
-        psi, readings, truth = captured(case)
-        deviation = np.full(readings.shape, case.noise)
-        frames = Frames(readings, deviation, np.ones(readings.shape, dtype=bool))
-        for expected in prospects(psi, frames):
-            result = reconstruct(expected.method, psi, readings, case.noise)
+    for case in chosen:
+        given = captured(case)
+        frames = Frames(given.readings, np.full(given.readings.shape, case.noise), given.usable)
+        for expected in prospects(given.psi, frames):
+            result = given.solved(expected.method)
             sigma = result.maps.get("sigma")
             shares: list[float | None] = [None, None]
             if sigma is not None:
-                error = np.abs(result.light_field - truth)
+                error = np.abs(result.light_field - given.truth)
                 shares = [float(np.mean(error <= n * sigma[..., None])) for n in (1, 2)]
-            yield Stated(case, expected, psnr_db(result.light_field, truth), *shares)
+            yield Stated(case, expected, given.psnr_db(result.light_field), *shares)
 
 
 def summary(rows: Sequence[Stated]) -> list[str]:
@@ -87,3 +88,20 @@ def summary(rows: Sequence[Stated]) -> list[str]:
                 f"average, {min(known):.0%} to {max(known):.0%} ({wanted} % meant)"
             )
     return lines
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Measure stated PSNRs and deviations on fixed captures beside the truth (`chart --stated`)."""
+    rows = list(stated(cases(asked.scenes, asked.size, asked.camera)))
+    lines, shown = summary(rows), []
+    for row in rows:
+        expected = row.expected
+        interval = f"{expected.low_db:.1f} to {expected.high_db:.1f}"
+        shares = [number(one, ".0%") for one in (row.within_one, row.within_two)]
+        true = f"{row.true_db:.1f}{'' if row.inside else ' (outside)'}"
+        stated_db = f"{expected.psnr_db:.1f} ({interval})"
+        shown.append((row.case.key, expected.method, stated_db, true, *shares))
+    show.table(("case", "method", "stated dB", "true dB", "within one", "within two"), shown)
+    for line in lines:
+        show.line(line)
+    return {"rows": [row.as_dict() for row in rows], "summary": lines}

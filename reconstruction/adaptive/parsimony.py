@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.search import DECISIVE, Volume
-from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
 UNLIKELY = 20.0
@@ -63,16 +63,22 @@ def one_plane(volume: Volume, pixels: tuple[int, int]) -> Plane | None:
         return None
     best = volume.evidence.max(axis=-1, keepdims=True)
     lost = np.minimum(best - volume.evidence, UNLIKELY)[decisive].astype(np.float64)
+    # Labels that no patch looked at are missing: between, and beyond, all are unlikely.
+    step = np.diff(labels).min()
+    place = np.rint((labels - labels[0]) / step).astype(np.int64) + 1
+    unlikely = np.full((len(lost), place[-1] + 2), UNLIKELY)
+    unlikely[:, place] = lost
     y, x = (at - (length - 1) / 2 for at, length in zip(volume.centres, pixels, strict=True))
     rows, columns = (axis[decisive] for axis in np.meshgrid(y, x, indexing="ij"))
 
     def losses(plane: Array) -> Array:
         wanted = plane[0] + plane[1] * rows + plane[2] * columns
-        at = np.clip((wanted - labels[0]) / (labels[1] - labels[0]), 0, len(labels) - 1)
-        below = np.minimum(at.astype(np.int64), len(labels) - 2)
-        share = at - below
-        each = np.arange(len(rows))
-        return (1 - share) * lost[each, below] + share * lost[each, below + 1]
+        at = np.clip((wanted - labels[0]) / step + 1, 0, unlikely.shape[1] - 1)
+        # A parabola through the three labels nearest: a straight line is least at a label.
+        middle = np.clip(np.rint(at).astype(np.int64), 1, unlikely.shape[1] - 2)
+        each, off = np.arange(len(rows)), at - middle
+        below, here, above = (unlikely[each, middle + way] for way in (-1, 0, 1))
+        return here + off / 2 * (above - below) + off**2 / 2 * (above - 2 * here + below)
 
     chosen = labels[lost.argmin(axis=-1)]
     begin = _fitted(chosen, rows, columns)
@@ -109,7 +115,8 @@ def plane_bound_db(plane: Plane, volume: Volume, pixels: tuple[int, int], pictur
     mean = volume.probability @ volume.disparities
     rows, columns = (np.rint(at).astype(int) for at in volume.centres)
     flat = plane.over(pixels, 1)[np.ix_(rows, columns)]
-    relief = float(np.square(mean - flat)[volume.decisive].mean())
+    decided = np.square(mean - flat)[volume.decisive]
+    relief = float(decided.mean()) if decided.size else 0.0
     steep = sum(float(np.square(np.gradient(picture, axis=axis)).mean()) for axis in (0, 1))
     return _decibels(relief * steep)
 

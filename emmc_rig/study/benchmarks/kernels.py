@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import get_num_threads, njit, prange
@@ -23,7 +25,8 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
-from emmc_rig.study.benchmarks.timing import Figures, median_s
+from emmc_rig.study.benchmarks.running import Asked, Show
+from emmc_rig.study.benchmarks.timing import Figures, median_s, start_timings
 from reconstruction import kernels as tv_kernels
 from reconstruction.problem import colour_metric
 from reconstruction.tv import reconstruct_tv, row_bands
@@ -135,3 +138,30 @@ def _reconstruct_once(camera_name: str, size: tuple[int, int]) -> None:
     reconstruct_tv(psi, frames, 0.005)
     seconds = time.perf_counter() - started
     print(seconds, peak_memory_mib() / 2**10)
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Time kernels against their memory bound, a reconstruction, and starts (`chart --kernels`)."""
+    size, repeats = asked.size or (593, 840), asked.repeats or 7
+    seconds, peak_gib = reconstruction_memory(asked.camera, size)
+    kernels = list(kernel_timings(asked.described, size, repeats))
+    show.table(
+        ("kernel", "GB counted", "ms", "GB/s", "times its bound"),
+        [
+            (one.name, f"{one.gigabytes:.3f}", f"{one.seconds * 1e3:.1f}",
+             f"{one.gigabytes / one.seconds:.1f}", f"{one.ratio:.2f}")
+            for one in kernels
+        ],
+    )  # fmt: skip
+    show.line(f"one TV reconstruction: {seconds:.1f} s, peak memory {peak_gib:.2f} GiB")
+    starts = start_timings(repeats)
+    for start in starts:
+        show.line(f"{start.name}: {start.seconds:.2f} s to start")
+    return {
+        "camera": asked.camera,
+        "size": list(size),
+        "kernels": [one.as_dict() for one in kernels],
+        "starts": [start.as_dict() for start in starts],
+        "reconstruction_seconds": seconds,
+        "reconstruction_peak_gib": peak_gib,
+    }

@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -20,9 +21,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction import bpdn
 from reconstruction.dictionary import Dictionary
@@ -271,3 +274,34 @@ def peer_timings(
             for a, b, sensed in zip(our_codes, their_codes, problem.sensed, strict=True)
         ]
         yield PeerTiming(name, our_s * 1e3, their_s * 1e3, float(max(fits)))
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Time the sparse solvers on one sensed dictionary, and another library's (`--solvers`)."""
+    camera, peers = asked.described, []
+    atoms = open_dictionary(asked.dictionary, camera.views, camera.sensor.binning)
+    solvers = list(solver_timings(camera, TIMED_SIZE, atoms))
+    show.table(
+        ("solver", "ms/patch", "passes", "GFLOP/s", "times its bound", "gap", "dB"),
+        [
+            (one.name, f"{one.milliseconds:.2f}", f"{one.passes:.0f}", f"{one.gigaflops:.1f}",
+             f"{one.ratio:.1f}", f"{one.gap:.1e}", f"{one.psnr_db:.2f}")
+            for one in solvers
+        ],
+    )  # fmt: skip
+    try:
+        peers = list(peer_timings(camera, TIMED_SIZE, atoms))
+    except AppError as missing:
+        show.note("not compared", missing)
+    for one in peers:
+        show.line(
+            f"{one.name}: ours {one.ours_ms:.2f} ms a patch, scikit-learn's {one.theirs_ms:.2f} "
+            f"ms: {one.ratio:.1f} times faster"
+        )
+    return {
+        "camera": asked.camera,
+        "dictionary": atoms.kind,
+        "atoms": atoms.size,
+        "solvers": [one.as_dict() for one in solvers],
+        "peers": [one.as_dict() for one in peers],
+    }

@@ -1,11 +1,13 @@
-"""How long a call takes, the median of several after a first one; and rows of such figures."""
+"""How long a call or a new process takes, the median of several; and rows of such figures."""
 
 from __future__ import annotations
 
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, cast
 
 
@@ -27,3 +29,35 @@ class Figures:
         """Return the figures by name, as they are written to metrics.json."""
         derived = [name for name, one in vars(type(self)).items() if isinstance(one, property)]
         return {**asdict(cast(Any, self)), **{name: getattr(self, name) for name in derived}}
+
+
+_MAIN = "import sys; from emmc_rig.cli import main"
+STARTS = {
+    "python": ("-c", "pass"),
+    "import numpy": ("-c", "import numpy"),
+    "import emmc_rig": ("-c", "import emmc_rig"),
+    "emmc-rig --help": ("-c", f"{_MAIN}; sys.argv[1:] = ['--help']; main()"),
+}
+
+
+@dataclass(frozen=True)
+class Start:
+    """seconds: median of starting a new process, by the clock, Python's own start included."""
+
+    name: str
+    seconds: float
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the row."""
+        return asdict(self)
+
+
+def start_timings(repeats: int) -> list[Start]:
+    """Return the median start of each of STARTS, measured in turn so that load affects all."""
+    taken: dict[str, list[float]] = {name: [] for name in STARTS}
+    for _ in range(repeats):
+        for name, arguments in STARTS.items():
+            began = time.perf_counter()
+            subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+            taken[name].append(time.perf_counter() - began)
+    return [Start(name, statistics.median(seconds)) for name, seconds in taken.items()]

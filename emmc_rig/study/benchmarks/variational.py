@@ -11,6 +11,7 @@ import importlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from reconstruction.tv import TVSettings, reconstruct_tv
 
@@ -155,3 +157,15 @@ def variational_timings(
 def _step_s(ends: list[float]) -> float:
     """Return the median seconds between the ends of steps; the first one may have compiled."""
     return float(np.median(np.diff(ends)))
+
+
+def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
+    """Time the primal-dual step, and that of another library (`chart --peers`)."""
+    size = asked.size or (593, 840)
+    steps = list(variational_timings(asked.described, size, asked.repeats or 7))
+    show.table(
+        ("primal-dual step", "ms", "times ours"),
+        [(one.name, f"{one.seconds * 1e3:.1f}", f"{one.times_ours:.1f}") for one in steps],
+    )
+    rows = [one.as_dict() for one in steps]
+    return {"camera": asked.camera, "size": list(size), "steps": rows}

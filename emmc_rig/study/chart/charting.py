@@ -3,23 +3,45 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import mean
+
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.drawing import colours_of
+from emmc_rig.pages.drawing import (
+    COLOURS,
+    FAINT,
+    INK,
+    LEGEND,
+    LINE,
+    colours_of,
+    plain_log_ticks,
+    save_drawing,
+    sheet,
+    titled,
+)
+from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
+from emmc_rig.pages.page import (
+    Section,
+    embedded,
+    fragment,
+    framed,
+    inline_svg,
+    number,
+    provenance_section,
+)
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.chart_drawing import draw_chart, draw_growths
-from emmc_rig.study.chart.chart_page import chart_page
 from emmc_rig.study.chart.chart_sweep import ChartSweep
-from emmc_rig.study.chart.front import POOLED, Chart, charts
+from emmc_rig.study.chart.front import POOLED, Chart, Growth, Mark, charts, growths
 from emmc_rig.study.chart.peers import PEERS
 from emmc_rig.study.chart.points import ChartSettings, Point, charted_points, scalings
-from emmc_rig.study.chart.scaling import Growth, growths
 from emmc_rig.study.sweep import (
     available_cores,
     check_scene_names,
@@ -28,6 +50,182 @@ from emmc_rig.study.sweep import (
     provenance,
     sweep_folder,
 )
+
+LINE_POINTS, LETTER_POINTS = 10.0, 4.6
+"""Height of a line, and width of a letter, of the names at the front."""
+
+
+def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
+    """Write one chart; return the SVG. Every mark has the name of `Chart.mark_name`."""
+    figure, (axes,) = sheet(1, 7.6, 4.6)
+    axes.set_xscale("log")
+    axes.grid(axis="x", color=LINE, linewidth=0.7)
+    front = chart.front()
+    shown = {}
+    for mark in chart.marks:
+        one = mark.configuration
+        (dot,) = axes.plot(
+            mark.seconds, mark.psnr_db,
+            "D" if one.is_peer else "o",
+            markersize=8 if mark in front else 7,
+            markerfacecolor="white" if one.is_peer else colours[one.method],
+            markeredgecolor=colours[one.method],
+            markeredgewidth=1.6,
+            alpha=1 if mark in front or one.is_peer else 0.55,
+            zorder=3,
+        )  # fmt: skip
+        dot.set_gid(chart.mark_name(mark))
+        shown.setdefault(one.method, dot)
+    axes.step(
+        [mark.seconds for mark in front], [mark.psnr_db for mark in front],
+        where="post", color=INK, linewidth=1.1, alpha=0.55, zorder=2, label="_front",
+    )  # fmt: skip
+    axes.axhline(chart.replicate_db, color=FAINT, linestyle=":", linewidth=1)
+    axes.text(
+        0.995, chart.replicate_db, "copied true centre view", fontsize=8, color=FAINT,
+        ha="right", va="bottom", transform=axes.get_yaxis_transform(),
+    )  # fmt: skip
+    axes.margins(x=0.14, y=0.16)
+    plain_log_ticks(axes, "x")
+    titled(axes, chart.title, "seconds")
+    axes.legend(
+        list(shown.values()), list(shown), loc="center left", bbox_to_anchor=(1.0, 0.5), **LEGEND
+    )
+    # Places on the paper are known only when everything else has taken its own.
+    figure.draw_without_rendering()
+    _name(axes, front, colours)
+    return save_drawing(figure, folder / f"chart-{chart.key}.svg")
+
+
+def _name(axes: Axes, front: Sequence[Mark], colours: Mapping[str, str]) -> None:
+    """Write the names of the front's marks above and left of it, without overlaps."""
+    assert axes.figure is not None
+    placed: list[tuple[float, float, float]] = []
+    for mark in front:
+        label = mark.configuration.label
+        x, y = axes.transData.transform((mark.seconds, mark.psnr_db)) / axes.figure.dpi * 72
+        right, above = x + 3, y + 7
+        left = right - LETTER_POINTS * len(label)
+        below = [top for start, end, top in placed if left < end and start < right]
+        height = max([above, *below])
+        placed.append((left, right, height + LINE_POINTS))
+        axes.annotate(
+            label, (mark.seconds, mark.psnr_db), (3, 7 + height - above),
+            textcoords="offset points", fontsize=8, ha="right",
+            color=colours[mark.configuration.method],
+        )  # fmt: skip
+
+
+def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
+    """Write a chart for each axis that was varied, time beside memory; return them by axis."""
+    return {
+        axis: _draw_growth([growth for growth in growths if growth.axis == axis], axis, folder)
+        for axis in dict.fromkeys(growth.axis for growth in growths)
+    }
+
+
+def _draw_growth(growths: Sequence[Growth], axis: str, folder: Path) -> Path:
+    figure, (time, memory) = sheet(2, 4.4, 3.3, "seconds")
+    for growth, colour in zip(growths, COLOURS * len(growths), strict=False):
+        label = f"{growth.label}: {growth.exponent:.2f}"
+        if growth.expected is not None:
+            label += f" ({growth.expected:.2f} expected)"
+            first, start = growth.seconds[0], growth.at[0]
+            line = [first * (at / start) ** growth.expected for at in growth.at]
+            time.plot(growth.at, line, "--", color=colour, alpha=0.45, linewidth=1)
+        time.plot(growth.at, growth.seconds, "-o", color=colour, markersize=5, label=label)
+        memory.plot(growth.at, growth.peak_mib, "-o", color=colour, markersize=5)
+    for axes, title in ((time, "Time"), (memory, "Peak memory")):
+        axes.set_xscale("log")
+        axes.set_xticks(growths[0].at, [f"{at:g}" for at in growths[0].at])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        titled(axes, title, axis)
+    time.set_yscale("log")
+    plain_log_ticks(time, "y")
+    low, high = time.get_ylim()
+    if high / low < 4:  # what hardly moves should look as if it hardly moved
+        middle = (low * high) ** 0.5
+        time.set_ylim(middle / 2, middle * 2)
+    memory.set_ylim(0, 1.15 * max(max(growth.peak_mib) for growth in growths))
+    memory.set_ylabel("MiB", color=FAINT, fontsize=9)
+    time.legend(**LEGEND)
+    return save_drawing(figure, folder / f"growth-{axis.replace(' ', '-')}.svg")
+
+
+CAVEATS = (
+    "Frames are made with the very Psi that reconstructs them; all methods have this advantage.",
+    "Angular: 0 dB is what one picture copied to every view scores; below, parallax is worse than "
+    "none. Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
+    "Seconds are the median of repeats after a warm-up, in a fresh process each, one at a time; "
+    "the dictionary is made beforehand. Memory is that of the whole process.",
+)
+MEANS = {
+    "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",
+    "own_disparity_mae_px": ".2f", "cpu_seconds": ".3g", "peak_mib": ".0f", "steps": ".0f",
+}  # fmt: skip
+"""Figures of a point that the table shows as means over the scenes, and how."""
+
+
+def chart_page(
+    sweep: ChartSweep,
+    about: Sequence[str],
+    charts: Mapping[Chart, Path],
+    growths: Sequence[Growth],
+    drawn_growths: Mapping[str, Path],
+    provenance: Mapping[str, str],
+) -> str:
+    """Return the page. about: sentences under the title. charts, drawn_growths: their SVG files."""
+    sections = [_chart_section(sweep, chart, path) for chart, path in charts.items()]
+    if growths:
+        pictures = {axis: embedded(path) for axis, path in drawn_growths.items()}
+        body = fragment("chart_growth.html", growths=growths, pictures=pictures)
+        sections.append(Section("growth", "Growth with the size of the problem", body, "Growth"))
+    sections.append(provenance_section(provenance))
+    marks = {chart.mark_name(mark): _shown(sweep, mark) for chart in charts for mark in chart.marks}
+    return framed(
+        "Speed against accuracy", about, CAVEATS, sections, ["chart.css"], ["chart.js"],
+        marks_data(marks),
+    )  # fmt: skip
+
+
+def _chart_section(sweep: ChartSweep, chart: Chart, path: Path) -> Section:
+    front = chart.front()
+    rows = [
+        {
+            "name": chart.mark_name(mark),
+            "mark": mark,
+            "in_front": mark in front,
+            **_means([sweep.results[point] for point in mark.points]),
+        }
+        for mark in sorted(chart.marks, key=lambda mark: mark.seconds)
+    ]
+    first = chart.mark_name(front[-1]) if front else None
+    drawing = inline_svg(path, chart.key)
+    body = fragment("chart_front.html", drawing=drawing, first=first, rows=rows)
+    return Section(chart.key, chart.title, body)
+
+
+def _means(results: Sequence[dict]) -> dict[str, str]:
+    """Return the means over scenes, a dash where none is known."""
+    means = {}
+    for key, form in MEANS.items():
+        known = [result[key] for result in results if result[key] is not None]
+        means[key] = number(mean(known) if known else None, form)
+    return means
+
+
+def _shown(sweep: ChartSweep, mark: Mark) -> ShownMark:
+    pairs = [
+        ShownPair(
+            f"{point.capture.scene_name}: {sweep.results[point]['psnr_db']:.2f} dB",
+            sweep.picture(point),
+            sweep.truth_picture(point.capture),
+        )
+        for point in mark.points
+    ]
+    words = f"{mark.psnr_db:.2f} dB, {mark.seconds:.3g} s"
+    return ShownMark(mark.configuration.label, words, pairs)
+
 
 CSV, PAGE, DRAWN = "chart.csv", "chart.html", "charts"
 COLUMNS = (

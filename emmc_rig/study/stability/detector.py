@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
 from emmc_rig.errors import AppError
@@ -24,16 +23,13 @@ from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
-from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS, Fault
-from emmc_rig.study.stability.fault_sweep import open_dictionary_once
+from emmc_rig.study.stability.fault_sweep import named_methods
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
-from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
+from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Fault, Trial
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, find_method
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
@@ -61,10 +57,10 @@ class DetectorSettings(Settings):
 
 def detector_settings(
     fast: bool,
-    scenes: Sequence[str],
+    scenes: Sequence[str] | None,
     camera: str | None,
-    faults: Sequence[str],
-    methods: Sequence[str],
+    faults: Sequence[str] | None,
+    methods: Sequence[str] | None,
     size: tuple[int, int] | None,
     seed: int,
 ) -> DetectorSettings:
@@ -72,19 +68,17 @@ def detector_settings(
 
     Raises AppError and ReconstructionError naming the nearest for names that are not known.
     """
-    for name in faults:
+    for name in faults or ():
         find_fault(name)
-    for name in methods:
-        find_method(name)
     given = {
         "cameras": (camera,) if camera else (),
-        "faults": tuple(faults),
-        "methods": tuple(methods),
+        "faults": tuple(faults or ()),
+        "methods": named_methods(methods, fast) if methods else (),
         "size": size,
     }
     chosen = {key: value for key, value in given.items() if value}
     return DetectorSettings.model_validate(
-        {"fast": fast, "scenes": tuple(scenes) or tuple(SCENES), "seeds": (seed,), **chosen}
+        {"fast": fast, "scenes": tuple(scenes or ()) or tuple(SCENES), "seeds": (seed,), **chosen}
     )
 
 
@@ -162,13 +156,14 @@ class CaseResult:
 
     @property
     def wrong(self) -> bool:
-        """Whether it is broken and trusted, or good and not."""
-        return self.kind in ("broken", "good") and self.flagged != (self.kind == "broken")
+        """Whether it is broken and trusted, or good and flagged."""
+        trusted = self.verdict.level == "trust"
+        return (self.kind == "broken" and trusted) or (self.kind == "good" and self.flagged)
 
     @property
     def flagged(self) -> bool:
-        """Whether the verdict is not trust."""
-        return self.verdict.level != "trust"
+        """Whether the verdict speaks against it."""
+        return self.verdict.level in ("doubt", "do not use")
 
 
 @dataclass
@@ -208,20 +203,18 @@ def _trial(case: Case, settings: DetectorSettings) -> Trial:
 
 
 def _row(method: str, given: Trial) -> dict:
-    dictionary = None
-    if METHODS[method].needs_dictionary:
-        views = given.psi.light_field_shape[:2]
-        dictionary = open_dictionary_once(None, views, given.psi.binning)
+    dictionary = given.dictionary(method)
     try:
         found, verdict = reconstruct_judged(
             method, given.psi, given.readings, given.noise_sigma, dictionary, None, given.usable
         )
     except (ReconstructionError, ModelError) as fault:
         return {"refused": str(fault)}
-    level = psnr_db(found.light_field, given.truth) + 20 * math.log10(given.peak)
-    even = np.broadcast_to(given.truth.mean(axis=(0, 1, 2, 3)), given.truth.shape)
-    even_db = psnr_db(even, given.truth) + 20 * math.log10(given.peak)
-    return {"psnr_db": level, "even_db": even_db, "evidence": verdict.evidence.as_dict()}
+    return {
+        "psnr_db": given.psnr_db(found.light_field),
+        "even_db": given.psnr_db(given.even),
+        "evidence": verdict.evidence.as_dict(),
+    }
 
 
 def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
@@ -246,7 +239,10 @@ def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
 
 @dataclass(frozen=True)
 class Tally:
-    """How many results were of each kind, and how many of those were flagged."""
+    """How many results were of each kind, and how many of those were flagged.
+
+    untold: of all kinds, how many could not be told.
+    """
 
     broken: int = 0
     broken_flagged: int = 0
@@ -256,6 +252,12 @@ class Tally:
     good_flagged: int = 0
     poor: int = 0
     poor_flagged: int = 0
+    untold: int = 0
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return, of broken, good, between and poor, how many were flagged, and how many are."""
+        counts = asdict(self)
+        return [(counts[f"{k}_flagged"], counts[k]) for k in ("broken", "good", "between", "poor")]
 
     @property
     def detected(self) -> float | None:
@@ -274,6 +276,7 @@ def tallied(results: Iterable[CaseResult]) -> Tally:
     for one in results:
         counts[one.kind] += 1
         counts[f"{one.kind}_flagged"] += one.flagged
+        counts["untold"] += one.verdict.level == "cannot tell"
     return Tally(**counts)
 
 

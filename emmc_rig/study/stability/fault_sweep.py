@@ -1,32 +1,166 @@
-"""The points of a stability sweep, measured for accuracy alone: in this process, untimed."""
+"""The points of a stability sweep: scenes, faults at their strengths, methods; measured untimed.
+
+All methods of a (scene, fault, strength) get the same trial.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.pages.page import number
-from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.model.lightfield import replicate_centre
+from emmc_rig.model.settings import Settings
+from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import angular_snr_db
-from emmc_rig.study.stability.fault_points import Point
-from emmc_rig.study.stability.faults import FAULTS, camera_for
-from emmc_rig.study.stability.trial import Setup, Trial
-from emmc_rig.study.sweep import Results, Sweep, dictionary_identity, digest_of, machine
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from emmc_rig.study.scores import angular_snr_db
+from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
+from emmc_rig.study.sweep import (
+    Results,
+    Sweep,
+    check_scene_names,
+    dictionary_identity,
+    digest_of,
+    machine,
+)
+from emmc_rig.study.trial import Fault, Setup, Trial
+from reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
 from reconstruction.sparse import SparseSettings
 
+SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
+FAST_METHODS = ("tv", "dict-omp", "adaptive-fast")
+SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
+FAST_SCENES = ("deep-occlusions",)
+ALL = "all"
+"""Instead of a method's name: every one that is installed."""
+CAMERA = "rgbw-bayer-3shots"
+SIZE, ZOOM = (96, 128), 2
+FAST_SIZE, FAST_ZOOM = (64, 80), 3
+SMALLEST_PX = 16
+
+
+class StabilitySettings(Settings):
+    """What to sweep. faults, methods: names; empty takes all. zoom: see `zoomed_scene`.
+
+    screening: whether the frames are screened for bad pixels and shots before they are
+    reconstructed; "both" measures without too, for the faults that screening is for.
+    """
+
+    scenes: tuple[str, ...]
+    camera: str = CAMERA
+    size: tuple[int, int] | None = None
+    zoom: int = Field(default=1, ge=1)
+    fast: bool = False
+    faults: tuple[str, ...] = ()
+    methods: tuple[str, ...] = ()
+    screening: Literal["on", "off", "both"] = "both"
+    dictionary: str | None = None
+    seed: int = Field(default=0, ge=0)
+
+    def trial(self, fault: str, strength: float, scene: str) -> Trial:
+        """Return what methods get of a scene with a fault; raises what `faults.trial` does."""
+        camera = find_camera(self.camera)
+        return trial(FAULTS[fault], strength, scene, camera, self.size, self.seed, self.zoom)
+
+
+def stability_settings(
+    fast: bool, scenes: Sequence[str], size: tuple[int, int] | None, **others: object
+) -> StabilitySettings:
+    """Return the settings of a sweep; defaults are those of --fast or of the full sweep."""
+    chosen = {
+        "fast": fast,
+        "scenes": tuple(scenes) or (FAST_SCENES if fast else SCENES),
+        "size": size or (FAST_SIZE if fast else SIZE),
+        "zoom": FAST_ZOOM if fast else ZOOM,
+        **others,
+    }
+    return StabilitySettings.model_validate(chosen)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement; screened: whether the frames were screened first."""
+
+    scene: str
+    fault: str
+    strength: float
+    method: str
+    screened: bool = True
+
+    @property
+    def scene_name(self) -> str:
+        """The scene as charts call it."""
+        return Path(self.scene).stem
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        fault = FAULTS[self.fault]
+        without = "" if self.screened else ", not screened"
+        return (
+            f"{self.scene_name}, {fault.title} {self.strength:g} {fault.unit}, "
+            f"{self.method}{without}"
+        )
+
+
+def chosen_faults(settings: StabilitySettings) -> list[Fault]:
+    """Return the faults to sweep; raises AppError naming the nearest for one not known."""
+    return [find_fault(name) for name in settings.faults] or list(FAULTS.values())
+
+
+def named_methods(names: Sequence[str], fast: bool) -> tuple[str, ...]:
+    """Return methods by name, those usually compared where none is given, every one for ALL.
+
+    Raises ReconstructionError naming the nearest for one not known.
+    """
+    if ALL in names:
+        return installed_methods()
+    for name in names:
+        find_method(name)
+    return tuple(names) or (FAST_METHODS if fast else SWEPT_METHODS)
+
+
+def chosen_methods(settings: StabilitySettings) -> tuple[str, ...]:
+    """Return the methods of a sweep; raises what `named_methods` does."""
+    return named_methods(settings.methods, settings.fast)
+
+
+def strengths(fault: Fault, settings: StabilitySettings) -> tuple[float, ...]:
+    """Return the strengths at which a fault is measured."""
+    return fault.quick if settings.fast else fault.strengths
+
+
+def planned(settings: StabilitySettings) -> list[Point]:
+    """Return the points, those of one trial together; raises AppError for wrong names."""
+    if settings.size is not None and min(settings.size) < SMALLEST_PX:
+        raise AppError(
+            f"--size {settings.size[0]}x{settings.size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} "
+            "or more"
+        )
+    check_scene_names(settings.scenes)
+    methods = chosen_methods(settings)
+    both = settings.screening == "both"
+    return [
+        Point(scene, fault.name, strength, method, screened)
+        for scene in settings.scenes
+        for fault in chosen_faults(settings)
+        for strength in strengths(fault, settings)
+        for method in methods
+        for screened in (
+            (True, False) if both and fault.screened else (settings.screening != "off",)
+        )
+    ]
+
+
 PICTURES = "pictures"
-open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)
 
 
 @dataclass
@@ -94,27 +228,15 @@ class StabilitySweep(Sweep[Point]):
         truth = self.truth_picture(one)
         truth.parent.mkdir(exist_ok=True)
         if not truth.is_file():
-            save_thumbnail(truth, made.truth, telling_lines(made.truth))
+            save_thumbnail(truth, made.truth, epipolar_lines(made.truth))
         for point in points:
             yield self._measured(point, made)
 
     def _measured(self, point: Point, made: Trial) -> dict:
-        dictionary = None
-        if METHODS[point.method].needs_dictionary:
-            views = made.psi.light_field_shape[:2]
-            dictionary = open_dictionary_once(self.settings.dictionary, views, made.psi.binning)
-        stretched_db = 20 * math.log10(made.peak)
-        view_db = psnr_db(replicate_centre(made.truth), made.truth) + stretched_db
+        view_db = made.psnr_db(replicate_centre(made.truth))
         try:
-            result = reconstruct(
-                point.method,
-                made.psi,
-                made.readings,
-                made.noise_sigma,
-                dictionary,
-                _settings(point, made.psi.binning),
-                made.usable,
-            )
+            settings = _settings(point, made.psi.binning)
+            result = made.solved(point.method, settings, self.settings.dictionary)
         except MemoryError:
             return {"failed": "not enough memory", "keep": False}
         except Exception as fault:
@@ -125,9 +247,9 @@ class StabilitySweep(Sweep[Point]):
         estimate = result.light_field
         if not np.isfinite(estimate).all():
             return {"failed": "the estimate is not finite", "view_db": view_db}
-        save_thumbnail(self.picture(point), estimate, telling_lines(made.truth))
+        save_thumbnail(self.picture(point), estimate, epipolar_lines(made.truth))
         return {
-            "psnr_db": psnr_db(estimate, made.truth) + stretched_db,
+            "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,
             "angular_db": angular_snr_db(estimate, made.truth),
             "usable": float(made.usable.mean()),
@@ -137,12 +259,6 @@ class StabilitySweep(Sweep[Point]):
             "advice": result.advice,
             "screening": "; ".join(result.screening),
         }
-
-    def words(self, point: Point, result: dict) -> str:
-        """Return a measured point in words."""
-        if "failed" in result:
-            return f"{point.label}: {result['failed']}"
-        return f"{number(result['psnr_db'], '.2f')} dB, {point.label}"
 
 
 def _settings(point: Point, binning: int = 1) -> MethodSettings:

@@ -22,14 +22,14 @@ from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
-from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.pages.drawing import COLOURS, INK, legend_below, save_drawing, sheet, titled
+from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.checks import solved
-from emmc_rig.study.stability.fault_points import StabilitySettings
+from emmc_rig.study.stability.fault_sweep import StabilitySettings, chosen_methods
 from emmc_rig.study.stability.faults import find_fault
-from emmc_rig.study.stability.trial import Trial
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
+from emmc_rig.study.trial import Trial
 from reconstruction.errors import ReconstructionError
 
 SCENARIOS = ("ideal", "mismatched", "oracle", "blind")
@@ -43,8 +43,6 @@ ERRORS = (
 UNMOVED = ("mask-shift", 0.0)
 QUICK_ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 25.0))
 QUICK_DRIFT = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)
-METHODS_JUDGED = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
-QUICK_METHODS = ("tv", "dict-omp", "adaptive-fast")
 LEAST_DB = 0.2
 """Loss below which a recovered share would be that of noise."""
 
@@ -115,10 +113,10 @@ def corrected(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, boo
 
 def _psnr(taken: Trial, psi: ImagingMatrix, method: str) -> float:
     try:
-        found = solved(replace(taken, psi=psi), method)
+        found = replace(taken, psi=psi).solved(method)
     except ReconstructionError:
         return math.nan
-    return psnr_db(found.light_field, taken.truth)
+    return taken.psnr_db(found.light_field)
 
 
 @dataclass(frozen=True)
@@ -185,18 +183,13 @@ def drift_settings(fast: bool) -> DriftSettings:
     return QUICK_DRIFT if fast else DriftSettings()
 
 
-def measure_mismatch(
-    settings: StabilitySettings,
-    folder: Path,
-    watcher: Watcher,
-    methods: Sequence[str] = (),
-) -> list[Mismatch]:
+def measure_mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> list[Mismatch]:
     """Return every row, those that the folder does not hold measured and kept there.
 
-    methods: none takes those of the protocol. Raises what scenes and cameras do for wrong input,
-    NotApplicableError for cameras without a mask that can sit otherwise.
+    Raises what scenes, cameras and methods do for wrong input, NotApplicableError for cameras
+    without a mask that can sit otherwise.
     """
-    methods = methods or (QUICK_METHODS if settings.fast else METHODS_JUDGED)
+    methods = chosen_methods(settings)
     errors = QUICK_ERRORS if settings.fast else ERRORS
     sweep = MismatchSweep(settings, folder)
     sweep.run(
@@ -229,3 +222,62 @@ def _mismatch(point: MismatchPoint, result: dict, ideal: dict) -> Mismatch:
         psi_error=result["psi_error"],
         psi_left=result["psi_left"],
     )
+
+
+MARKS = {
+    "ideal": ("o", INK, "none", 10),
+    "mismatched": ("X", "#b42318", "#b42318", 7),
+    "oracle": ("D", COLOURS[0], "none", 7),
+    "blind": ("o", COLOURS[0], COLOURS[0], 4),
+}
+
+
+def draw_mismatch(rows: Sequence[Mismatch], path: Path) -> Path:
+    """Write a panel for each error of one scene, a column a method, as SVG and PNG."""
+    errors = list(dict.fromkeys(row.error for row in rows))
+    figure, axes = sheet(len(errors), 3.9, 2.9, columns=min(3, len(errors)))
+    for panel, error in zip(axes, errors, strict=True):
+        some = [row for row in rows if row.error == error]
+        for place, row in enumerate(some):
+            ends = row.mismatched, row.blind
+            panel.plot([place, place], ends, color=COLOURS[0], linewidth=1, alpha=0.5)
+            for kind in SCENARIOS:
+                mark, edge, face, size = MARKS[kind]
+                panel.plot(
+                    place, getattr(row, kind), mark, color=edge, markerfacecolor=face,
+                    markersize=size, label=kind if place == 0 else None,
+                )  # fmt: skip
+        panel.set_xticks(range(len(some)), [row.method for row in some], rotation=20)
+        panel.tick_params(labelsize=7.5)
+        panel.set_xlim(-0.5, len(some) - 0.5)
+        titled(panel, error)
+    lines, names = axes[0].get_legend_handles_labels()
+    legend_below(figure, lines, names, 4)
+    return save_drawing(figure, path)
+
+
+def recovered_share(rows: Sequence[Mismatch], of_oracle: bool = False) -> float | None:
+    """Return what blind correction recovers of all that was lost; None where too little was."""
+    whole = [row for row in rows if (row.of_oracle if of_oracle else row.recovered) is not None]
+    best = (row.oracle if of_oracle else row.ideal for row in whole)
+    lost = sum(one - row.mismatched for one, row in zip(best, whole, strict=True))
+    return sum(row.blind - row.mismatched for row in whole) / lost if whole else None
+
+
+def mismatch_sections(rows: Sequence[Mismatch], folder: Path) -> list[Section]:
+    """Return a section for each scene, its chart written into a folder."""
+    sections = []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        some = [row for row in rows if row.scene == scene]
+        picture = draw_mismatch(some, folder / f"mismatch-{scene}.svg")
+        body = fragment(
+            "mismatch.html",
+            scene=scene,
+            picture=embedded(picture),
+            rows=some,
+            scenarios=SCENARIOS,
+            share=recovered_share(some),
+            share_of_oracle=recovered_share(some, True),
+        )
+        sections.append(Section(f"mismatch-{scene}", f"Mismatch of Psi, {scene}", body))
+    return sections

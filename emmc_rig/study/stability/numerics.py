@@ -1,36 +1,120 @@
-"""Numerical stability: rounding, ill-conditioned Psi, step sizes, the data's scale, repeatability.
+"""Numerical stability: rounding, ill-conditioned Psi, step sizes, the scale of data, repeatability.
 
 Kernels are compared with float64 through SciPy (`rounding`), methods with themselves on the same
-capture (`conditions`): what should change nothing must change nothing, what cannot be solved must
-be refused or come out finite.
+capture: what should change nothing must change nothing, what cannot be solved must be refused or
+come out finite.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
-from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.pages.drawing import LEGEND, colours_of, save_drawing, sheet, titled
+from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.checks import (
+from emmc_rig.study.stability.rounding import (
     BROKEN,
     SOUND,
     WEAK,
     Attempt,
     Finding,
     attempted,
+    double_precision,
     example,
-    solved,
+    rounding,
+    step_sizes,
 )
-from emmc_rig.study.stability.conditions import CONDITIONS, scaled
-from emmc_rig.study.stability.rounding import double_precision, rounding, step_sizes
-from emmc_rig.study.stability.trial import Trial
-from reconstruction.methods import METHODS
+from emmc_rig.study.trial import Trial
+from reconstruction.methods import installed_methods
 from reconstruction.result import Reconstruction
+
+OPAQUE = 0.02
+
+
+def dimmed(trial: Trial, factor: float) -> Trial:
+    """Return a capture whose Psi, readings and noise are `factor` times as large."""
+    weights = trial.psi.weights * np.float32(factor)
+    psi = replace(trial.psi, weights=weights)
+    readings = trial.readings * np.float32(factor)
+    return replace(trial, psi=psi, readings=readings, noise_sigma=trial.noise_sigma * factor)
+
+
+def _opaque(trial: Trial) -> Trial:
+    psi = replace(trial.psi, weights=trial.psi.weights * np.float32(OPAQUE))
+    noise = trial.readings - trial.psi.forward(trial.truth)
+    return replace(trial, psi=psi, readings=psi.forward(trial.truth) + noise)
+
+
+def _blind_rows(trial: Trial) -> Trial:
+    dark = np.random.default_rng(0).random(trial.psi.size) < 0.05
+    weights = np.where(dark[:, None, :], 0, trial.psi.weights).astype(np.float32)
+    readings = np.where(dark, 0, trial.readings).astype(np.float32)
+    return replace(trial, psi=replace(trial.psi, weights=weights), readings=readings)
+
+
+def _dark_shot(trial: Trial) -> Trial:
+    weights, readings = trial.psi.weights.copy(), trial.readings.copy()
+    weights[-1], readings[-1] = 0, 0
+    return replace(trial, psi=replace(trial.psi, weights=weights), readings=readings)
+
+
+def _repeated(trial: Trial) -> Trial:
+    psi = trial.psi
+    colour = None if psi.colour is None else psi.colour[[0, 0]]
+    twice = replace(psi, weights=psi.weights[[0, 0]], colour=colour)
+    return replace(trial, psi=twice, readings=trial.readings[[0, 0]], usable=trial.usable[[0, 0]])
+
+
+def scaled(trial: Trial, factor: float) -> Trial:
+    """Return a capture whose readings and noise are `factor` times as large, Psi as it was."""
+    readings = trial.readings * np.float32(factor)
+    return replace(trial, readings=readings, noise_sigma=trial.noise_sigma * factor)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One such capture.
+
+    shots: of the capture that is changed. same: whether the outcome should be that of the capture
+    as it was, or may be any that is finite and no worse than a card of the mean colour.
+    """
+
+    name: str
+    shots: int
+    change: Callable[[Trial], Trial]
+    same: bool
+    meaning: str
+
+
+CONDITIONS = (
+    Condition(
+        "Psi, readings and noise x 1e-6", 1, lambda one: dimmed(one, 1e-6), True,
+        "the units of the readings do not matter",
+    ),
+    Condition(
+        "Psi, readings and noise x 1e6", 1, lambda one: dimmed(one, 1e6), True,
+        "the units of the readings do not matter",
+    ),
+    Condition(
+        "nearly opaque mask", 1, _opaque, False,
+        "a fiftieth of the light under the same noise: what is seen is hardly more than the noise",
+    ),
+    Condition(
+        "5 % of the rows are 0", 1, _blind_rows, False, "readings without light, not marked",
+    ),
+    Condition("a dark shot", 2, _dark_shot, False, "blocks of Psi Psi^T are singular"),
+    Condition(
+        "two identical shots", 1, _repeated, True,
+        "blocks of Psi Psi^T are singular; repeated readings add nothing",
+    ),
+)  # fmt: skip
+
 
 SAME_DB, FEW_DB = 0.1, 3.0
 SCALES = (1e-6, 1e-3, 1e-1, 1e1, 1e3, 1e6)
@@ -50,8 +134,7 @@ class Numerics:
 
 def card_db(trial: Trial) -> float:
     """Return the PSNR of a card of the scene's mean colour, a lower bound for any method."""
-    mean = trial.truth.mean(axis=(0, 1, 2, 3))
-    return psnr_db(np.broadcast_to(mean, trial.truth.shape), trial.truth)
+    return trial.psnr_db(trial.even)
 
 
 def condition_verdict(
@@ -83,14 +166,14 @@ def repeats(trial: Trial, methods: Sequence[str]) -> list[Finding]:
     differ, threaded = [], {}
     threads = get_num_threads()
     for method in methods:
-        first = solved(trial, method)
-        if not identical(first, solved(trial, method)):
+        first = trial.solved(method)
+        if not identical(first, trial.solved(method)):
             differ.append(method)
         if threads == 1:
             continue
         try:
             set_num_threads(1)
-            alone = solved(trial, method).light_field
+            alone = trial.solved(method).light_field
         finally:
             set_num_threads(threads)
         threaded[method] = float(np.abs(alone - first.light_field).max())
@@ -123,12 +206,14 @@ def identical(one: Reconstruction, other: Reconstruction) -> bool:
 
 
 def measure_numerics(
-    watcher: Watcher, fast: bool = False, every: Sequence[str] = tuple(METHODS)
+    watcher: Watcher, fast: bool = False, every: Sequence[str] | None = None
 ) -> Numerics:
     """Return every check, on small captures of a built-in scene.
 
-    every: methods run twice; fast: of those, the slow ones are not run under every condition.
+    every: methods run twice (default: all that are installed); fast: of those, the slow ones are
+    not run under every condition.
     """
+    every = installed_methods() if every is None else every
     methods = [name for name in every if not (fast and name in SLOW)]
     scales = QUICK_SCALES if fast else SCALES
     watcher.begin("numerical stability", 4 + len(CONDITIONS) + len(scales))
@@ -165,3 +250,37 @@ def measure_numerics(
         findings.append(Finding(f"readings and noise x {factor:g}", figure, verdict, meaning))
         watcher.step(f"scale {factor:g}")
     return Numerics(findings, outcomes, by_scale)
+
+
+def draw_numerics(found: Numerics, path: Path) -> Path:
+    """Write the PSNR of every method by the scale of its data as SVG and PNG."""
+    figure, (axes,) = sheet(1, 6.4, 3.2)
+    usual = found.outcomes["as it is"]
+    for method, colour in colours_of(usual).items():
+        levels = {1.0: usual[method]} | {
+            scale: outcomes[method] for scale, outcomes in found.scales.items()
+        }
+        known = sorted((s, one.db) for s, one in levels.items() if math.isfinite(one.db))
+        axes.plot(
+            [s for s, _ in known], [db for _, db in known], "-o", markersize=3.6,
+            color=colour, label=method,
+        )  # fmt: skip
+    axes.set_xscale("log")
+    across = "readings and noise, times what they were (no mark: refused)"
+    titled(axes, "The scale of the data", across)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), **LEGEND)
+    return save_drawing(figure, path)
+
+
+def numerics_section(found: Numerics, folder: Path) -> Section:
+    """Return the section, its chart written into a folder."""
+    picture = draw_numerics(found, folder / "numerics.svg")
+    scales = {f"x {scale:g}": outcomes for scale, outcomes in found.scales.items()}
+    body = fragment(
+        "numerics.html",
+        findings=found.findings,
+        picture=embedded(picture),
+        outcomes={**found.outcomes, **scales},
+        methods=list(found.outcomes["as it is"]),
+    )
+    return Section("numerics", "Numerical stability", body)

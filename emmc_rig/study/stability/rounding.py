@@ -1,26 +1,166 @@
-"""Rounding and step sizes: float32 kernels against float64 through SciPy, absurd steps of TV."""
+"""Float32 kernels against float64 through SciPy, written from the formulas; absurd steps of TV."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.model import kernels as psi_kernels
+from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from emmc_rig.study.stability.checks import BROKEN, SOUND, VIEWS, WEAK, Finding, solved
-from emmc_rig.study.stability.reference import Reference
-from emmc_rig.study.stability.trial import Trial
+from emmc_rig.study.trial import Setup, Trial, trial_of
 from reconstruction.choices import choose_mu, first_light_field, smooth_guess
 from reconstruction.differences import norm_squared
+from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings
 from reconstruction.problem import Problem, colour_metric
 from reconstruction.result import Status
 from reconstruction.tv import TVSettings, reconstruct_tv
+
+Array = NDArray[np.floating]
+AXES = (3, 2, 1, 0)
+"""Directions of the differences, x y u v, as axes of (v, u, y, x, c)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """metric: (3, 3), turns colours into those whose differences count (see `reconstruct_tv`)."""
+
+    psi: ImagingMatrix
+    metric: NDArray[np.float64]
+
+    @cached_property
+    def matrix(self) -> sparse.csr_array:
+        """Psi as it is stored, in float64."""
+        return self.psi.to_scipy().astype(np.float64).tocsr()
+
+    @cached_property
+    def differences(self) -> list[sparse.csr_array]:
+        """Forward differences along x, y, u and v, 0 across the far border, of mixed colours."""
+        shape = self.psi.light_field_shape
+        found = []
+        for axis in AXES:
+            parts: list = [sparse.eye_array(n) for n in shape[:4]]
+            step = np.eye(shape[axis], k=1) - np.eye(shape[axis])
+            step[-1] = 0
+            parts[axis] = sparse.csr_array(step)
+            found.append(reduce(sparse.kron, [*parts, self.metric]).tocsr())
+        return found
+
+    def forward(self, light_field: Array) -> NDArray[np.float64]:
+        """Return Psi light_field, (shot, pixel_y, pixel_x)."""
+        flat = np.asarray(light_field, dtype=np.float64).ravel()
+        return (self.matrix @ flat).reshape(self.psi.frames_shape)
+
+    def adjoint(self, frames: Array) -> NDArray[np.float64]:
+        """Return Psi^T frames, (v, u, y, x, c)."""
+        flat = np.asarray(frames, dtype=np.float64).ravel()
+        return (self.matrix.T @ flat).reshape(self.psi.light_field_shape)
+
+    def _system(self, gamma: float) -> sparse.csc_array:
+        matrix, readings = self.matrix, self.psi.shape[0]
+        return sparse.csc_array(matrix @ matrix.T + sparse.eye_array(readings) / gamma)
+
+    def data_step(self, light_field: Array, frames: Array, gamma: float) -> NDArray[np.float64]:
+        """Return the proximal point of gamma / 2 |Psi z - frames|^2: the normal equations."""
+        missed = self.forward(light_field) - np.asarray(frames, dtype=np.float64)
+        return np.asarray(light_field, np.float64) - self.adjoint(
+            splu(self._system(gamma)).solve(missed.ravel()).reshape(missed.shape)
+        )
+
+    def variation(self, light_field: Array) -> float:
+        """Return the sum over samples of the length of their differences, colours together."""
+        flat = np.asarray(light_field, dtype=np.float64).ravel()
+        square = sum(np.square(one @ flat).reshape(-1, 3).sum(axis=1) for one in self.differences)
+        return float(np.sqrt(square).sum())
+
+    def steps(
+        self, frames: Array, start: Array, mu: float, gamma: float, dual_step: float, relax: float
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield the light fields of over-relaxed primal-dual steps (Condat 2013, algorithm 3.1)."""
+        matrix, shape = self.matrix, self.psi.light_field_shape
+        now = np.asarray(start, dtype=np.float64).ravel()
+        duals = [np.zeros(now.size) for _ in self.differences]
+        data = np.asarray(frames, dtype=np.float64).ravel()
+        factor = splu(self._system(gamma))
+        while True:
+            pulled = sum(one.T @ dual for one, dual in zip(self.differences, duals, strict=True))
+            down = now - gamma * pulled
+            new = down - matrix.T @ factor.solve(matrix @ down - data)
+            ahead = 2 * new - now
+            raised = [
+                dual + dual_step * (one @ ahead)
+                for one, dual in zip(self.differences, duals, strict=True)
+            ]
+            square = sum(np.square(one).reshape(-1, 3).sum(axis=1) for one in raised)
+            shrink = np.repeat(1 / np.maximum(np.sqrt(square) / mu, 1), 3)
+            duals = [
+                relax * shrink * one + (1 - relax) * dual
+                for one, dual in zip(raised, duals, strict=True)
+            ]
+            now = relax * new + (1 - relax) * now
+            yield now.reshape(shape)
+
+
+SOUND, WEAK, BROKEN = "sound", "weak", "broken"
+SCENE, SIZE, VIEWS, ZOOM = "near-planar", (24, 32), (3, 3), 6
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check. figure: what was measured, in words. verdict: sound, weak or broken."""
+
+    name: str
+    figure: str
+    verdict: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What a method made of a capture: its PSNR, or why there is none.
+
+    refused: the error's line, "" where it ran. db: NaN where it did not run or is not finite.
+    """
+
+    db: float
+    refused: str = ""
+
+    @property
+    def words(self) -> str:
+        """Return it for a table."""
+        if self.refused:
+            return "refused"
+        return f"{self.db:.2f}" if math.isfinite(self.db) else "not finite"
+
+
+def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) -> Trial:
+    """Return a small noisy capture of a built-in scene."""
+    chosen = find_camera(camera)
+    sensor = chosen.sensor.model_copy(update={"binning": binning})
+    chosen = chosen.with_shots(shots).model_copy(update={"views": VIEWS, "sensor": sensor})
+    return trial_of(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
+
+
+def attempted(trial: Trial, method: str, scale: float = 1.0) -> Attempt:
+    """Return the attempt of a method, its light field divided by `scale`."""
+    try:
+        found = np.clip(trial.solved(method).light_field.astype(np.float64) / scale, 0, 1)
+    except (ReconstructionError, ModelError) as fault:
+        return Attempt(math.nan, str(fault))
+    if not np.isfinite(found).all():
+        return Attempt(math.nan)
+    return Attempt(psnr_db(found, trial.truth))
+
 
 Array = NDArray[np.floating]
 EPSILON = float(np.finfo(np.float32).eps)
@@ -102,8 +242,8 @@ def _tv_against(plain: Reference, trial: Trial) -> float:
 def double_precision(trial: Trial) -> Finding:
     """The light field of TV run to its end in float32 and in float64, by PSNR."""
     wide = ImagingMatrix(trial.psi.weights.astype(np.float64), trial.psi.colour, trial.psi.binning)
-    narrow = solved(trial, "tv").light_field
-    other = solved(replace(trial, psi=wide), "tv").light_field
+    narrow = trial.solved("tv").light_field
+    other = replace(trial, psi=wide).solved("tv").light_field
     apart = psnr_db(narrow, trial.truth) - psnr_db(other, trial.truth)
     verdict = SOUND if abs(apart) < SAME_DB else WEAK
     meaning = "all of Psi and the solver in float64 find the same light field"
@@ -112,13 +252,13 @@ def double_precision(trial: Trial) -> Finding:
 
 def step_sizes(trial: Trial) -> list[Finding]:
     """TV with primal steps and mu far from those that it chooses."""
-    usual = solved(trial, "tv", MethodSettings(tv=TVSettings(objective_every=1)))
+    usual = trial.solved("tv", MethodSettings(tv=TVSettings(objective_every=1)))
     objective = usual.objective[-1][1]
     findings = []
     for factor in STEP_FACTORS:
         step = usual.parameters["primal_step"] * factor
         chosen = TVSettings(mu=usual.parameters["mu"], primal_step=step, objective_every=1)
-        found = solved(trial, "tv", MethodSettings(tv=chosen))
+        found = trial.solved("tv", MethodSettings(tv=chosen))
         value = found.objective[-1][1]
         finite = bool(np.isfinite(found.light_field).all())
         stopped = found.status != Status.CONVERGED
@@ -134,7 +274,7 @@ def step_sizes(trial: Trial) -> list[Finding]:
             )
         )
     for mu in (1e-12, 1e6):
-        found = solved(trial, "tv", MethodSettings(tv=TVSettings(mu=mu)))
+        found = trial.solved("tv", MethodSettings(tv=TVSettings(mu=mu)))
         finite = bool(np.isfinite(found.light_field).all())
         db = psnr_db(found.light_field, trial.truth) if finite else math.nan
         findings.append(

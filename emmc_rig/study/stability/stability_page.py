@@ -2,15 +2,141 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import Section, fragment, framed, inline_svg, number
-from emmc_rig.study.stability.curve_drawing import shown
-from emmc_rig.study.stability.curves import Curve, breaking_rows
-from emmc_rig.study.stability.fault_points import Point
-from emmc_rig.study.stability.fault_sweep import StabilitySweep
+from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows
+from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep
+
+DASHED = (0, (3, 2))
+PANEL_INCHES = (3.9, 2.75)
+FLOOR_DB = 6.0
+"""Below the least of the copied centre view: further down, a curve says nothing more."""
+
+
+def draw_curves(
+    curves: Sequence[Curve], colours: dict[str, str], path: Path, columns: int = 3
+) -> Path:
+    """Write a panel for each fault of some curves as SVG and PNG; return the SVG's path.
+
+    Every measured point of the SVG has the name of `Curve.mark_name`.
+    """
+    faults = list(dict.fromkeys(curve.fault.name for curve in curves))
+    panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
+    figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(columns, len(panels)))
+    for one, some in zip(axes, panels, strict=True):
+        _panel(one, some, colours)
+    _legend(figure, curves, colours)
+    return save_drawing(figure, path)
+
+
+def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    fault, strengths = curves[0].fault, curves[0].strengths
+    views = next((c.views for c in curves if None not in c.views), curves[0].views)
+    mixed = _is_mixed(curves)
+    seen = [(i, view) for i, view in enumerate(views) if view is not None]
+    axes.plot(
+        [i for i, _ in seen], [view for _, view in seen],
+        ":", color=FAINT, linewidth=1.2, zorder=1,
+    )  # fmt: skip
+    for curve in curves:
+        colour = colours[curve.method]
+        known = [(i, level) for i, level in enumerate(curve.levels) if level is not None]
+        axes.plot(
+            [i for i, _ in known], [level for _, level in known],
+            linestyle=DASHED if mixed and not curve.screened else "-", color=colour, linewidth=1.5,
+            zorder=2,
+        )  # fmt: skip
+        for i, level in known:
+            (dot,) = axes.plot(
+                i, level, "o", markersize=3.6, color=colour, zorder=3,
+                markerfacecolor="white" if mixed and not curve.screened else colour,
+            )  # fmt: skip
+            dot.set_gid(curve.mark_name(i))
+    floor = _limit(axes, curves)
+    for curve in curves:
+        colour = colours[curve.method]
+        for place, level, mark in _breaks(curve):
+            level = max(level, floor)
+            axes.plot(
+                place, level, mark, color=colour, markersize=9,
+                markerfacecolor="none", markeredgewidth=1.4, zorder=4, clip_on=False,
+            )  # fmt: skip
+    axes.set_xticks(range(len(strengths)), [shown(strength) for strength in strengths])
+    axes.set_xlim(-0.25, len(strengths) - 0.75)
+    axes.tick_params(labelsize=7.5)
+    titled(axes, fault.title, fault.unit)
+
+
+def _breaks(curve: Curve) -> list[tuple[float, float, str]]:
+    """Return place, level and mark of every breaking point."""
+    found = []
+    for span, mark in ((curve.below_best(), "x"), (curve.below_view(), "D")):
+        for place in () if span is None else (span.low, span.high):
+            level = None if place is None else _level_at(curve.levels, place)
+            if place is not None and level is not None:
+                found.append((place, level, mark))
+    return found
+
+
+def _level_at(levels: Sequence[float | None], place: float) -> float | None:
+    index = min(int(place), len(levels) - 1)
+    part = place - index
+    first, last = levels[index], levels[min(index + 1, len(levels) - 1)]
+    if first is None or (part and last is None):
+        return None
+    return first if not part or last is None else first + part * (last - first)
+
+
+def _is_mixed(curves: Sequence[Curve]) -> bool:
+    """Whether some of the curves are of screened frames and some are not."""
+    return len({curve.screened for curve in curves}) > 1
+
+
+def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
+    """End the axis a little below the copied view, where lower values add nothing; return where."""
+    views = [view for curve in curves for view in curve.views if view is not None]
+    levels = [level for curve in curves for level in curve.levels if level is not None]
+    if not levels:
+        return -math.inf
+    views = views or levels
+    low = max(min(levels), min(min(views), max(levels) - LOST_DB) - FLOOR_DB)
+    high = max(*levels, *views)
+    bottom = low - 0.06 * (high - low)
+    axes.set_ylim(bottom, high + 0.08 * (high - low))
+    return bottom
+
+
+def shown(strength: float) -> str:
+    """Return a strength for a tick: short."""
+    if strength >= 1000:
+        return f"{strength / 1000:g}k"
+    return f"{strength:.3g}"
+
+
+def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    methods = dict.fromkeys(curve.method for curve in curves)
+    lines = [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in methods]
+    names = list(methods)
+    if _is_mixed(curves):
+        lines.append(Line2D([], [], color=INK, linestyle=DASHED, marker="o", markersize=4,
+                            markerfacecolor="white"))  # fmt: skip
+        names.append("frames not screened")
+    for mark, name in (("x", f"{LOST_DB:g} dB below its best"), ("D", "below the copied view")):
+        lines.append(Line2D([], [], color=INK, linestyle="", marker=mark, markerfacecolor="none"))
+        names.append(name)
+    lines.append(Line2D([], [], color=FAINT, linestyle=":"))
+    names.append("copied true centre view")
+    legend_below(figure, lines, names, 5)
+
 
 CAVEATS = (
     "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "

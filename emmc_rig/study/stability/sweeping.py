@@ -1,10 +1,15 @@
-"""`emmc-rig stability`: measure the sweeps, and write tables, charts, page and metrics."""
+"""`emmc-rig stability`: measure the sweeps and the studies beside them, write page and metrics.
+
+Beside them: theory, numerical stability and the mismatch protocol, each with sections of the page,
+a chart, a CSV file and figures for metrics.json.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
@@ -16,25 +21,136 @@ from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import colours_of
 from emmc_rig.pages.page import Section, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.curve_drawing import draw_curves
+from emmc_rig.reconstruct.pool import opened_pool
 from emmc_rig.study.stability.curves import Curve, break_row, curves
-from emmc_rig.study.stability.fault_points import (
+from emmc_rig.study.stability.fault_sweep import (
     Point,
     StabilitySettings,
+    StabilitySweep,
     chosen_methods,
     planned,
 )
-from emmc_rig.study.stability.fault_sweep import StabilitySweep
 from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.mismatch import measure_mismatch, mismatch_sections, recovered_share
+from emmc_rig.study.stability.numerics import measure_numerics, numerics_section
+from emmc_rig.study.stability.rounding import BROKEN, WEAK
 from emmc_rig.study.stability.stability_page import (
     breaking_section,
     curves_section,
+    draw_curves,
     stability_page,
 )
-from emmc_rig.study.sweep import csv_text, machine, provenance, sweep_folder
+from emmc_rig.study.stability.theory import METHODS_COMPARED, measure_theory
+from emmc_rig.study.stability.theory_section import (
+    breaking,
+    compared,
+    is_predicted,
+    oracle_offset,
+    theory_sections,
+)
+from emmc_rig.study.sweep import (
+    NotApplicableError,
+    csv_text,
+    machine,
+    plain,
+    provenance,
+    sweep_folder,
+)
 from reconstruction.methods import METHODS
 
-POINTS_CSV, BREAKS_CSV, PAGE, DRAWN = "points.csv", "breaking.csv", "stability.html", "charts"
+DRAWN = "charts"
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """sections: of the page. metrics: by part. lines: for the terminal."""
+
+    sections: list[Section]
+    metrics: dict[str, object]
+    lines: list[str]
+
+
+def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
+    points = measure_theory(settings, folder, watcher)
+    rows = [
+        {"scene": one.scene, "fault": one.fault, "strength": one.strength, **one.figures}
+        for one in points
+    ]
+    write_text(new / "theory.csv", csv_text(rows))
+    every = compared(points, METHODS_COMPARED)
+    mean, root = oracle_offset(every)
+    breaks = [breaking(one, method) for one in every for method in METHODS_COMPARED]
+    agreed = sum(is_predicted(one["judged"]) for one in breaks)
+    metrics = {"oracle_less_bound_db": {"mean": mean, "rms": root}, "breaks": breaks}
+    line = (
+        f"theory: the bound says where a method breaks in {agreed} of {len(breaks)} curves; "
+        f"the oracle lies {mean:+.2f} dB from it"
+    )
+    sections = theory_sections(points, METHODS_COMPARED, new / DRAWN)
+    return Beside(sections, {"theory": metrics}, [line])
+
+
+def _numerics(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
+    found = measure_numerics(watcher, settings.fast)
+    rows = [asdict(one) for one in found.findings]
+    write_text(new / "numerics.csv", csv_text(rows))
+    verdicts = [one.verdict for one in found.findings]
+    weak, broken = verdicts.count(WEAK), verdicts.count(BROKEN)
+    line = f"numerics: {len(rows)} checks, {weak} weak, {broken} broken"
+    return Beside([numerics_section(found, new / DRAWN)], {"numerics": rows}, [line])
+
+
+def _mismatch(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
+    try:
+        found = measure_mismatch(settings, folder, watcher)
+    except NotApplicableError as fault:
+        return Beside([], {}, [f"mismatch left out: {fault}"])
+    rows = [
+        plain({**asdict(one), "recovered": one.recovered, "recovered_of_oracle": one.of_oracle})
+        for one in found
+    ]
+    write_text(new / "mismatch.csv", csv_text(rows))
+    share = recovered_share(found, of_oracle=True)
+    line = "mismatch: too little is lost to measure a recovered share"
+    if share is not None:
+        line = f"mismatch: blind correction recovers {share:.0%} of what the true Psi recovers"
+    return Beside(mismatch_sections(found, new / DRAWN), {"mismatch": rows}, [line])
+
+
+PARTS: dict[str, Callable[[StabilitySettings, Path, Path, Watcher], Beside]] = {
+    "theory": _theory,
+    "numerics": _numerics,
+    "mismatch": _mismatch,
+}
+
+
+def measure_beside(
+    settings: StabilitySettings, parts: Sequence[str], out: Path, watcher: Watcher
+) -> Beside:
+    """Return the parts wanted, in the order of PARTS, measured into the folder of the sweeps.
+
+    Raises SweepStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written,
+    and the errors of the layers below; points that are done are kept in each case.
+    """
+    sections, metrics, lines = [], {}, []
+    if not parts:
+        return Beside(sections, metrics, lines)
+    find_camera(settings.camera)  # raises before anything is written
+    with (
+        sweep_folder(out, StabilitySweep.journal, "stability") as folder,
+        result_folder(folder, "stability", adds=True) as new,
+    ):
+        (new / DRAWN).mkdir()
+        for name, measure in PARTS.items():
+            if name in parts:
+                found = measure(settings, folder, new, watcher)
+                sections += found.sections
+                metrics |= found.metrics
+                lines += found.lines
+    return Beside(sections, metrics, lines)
+
+
+POINTS_CSV, BREAKS_CSV, PAGE = "points.csv", "breaking.csv", "stability.html"
 POINT_COLUMNS = (
     "scene", "fault", "unit", "strength", "method", "screened", "psnr_db", "view_db",
     "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "screening",
@@ -66,12 +182,14 @@ def run_stability(
     more: Sequence[Section] = (),
     figures: Mapping[str, object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    workers: int | None = None,
 ) -> StabilityOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
     more: sections of the page between the curves and where they came from. figures: of them, for
-    metrics.json. Raises SweepStopped at Ctrl-C, AppError for wrong input and a folder that cannot
-    be written, and the errors of the layers below; what is done is kept in each case.
+    metrics.json. workers: processes that share the trials; None: this one. Raises SweepStopped at
+    Ctrl-C, AppError for wrong input and a folder that cannot be written, and the errors of the
+    layers below; what is done is kept in each case.
     """
     started = clock()
     points = planned(settings)
@@ -82,7 +200,8 @@ def run_stability(
         open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
     with sweep_folder(out, StabilitySweep.journal, "stability") as folder:
         sweep = StabilitySweep(settings, folder)
-        sweep.run(points, watcher)
+        with opened_pool(workers) if workers else nullcontext() as pool:
+            sweep.run(points, watcher, pool)
         left_out = [*sweep.unmeasured(), *sweep.failures()]
         found = curves(sweep.results)
         if not found:
@@ -164,6 +283,6 @@ def _about(sweep: StabilitySweep, left_out: Sequence[str]) -> list[str]:
     size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(sweep.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
-        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}.",
+        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
     return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]

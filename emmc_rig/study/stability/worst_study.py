@@ -24,12 +24,9 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import swept_disparity
-from emmc_rig.study.stability import fault_points
+from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
-from emmc_rig.study.stability.fault_points import FAST_SCENES, SCENES
-from emmc_rig.study.stability.fault_sweep import open_dictionary_once
-from emmc_rig.study.stability.trial import Setup, Trial, trial_of
+from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES, named_methods
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
     Results,
@@ -40,7 +37,8 @@ from emmc_rig.study.sweep import (
     open_folder,
     provenance,
 )
-from reconstruction.methods import METHODS, find_method, reconstruct
+from emmc_rig.study.trial import Setup, Trial, trial_of
+from reconstruction.methods import reconstruct
 
 Array = NDArray[np.floating]
 CAMERA = "rgbw-bayer-1shot"
@@ -92,11 +90,9 @@ def worst_settings(
         raise AppError(f"--size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
     scenes = tuple(scenes) or (FAST_SCENES if fast else SCENES)
     check_scene_names(scenes)
-    for name in methods:
-        find_method(name)
+    methods = named_methods(methods, fast)
     camera = camera or CAMERA
     find_camera(camera)
-    methods = tuple(methods) or (fault_points.FAST_METHODS if fast else fault_points.METHODS)
     return WorstSettings(
         scenes=scenes, camera=camera, methods=methods, size=size, fast=fast,
         dictionary=dictionary, seed=seed,
@@ -152,10 +148,7 @@ class WorstSweep(Sweep[Point]):
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the figures of each point of one scene and method."""
         trial, method = self.settings.trial(points[0].scene), points[0].method
-        dictionary = None
-        if METHODS[method].needs_dictionary:
-            views = trial.psi.light_field_shape[:2]
-            dictionary = open_dictionary_once(self.settings.dictionary, views, trial.psi.binning)
+        dictionary = trial.dictionary(method, self.settings.dictionary)
 
         def solve(readings: Array) -> Array:
             frames = readings.astype(np.float32)

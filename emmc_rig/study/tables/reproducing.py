@@ -3,25 +3,146 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
 
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
+from emmc_rig.pages.page import Section, embedded, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import csv_text, provenance, sweep_folder
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
-from emmc_rig.study.tables.cells import Cell, Part, cells_of, chosen_parts
+from emmc_rig.study.tables.cells import METHOD_TITLES, PARTS, Cell, Part, cells_of, chosen_parts
 from emmc_rig.study.tables.charts import draw_charts
-from emmc_rig.study.tables.dictionaries import Given, LeaveOneOut, Source
 from emmc_rig.study.tables.figures import draw_figures
-from emmc_rig.study.tables.findings import Finding, judge
-from emmc_rig.study.tables.grids import Grid, grids
-from emmc_rig.study.tables.library import Library, scene_specs
-from emmc_rig.study.tables.tables_page import tables_page
+from emmc_rig.study.tables.findings import Finding, findings_from
+from emmc_rig.study.tables.grids import Grid, Pair, grids
+from emmc_rig.study.tables.library import Given, LeaveOneOut, Library, Source, scene_specs
 from reconstruction.methods import METHODS
+
+CAVEAT = (
+    "The paper's figures stand beside ours to show the order of things, not to be reached or "
+    "beaten: which aperture variant of the MIT scenes it used, and how far its mask stood from the "
+    "sensor, is unknown. Compare methods and scenarios within one run."
+)
+ALTS = {
+    "figure5": "Frames of the three scenarios with enlarged pieces",
+    "figure6": "Reconstructed views of the three scenarios with enlarged pieces",
+    "figure7": "Epipolar images, true and reconstructed",
+    "figure8": "Mask patterns",
+    "figure9": "Reconstructed views by method and scenario with enlarged pieces",
+    "figure10": "Super-resolved views with enlarged pieces",
+}
+
+
+def tables_page(
+    about: Sequence[str],
+    grids: Sequence[Grid],
+    findings: Sequence[Finding],
+    charts: Mapping[str, Path],
+    figures: Mapping[str, Path],
+    provenance: Mapping[str, str],
+) -> str:
+    """Return the page. about: sentences under the title. charts: by title. figures: by part."""
+    body = fragment("tables_findings.html", findings=findings, titles=METHOD_TITLES)
+    sections = [Section("findings", "Findings", body)]
+    if charts:
+        drawn = {title: embedded(path) for title, path in charts.items()}
+        sections.append(Section("charts", "Charts", fragment("tables_charts.html", charts=drawn)))
+    for grid in grids:
+        body = fragment("tables_grid.html", grid=grid, titles=METHOD_TITLES)
+        sections.append(_section(grid.name, grid.title, body))
+    for name, path in figures.items():
+        body = fragment("tables_figure.html", alt=ALTS[name], picture=embedded(path))
+        sections.append(_section(f"{name}-picture", PARTS[name].title, body))
+    sections.append(provenance_section(provenance))
+    title = "The paper's tables and figures, reproduced"
+    return framed(title, about, [CAVEAT], sections, ["tables.css"])
+
+
+def _section(key: str, title: str, body: str) -> Section:
+    return Section(key, title, body, title.partition(":")[0])
+
+
+COLOURS = {"holds": "green", "does not hold": "red"}
+WIDE = 3
+
+
+def shown(grids: Sequence[Grid], findings: Sequence[Finding]) -> Iterator[Table | Text]:
+    """Yield everything to print, the caveat last."""
+    yield from _tables(grids)
+    yield _findings_table(findings)
+    yield Text(CAVEAT, style="yellow")
+
+
+def _tables(grids: Sequence[Grid]) -> Iterator[Table]:
+    """Yield one table per grid: ours, and the paper's behind a bar or, in wide ones, below."""
+    for grid in grids:
+        table = Table(title=grid.title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        table.title_justify = table.caption_justify = "left"
+        for head in grid.heads:
+            table.add_column(head, no_wrap=True)
+        stacked = len(grid.columns) > WIDE
+        for column in grid.columns:
+            table.add_column(column.replace(") ", ")\n"), justify="right")
+        table.caption = "PSNR in dB: ours" + (
+            ", the paper's below" if stacked else " | the paper's"
+        )
+        before = None
+        for line in grid.lines:
+            if before and line.heads[0] != before.heads[0]:
+                table.add_section()
+            pairs = [_shown(pair, stacked) for pair in line.pairs]
+            heads = line.shown_heads(before)[:-1]
+            table.add_row(*heads, line.heads[-1], *pairs, style="bold" if line.mean else "")
+            before = line
+        yield table
+
+
+def _shown(pair: Pair, stacked: bool) -> Text:
+    text = Text(_db(pair.ours))
+    if pair.paper is not None:
+        text.append("\n" if stacked else " | ", style="dim")
+        text.append(_db(pair.paper), style="dim")
+    return text
+
+
+def _db(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _findings_table(findings: Sequence[Finding]) -> Table:
+    """Return the findings: verdict, by how much and in how many scenes, and in the paper."""
+    table = Table(title="The paper's findings on these light fields, by TV-Dict", box=SIMPLE_HEAD)
+    table.title_justify = table.caption_justify = "left"
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("dB: mean (range), scenes", no_wrap=True)
+    table.add_column("paper", justify="right", no_wrap=True)
+    table.add_column("finding")
+    missing = 0
+    for finding in findings:
+        spread, printed = finding.spread, finding.printed
+        if spread is None:
+            missing += 1
+            continue
+        method = finding.claim.by_method
+        by_method = "" if method == "tv-dict" else f" [dim](by {METHOD_TITLES[method]})[/]"
+        table.add_row(
+            Text(finding.verdict, style=COLOURS[finding.verdict]),
+            f"{spread}, {spread.holding}/{spread.scenes}",
+            "-" if printed is None else f"{printed.mean_db:+.2f}",
+            finding.claim.says + by_method,
+        )
+    if missing:
+        table.caption = f"{missing} findings need tables that were not asked for"
+    return table
+
 
 CSV, PAGE, DRAWN, DICTIONARIES = "tables.csv", "tables.html", "figures", "dictionaries"
 COLUMNS = (
@@ -69,7 +190,7 @@ def run_tables(
         results = sweep.measure(watcher)
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)
-        findings = judge(results, library.names)
+        findings = findings_from(results, library.names)
         outcome = TablesOutcome(found, findings, folder / PAGE, clock() - started)
         more = {
             **{f"Scene {name}": spec for name, spec in library.specs.items()},
@@ -129,23 +250,21 @@ def _metrics(sweep: TablesSweep, dictionaries: Sequence[str], outcome: TablesOut
 
 
 def _described_finding(finding: Finding) -> dict[str, object]:
-    judged = finding.judged
-    spread = (
-        {}
-        if judged is None
-        else {
-            "by_db": judged.mean_db,
-            "lowest_scene_db": judged.low_db,
-            "highest_scene_db": judged.high_db,
-            "scenes": judged.scenes,
-            "scenes_holding": judged.holding,
+    figures = {}
+    if finding.spread is not None:
+        spread = finding.spread
+        figures = {
+            "by_db": spread.mean_db,
+            "lowest_scene_db": spread.low_db,
+            "highest_scene_db": spread.high_db,
+            "scenes": spread.scenes,
+            "scenes_holding": spread.holding,
         }
-    )
     return {
         "name": finding.claim.name,
         "says": finding.claim.says,
         "verdict": finding.verdict,
-        **spread,
+        **figures,
         "paper_db": None if finding.printed is None else finding.printed.mean_db,
     }
 

@@ -8,14 +8,54 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import build_imaging_matrix, pixel_light
+from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.tables.cells import Capture
-from emmc_rig.study.tables.demosaic import demosaiced_rggb
+
+_GREEN = np.array(
+    [[0, 0, -2, 0, 0], [0, 0, 4, 0, 0], [-2, 4, 8, 4, -2], [0, 0, 4, 0, 0], [0, 0, -2, 0, 0]]
+)
+_ALONG_ROW = np.array(
+    [[0, 0, 1, 0, 0], [0, -2, 0, -2, 0], [-2, 8, 10, 8, -2], [0, -2, 0, -2, 0], [0, 0, 1, 0, 0]]
+)
+_ACROSS = np.array(
+    [[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]]
+)
+
+
+def demosaiced_rggb(frame: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return (colour, y, x) of a frame (y, x) whose first pixel is red, the next one green."""
+    frame = np.asarray(frame, dtype=np.float32)
+
+    def filtered(kernel: NDArray[np.int_]) -> NDArray[np.float32]:
+        weights = (kernel / 16).astype(np.float32)
+        # Reflection about the edge pixel keeps the phase of the Bayer tile.
+        found = cv2.filter2D(frame, -1, weights, borderType=cv2.BORDER_REFLECT_101)
+        return found.astype(np.float32, copy=False)
+
+    green, row, column, across = (
+        filtered(kernel) for kernel in (_GREEN, _ALONG_ROW, _ALONG_ROW.T, _ACROSS)
+    )
+    colours = np.repeat(frame[None], 3, axis=0)
+    red, blue = (slice(0, None, 2),) * 2, (slice(1, None, 2),) * 2
+    beside_red, beside_blue = (red[0], blue[1]), (blue[0], red[1])
+    for place in (red, blue):
+        colours[(1, *place)] = green[place]
+    for colour, own, other, own_row, other_row in (
+        (0, red, blue, beside_red, beside_blue),
+        (2, blue, red, beside_blue, beside_red),
+    ):
+        colours[(colour, *own_row)] = row[own_row]
+        colours[(colour, *other_row)] = column[other_row]
+        colours[(colour, *other)] = across[other]
+        colours[(colour, *own)] = frame[own]
+    return colours
+
 
 Array = NDArray[np.floating]
 
@@ -56,20 +96,14 @@ class Sensors:
 
         The noise depends on the seed and the scene's name only, not on what was taken before.
         """
-        camera = capture.camera()
         size = light_field.shape[2], light_field.shape[3]
         psi = self.psi(capture, size)
         clean = psi.forward(light_field)
         frames, usable, sigma = clean, np.ones(clean.shape, dtype=bool), 0.0
         if capture.noisy:
-            noise = camera.sensor.noise
-            light, exposures_s = pixel_light(camera, size), camera.exposures_s()[:, None, None]
             rng = np.random.default_rng([self._seed, *scene.encode()])
-            frames_dn = noise.expose_dn(clean, exposures_s, light, rng)
-            usable = ~noise.saturated(frames_dn)
-            frames = noise.normalise(frames_dn, exposures_s, light)
-            variance = noise.variance(frames, exposures_s, light)
-            sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
+            found = capture.camera().read_out(clean, rng)
+            frames, usable, sigma = found.readings, found.usable, found.noise_sigma
         quality = psnr_db(frames, clean)
         if capture.demosaiced:
             frames = demosaiced_rggb(frames[0])

@@ -1,0 +1,204 @@
+"""One simulated capture: a scene, a camera, noise and what is wrong with it -> what a method gets.
+
+Frames are made with Psi on the grid of the reconstruction, an inverse crime that `emmc-rig demo`
+avoids; where mask, lens or shots are at fault, the method is given the Psi of the design.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.scenes import Scene, zoomed_scene
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.sweep import NotApplicableError
+from reconstruction.dictionary import Dictionary
+from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.result import Reconstruction
+from simulators.raycaster import World
+from simulators.scenes import SCENES
+
+Array = NDArray[np.floating]
+open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is captured, and by what. scene: see `open_scene`.
+
+    size: rows and columns; None takes all of a measured scene. zoom: a built-in scene is rendered
+    so many times larger, and cut. seed: of the noise, of what is random in a fault, and of a
+    built-in scene.
+    """
+
+    scene: str
+    camera: Camera
+    size: tuple[int, int] | None = None
+    seed: int = 0
+    zoom: int = 1
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the scene is a built-in one, which can be changed."""
+        return self.scene in SCENES
+
+    def need_built_in(self) -> None:
+        """Raise NotApplicableError for a measured scene."""
+        if not self.is_built_in:
+            raise NotApplicableError("built-in scenes only: what was measured cannot be changed so")
+
+    def scene_seen(
+        self, views: tuple[int, int] | None = None, change: Callable[[World], World] | None = None
+    ) -> Scene:
+        """Return the scene in the camera's views, or in others; changed, if it is a built-in one.
+
+        Raises what `zoomed_scene` does.
+        """
+        views = views or self.camera.views
+        if change is None:
+            return _opened(self.scene, self.size, views, self.seed, self.zoom)
+        return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
+
+    def with_camera(self, **changed: object) -> Setup:
+        """Return the setup with some fields of the camera replaced."""
+        return dataclasses.replace(self, camera=self.camera.model_copy(update=changed))
+
+
+@lru_cache(maxsize=4)
+def _opened(
+    spec: str, size: tuple[int, int] | None, views: tuple[int, int], seed: int, zoom: int
+) -> Scene:
+    return zoomed_scene(spec, size, views, seed, zoom)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a method gets, and the truth.
+
+    psi, readings, noise_sigma, usable: the method's inputs; `psi` is the assumed one. true_psi: the
+    one that made the readings. truth: (v, u, y, x, c); disparity_px: (y, x), None where it is not
+    known. peak: of the PSNR; below 1 where the scene has less contrast to show.
+    """
+
+    psi: ImagingMatrix
+    readings: NDArray[np.float32]
+    noise_sigma: float
+    usable: NDArray[np.bool_]
+    truth: Array
+    disparity_px: Array | None
+    true_psi: ImagingMatrix
+    peak: float = 1.0
+
+    @property
+    def even(self) -> Array:
+        """A picture of the scene's mean colour, a lower bound for any method."""
+        return np.broadcast_to(self.truth.mean(axis=(0, 1, 2, 3)), self.truth.shape)
+
+    def dictionary(self, method: str, spec: str | None = None) -> Dictionary | None:
+        """Return the dictionary of a method that needs one; spec: what `open_dictionary` takes."""
+        if not METHODS[method].needs_dictionary:
+            return None
+        return open_dictionary_once(spec, self.psi.light_field_shape[:2], self.psi.binning)
+
+    def solved(
+        self, method: str, settings: MethodSettings | None = None, dictionary: str | None = None
+    ) -> Reconstruction:
+        """Return a method's reconstruction; raises what it does."""
+        atoms = self.dictionary(method, dictionary)
+        return reconstruct(
+            method, self.psi, self.readings, self.noise_sigma, atoms, settings, self.usable
+        )
+
+    def psnr_db(self, light_field: Array) -> float:
+        """Return the PSNR of a light field against the truth."""
+        return psnr_db(light_field, self.truth) + 20 * math.log10(self.peak)
+
+
+def trial_of(
+    setup: Setup,
+    *,
+    scene: Scene | None = None,
+    true_psi: ImagingMatrix | None = None,
+    shot_scenes: list[Array] | None = None,
+    change_clean: Callable[[Array], Array] | None = None,
+    unusable: NDArray[np.bool_] | None = None,
+    white_noise: float | None = None,
+) -> Trial:
+    """Return the trial of a setup; the method assumes the Psi of its camera.
+
+    scene: instead of the setup's. true_psi: makes the readings, instead of the assumed one.
+    shot_scenes: the light field before each shot, where it changes. change_clean: what becomes of
+    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels marked as such. white_noise:
+    deviation of the readings' noise, instead of the sensor's.
+    """
+    scene = scene or setup.scene_seen()
+    truth = scene.light_field
+    size = (truth.shape[2], truth.shape[3])
+    psi = build_imaging_matrix(setup.camera, size)
+    real = true_psi or psi
+    if shot_scenes is None:
+        clean = real.forward(truth)
+    else:
+        clean = np.stack([real.forward(seen)[shot] for shot, seen in enumerate(shot_scenes)])
+    if change_clean is not None:
+        clean = change_clean(clean)
+    if white_noise is not None:
+        noise = np.random.default_rng(setup.seed).normal(0, white_noise, clean.shape)
+        every, readings = np.ones(clean.shape, bool), (clean + noise).astype(np.float32)
+        return Trial(psi, readings, white_noise, every, truth, scene.disparity_px, real)
+    # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
+    clean = np.maximum(clean, 0)
+    shots = setup.camera.read_out(clean, setup.seed)
+    usable = shots.usable if unusable is None else shots.usable & ~unusable
+    return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
+
+
+SEVERAL = 3
+"""Shots that a camera is given where a fault needs several."""
+
+
+SENSOR, MASK, SHOTS = "Light and sensor", "Mask and lens", "Between shots"
+SCENE, DESIGN = "Scene", "Design"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One way to fail.
+
+    strengths: from harmless to hopeless, in `unit`; a sweep is judged on both sides of its best,
+    as a design has two ends. quick: those that `--fast` measures. repairable: whether better
+    calibration, detection or repair could undo it, rather than physics or the design setting the
+    limit. screened: whether screening the frames is meant to help. shots: fewest that it takes.
+    whole: whether there is nothing between two strengths. clean: whether strength 0 is no fault.
+    """
+
+    name: str
+    title: str
+    unit: str
+    strengths: tuple[float, ...]
+    quick: tuple[float, ...]
+    kind: str
+    make: Callable[[Setup, float], Trial]
+    repairable: bool = False
+    screened: bool = False
+    shots: int = 1
+    whole: bool = False
+    clean: bool = True
+
+    def is_clean(self, strength: float) -> bool:
+        """Whether nothing is wrong at a strength: the trial is then that of any other fault."""
+        return self.clean and strength == 0
+
+    @property
+    def explained(self) -> str:
+        """What happens, in one sentence."""
+        return (self.make.__doc__ or "").strip().partition("\n")[0]
