@@ -1,12 +1,14 @@
 """`emmc-rig calibrate`: what it writes, what it says, and what it refuses."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 import yaml
 
+import emmc_rig as emmc
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
@@ -22,6 +24,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent
 from emmc_rig.study.checks.check_sweep import CHECKS, run_checks
+from emmc_rig.study.checks.effects import psnr_cost_db
 from emmc_rig.study.checks.rows import target_row
 from emmc_rig.study.checks.scenes import moved_truth
 
@@ -141,7 +144,8 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
     assert {row["verdict"] for row in metrics["rows"]} == {"met"}
     if effect == "together":
         found = " ".join(metrics["details"][effect]["findings"])
-        for named in ("tilted", "bowed", "glass", "lamp drifted", "response loses", "uneven",
+        # Glass displaces single views, as 256 grainy rays do: it is fitted, but not told apart.
+        for named in ("tilted", "bowed", "lamp drifted", "response loses", "uneven",
                       "colour filters"):  # fmt: skip
             assert named in found
 
@@ -210,6 +214,17 @@ def test_the_error_of_psi_leaves_bad_pixels_out_and_counts_colours_not_stored(co
     assert true_error(other, true, good) == 0
     leaking = true + 0.1 * true.sum(axis=4, keepdims=True)
     assert true_error(psi, leaking, good) > 0.1
+
+
+def test_the_cost_of_a_psi_is_nothing_for_the_true_one_and_decibels_for_one_that_is_off(coded_psi):
+    psi = coded_psi(binning=1, size=(24, 32))
+    scene = emmc.scene("near-planar", size=(24, 32), views=psi.light_field_shape[:2]).light_field
+    readings = psi @ scene
+    true, usable = in_three_colours(psi.weights, psi), np.ones(readings.shape, dtype=bool)
+    # The other colours are 0 in the truth: the same matrix, stored otherwise.
+    assert abs(psnr_cost_db(psi, true, readings, 1e-3, usable, scene)) < 0.01
+    moved = replace(psi, weights=np.roll(psi.weights, 2, axis=-1))
+    assert psnr_cost_db(moved, true, readings, 1e-3, usable, scene) > 1
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import pytest
 
 from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
-from calibration.defects import find_defects
+from calibration.defects import View, find_defects, loss_variance, mask_with_losses
 from calibration.errors import CalibrationError
 from calibration.fit import FitSettings, fit_placement
 from calibration.openings import CENTRED, parts, views_open
-from calibration.parametric import expected_psi_error, psi_at, shot_stages
+from calibration.parametric import expected_psi_error, psi_at, psi_deviation, shot_stages
 from calibration.placement import SCALARS, designed_placement, labels
 from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
@@ -263,6 +263,49 @@ def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
     )
     assert enough.undecided == ()
     assert enough.more_boards == 0
+
+
+def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(design, monkeypatch):
+    shadow = Shadow(shadow_mask(CAMERA, SIZE), designed_placement(CAMERA))
+    covariance = np.diag(np.full(len(shadow.placement.vector()), 1e-4))
+    found = []
+    for pixels in (2**16, 130):
+        monkeypatch.setattr("calibration.parametric.BAND_PIXELS", pixels)
+        found.append(psi_deviation(shadow, design.layout, shot_stages(CAMERA), covariance))
+    assert found[0].min() > 0
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(design):
+    truth = replace(designed_placement(CAMERA), blur_um=3.0)
+    mask = shadow_mask(CAMERA, SIZE)
+    middle = np.array(mask.cells.shape[1:3]) // 2
+    lost = np.zeros((2 * mask.cells.shape[1], 2 * mask.cells.shape[2]))
+    lost[2 * middle[0] : 2 * middle[0] + 2, 2 * middle[1] : 2 * middle[1] + 2] = 0.5
+    boards, soiled = synthetic(design, truth, 0.005), mask_with_losses(mask, truth, lost)
+    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
+    for i, board in enumerate(boards):
+        args = pixels, board.channels.ravel(), board.views_open, board.stage_um, board.shot
+        taken = Shadow(mask, truth).readings(*args) - Shadow(soiled, truth).readings(*args)
+        boards[i] = replace(board, reading=(board.reading - taken.reshape(SIZE)).astype(np.float32))
+    found = find_defects(boards, mask, truth)
+    assert found.count > 0
+    seen = View(np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0)
+    channels = design.colour[0].ravel()
+    variance = loss_variance(found, mask, truth, pixels, channels, seen)
+    grains = np.flatnonzero(found.lost)
+    dense = found.covariance[grains][:, grains].toarray()
+    root = np.linalg.cholesky(dense + 1e-12 * np.trace(dense) * np.eye(len(grains)))
+    rng, spread = np.random.default_rng(0), []
+    for _ in range(200):
+        drawn = np.zeros(found.lost.size)
+        drawn[grains] = root @ rng.standard_normal(len(grains))
+        other = mask_with_losses(mask, truth, drawn.reshape(found.lost.shape))
+        spread.append(Shadow(other, truth).readings(pixels, channels, seen.views_open))
+    touched = variance > 0.1 * variance.max()
+    ratio = np.var(spread, axis=0)[touched] / variance[touched]
+    # 200 draws tell a variance to 10 %.
+    assert ratio.mean() == pytest.approx(1, abs=0.25)
 
 
 def test_no_defects_are_found_on_a_clean_mask(design):

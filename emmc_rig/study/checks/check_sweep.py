@@ -32,7 +32,6 @@ from emmc_rig.study.sweep import Results, Sweep, machine, sweep_folder
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "psi": check_psi,
     "few": check_few,
-    "session": check_session,
     "bound": check_bound,
     "plan": check_plan,
     "sensor": check_sensor,
@@ -42,6 +41,7 @@ CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "drift": check_drift,
     "alarms": check_alarms,
     "large": check_large,
+    "session": check_session,
 }
 EFFECTS = "effects"
 COMMAND = "calibrate --check"
