@@ -15,6 +15,7 @@ from emmc_rig.commands.demo import demo
 from emmc_rig.commands.design import design
 from emmc_rig.commands.devices import app as devices
 from emmc_rig.commands.export import export
+from emmc_rig.commands.figure import figure
 from emmc_rig.commands.live import live
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
@@ -39,8 +40,8 @@ app = typer.Typer(
 app.add_typer(devices, name="devices")
 app.add_typer(session, name="session")
 for command in (
-    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, chart, train, tables,
-    stability, design,
+    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart, train,
+    tables, stability, design,
 ):  # fmt: skip
     app.command()(command)
 

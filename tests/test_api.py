@@ -25,7 +25,7 @@ psi = camera.psi(scene.size)
 frames = psi @ scene                      # or camera.expose(scene, seed=0), with noise
 result = emmc.reconstruct(psi, frames)    # the default method
 result.light_field, result.sigma, result.disparity, result.verdict
-result.show()                             # matplotlib figure; _repr_html_ in notebooks
+result.show()  # result.figure(other, truth=scene) for papers; _repr_html_ in notebooks
 rig = emmc.rig("simulated"); emmc.capture("plan.yaml", rig); emmc.calibrate("plan-session")
 """
 PLAN = {

@@ -49,6 +49,7 @@ WRITERS = {
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
+    "figure": ("scene.h5",),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "reconstruct --tile": (8, "frames"),

@@ -16,7 +16,7 @@ from programs import program
 from emmc_rig.capture.assessment import assessed, stated_psnr_db
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.until import Until
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
@@ -218,7 +218,7 @@ def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_pa
     rig = still_rig(SIZE)
     session = Session(copy)
 
-    class Impatient(Unwatched):
+    class Impatient(CaptureWatcher):
         def tell(self, message):
             if "reconstructing" in message:
                 raise KeyboardInterrupt

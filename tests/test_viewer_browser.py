@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from browsers import MARKS, complaints, open_browser
 
+from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, photograph
-from emmc_rig.pages.viewer import ViewerContent, write_viewer
+from emmc_rig.pages.viewer import render_viewer
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.webdriver.common.action_chains import ActionChains
@@ -34,17 +35,17 @@ def written(tmp_path_factory):
     rng = np.random.default_rng(2)
     noisy = np.clip(scene.light_field + rng.normal(0, 0.03, scene.light_field.shape), 0, 1)
     path = tmp_path_factory.mktemp("viewer") / "viewer.html"
-    content = ViewerContent(
+    content = Export(
         title="Browser <test>",
+        caption="",
         light_field=noisy.astype(np.float32),
         truth=scene.light_field,
         disparity=scene.disparity_px,
         sigma=np.full(scene.light_field.shape[:4], 0.03, np.float32),
         model=rng.integers(0, 5, scene.size),
         misfit=np.ones(scene.size, np.float32),
-        lossless=True,
     )
-    write_viewer(path, content)
+    path.write_text(render_viewer(content, lossless=True), encoding="utf-8")
     return path
 
 

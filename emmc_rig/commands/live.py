@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -54,13 +53,20 @@ def live(
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
     """Show the camera on a local page: levels, focus, mask, jog, light field. Ctrl-C ends."""
-    from emmc_rig.live.server import LOCAL_HOSTS, application, new_token
+    from emmc_rig.live.server import (
+        LOCAL_HOSTS,
+        Server,
+        application,
+        listening_socket,
+        new_token,
+    )
+    from emmc_rig.live.setup_page import SetupPage
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
     if method is not None and psi is None:
         raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
-    listening = _listen(host, port)
+    listening = listening_socket(host, port)
     with closing(listening), _watch(rig, camera, stage, design, scene, size, psi, method) as watch:
         token = new_token()
         number = listening.getsockname()[1]
@@ -79,18 +85,11 @@ def live(
             import webbrowser
 
             webbrowser.open(address)
-        _serve(application(watch, token, read_only, hosts), listening, watch.start)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as fault:
-        why = getattr(fault, "strerror", None) or str(fault)
-        raise AppError(
-            f"cannot serve at {host} port {port} ({why}): choose another --port or --host"
-        ) from fault
+        watch.start()
+        try:
+            Server(application(SetupPage(watch), token, read_only, hosts)).run(sockets=[listening])
+        except KeyboardInterrupt:
+            typer.echo("ended; the stage stands")
 
 
 @contextmanager
@@ -177,22 +176,3 @@ def _light_field(
 
 def _nobody(what: str) -> None:
     """Ask for nothing: a page that only shows and jogs needs no lamp changed."""
-
-
-def _serve(app: object, listening: socket.socket, begin: Callable[[], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, which are how it is meant to end."""
-    import uvicorn
-
-    config = uvicorn.Config(
-        app,  # pyright: ignore[reportArgumentType]
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        server_header=False,
-        timeout_graceful_shutdown=1,
-    )
-    begin()
-    try:
-        uvicorn.Server(config).run(sockets=[listening])
-    except KeyboardInterrupt:
-        typer.echo("ended; the stage stands")

@@ -36,10 +36,11 @@ def open_export(spec: str, truth: str | None = None) -> Export:
             raise AppError(f"{spec}: not reconstructed yet; run: emmc-rig reconstruct {spec}")
     if (folder / LIGHT_FIELD).is_file():
         light_field, maps = load_hdf5(folder / LIGHT_FIELD), read_maps(folder)
-        caption = _caption(folder)
+        metrics = _metrics(folder)
+        caption = _caption(metrics)
     else:
         scene = open_scene(spec)
-        light_field, caption = scene.light_field, scene.provenance
+        light_field, caption, metrics = scene.light_field, scene.provenance, {}
         maps = {} if scene.disparity_px is None else {"disparity": scene.disparity_px}
     true = None
     if truth is not None:
@@ -48,7 +49,7 @@ def open_export(spec: str, truth: str | None = None) -> Export:
             raise SceneError(f"{truth}: shape {true.shape}, but {spec} has {light_field.shape}")
     fitting = {name: one for name, one in maps.items() if _fits(one, light_field.shape)}
     return Export(
-        folder.resolve().name, caption, light_field, true, **{
+        folder.resolve().name, caption, light_field, true, metrics=metrics, **{
             name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")
         },
     )  # fmt: skip
@@ -73,12 +74,19 @@ def _fits(values: NDArray, shape: tuple[int, ...]) -> bool:
     return values.shape in (shape[2:4], shape[:4])
 
 
-def _caption(folder: Path) -> str:
-    """Return what metrics.json says of a result, in one line."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
-        told = [f"reconstructed by {metrics['method']}"]
-        if isinstance(metrics.get("psnr_db"), float):
-            told.append(f"{metrics['psnr_db']:.2f} dB against the truth")
-        return "; ".join([*told, f"verdict: {metrics['verdict']['level']}"])
-    return "a reconstructed light field"
+def _metrics(folder: Path) -> dict[str, object]:
+    """Return metrics.json of a result; empty where it cannot be read."""
+    with suppress(OSError, ValueError):
+        known = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+        if isinstance(known, dict):
+            return known
+    return {}
+
+
+def _caption(metrics: Mapping[str, object]) -> str:
+    parts = [f"reconstructed by {metrics.get('method', 'an unknown method')}"]
+    if isinstance(psnr := metrics.get("psnr_db"), float):
+        parts.append(f"{psnr:.2f} dB against the truth")
+    if isinstance(verdict := metrics.get("verdict"), Mapping):
+        parts.append(f"verdict: {verdict.get('level')}")
+    return "; ".join(parts)

@@ -1,4 +1,4 @@
-"""Small pictures of a light field for figures: two views and two epipolar images."""
+"""Small pictures of a light field for figures: views, epipolar images, pieces to enlarge."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +44,19 @@ class Pictures:
             return None
 
 
+@dataclass(frozen=True)
+class Piece:
+    """A square of a picture to enlarge."""
+
+    y: int
+    x: int
+    side: int
+
+    def of(self, picture: NDArray) -> NDArray:
+        """Cut it out of (y, x, c)."""
+        return picture[self.y : self.y + self.side, self.x : self.x + self.side]
+
+
 def epipolar_lines(truth: Array) -> tuple[int, int]:
     """Return the row and the column (y, x) along which the outer views differ most.
 
@@ -57,6 +71,31 @@ def epipolar_lines(truth: Array) -> tuple[int, int]:
         )
         found.append(int(inner.argmax()) + difference.shape[axis] // 5)
     return found[0], found[1]
+
+
+def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
+    """Return the squares of a picture (y, x, c) with most edges and colour, away from each other.
+
+    They lie inside the border, which has no neighbours in other views.
+    """
+    height, width = picture.shape[:2]
+    side = min(side, height, width)
+    grey = picture.mean(axis=-1, dtype=np.float32)
+    slope_y, slope_x = np.gradient(grey)
+    spread = np.abs(picture - grey[..., None]).mean(axis=-1)
+    interest = np.minimum(np.hypot(slope_y, slope_x), 0.2) + 0.5 * np.abs(np.gradient(spread)[0])
+    sums = cv2.boxFilter(interest.astype(np.float32), -1, (side, side), anchor=(0, 0))
+    sums = sums[: height - side + 1, : width - side + 1].copy()
+    border = [min((length - side) // 2, length // 12) for length in (height, width)]
+    inside = np.zeros(sums.shape, dtype=bool)
+    inside[border[0] : height - side + 1 - border[0], border[1] : width - side + 1 - border[1]] = 1
+    sums[~inside] = -1
+    found = []
+    for _ in range(count):
+        y, x = np.unravel_index(int(sums.argmax()), sums.shape)
+        found.append(Piece(int(y), int(x), side))
+        sums[max(0, y - side) : y + side, max(0, x - side) : x + side] = -1
+    return found
 
 
 def pictures_of(light_field: Array, lines: tuple[int, int]) -> Pictures:

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from emmc_rig.files.formats import Export
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.display import (
     HEAT,
@@ -29,7 +30,7 @@ from emmc_rig.pages.display import (
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import Card, data_address, fragment
 from emmc_rig.pages.psi_panels import psi_panels
-from emmc_rig.pages.viewer import ViewerContent, viewer_data
+from emmc_rig.pages.viewer import viewer_data
 
 Array = NDArray[np.floating]
 ERROR_JPEG_QUALITY = 72  # an error map is mostly noise, and noise is what costs bytes
@@ -43,7 +44,7 @@ class ReportContent:
     psi and psi_std (v, u, y, x), the weights of shot 0; cfa_tile (y, x, rgb), the colour each
     pixel of the tile lets through. Under a sensor that bins, frames are smaller than views.
     disparity_range_px is in pixels per view step; None where it is not known. maps: what is laid
-    over the picture in the viewer, by name, see `ViewerContent`.
+    over the picture in the viewer, by name, see `Export`.
     """
 
     title: str
@@ -100,6 +101,12 @@ def render(content: ReportContent) -> str:
     rows, columns, height, width, _ = content.estimate.shape
     shown = reduced(content.estimate)
     frames = finite(content.frames)
+    disparity, sigma, model, misfit = (
+        content.maps.get(name) for name in ("disparity", "sigma", "model", "misfit")
+    )
+    export = Export(
+        content.title, "", content.estimate, content.truth, disparity, sigma, model, misfit
+    )
     return fragment(
         "report.html",
         title=content.title,
@@ -132,22 +139,9 @@ def render(content: ReportContent) -> str:
         provenance=_provenance(content),
         data={
             "data": _page_data(content, shown, curve, errors),
-            "viewer-data": viewer_data(_viewer_content(content), atlases=False),
+            "viewer-data": viewer_data(export, atlases=False),
         },
         scripts=("viewer.js", "report.js"),
-    )
-
-
-def _viewer_content(content: ReportContent) -> ViewerContent:
-    maps = content.maps
-    return ViewerContent(
-        content.title,
-        content.estimate,
-        truth=content.truth,
-        disparity=maps.get("disparity"),
-        sigma=maps.get("sigma"),
-        model=maps.get("model"),
-        misfit=maps.get("misfit"),
     )
 
 

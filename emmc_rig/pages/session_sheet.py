@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 
 from drivers.errors import DriverError
+from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
@@ -178,19 +179,27 @@ def _picture(session: Session, planned: PlannedFrame) -> dict[str, object]:
     if entry is None:
         return {"id": planned.id, "why": "not captured"}
     try:
-        return {**entry, "why": "", "picture": _jpeg(session, planned, entry)}
+        return {
+            **entry,
+            "why": "",
+            "picture": data_address(stored_jpeg(session, planned.id), ".jpg"),
+        }
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
 
-def _jpeg(session: Session, planned: PlannedFrame, entry: Entry) -> str:
-    frame = decode_frame(session.read(planned.id), entry)
+def stored_jpeg(session: Session, name: str) -> bytes:
+    """Return a small picture of a stored frame; raises AppError or a `DriverError`."""
+    return small_jpeg(decode_frame(session.read(name), session.stored[name]))
+
+
+def small_jpeg(frame: RawFrame) -> bytes:
+    """Return a small picture of a frame, of whole colour tiles evenly spread over it."""
     picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)))
     scale = LONGEST_PX / max(picture.shape[:2])
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    return data_address(data.tobytes(), ".jpg")
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def _timeline(session: Session) -> str:

@@ -11,7 +11,7 @@ views themselves by canvas.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -69,44 +69,22 @@ class Overlay:
     names: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class ViewerContent:
-    """What the viewer shows: light fields (v, u, y, x, c), linear, and maps (y, x) of the centre.
-
-    caption: one line under the title. disparity: pixels per view step; estimated where None.
-    sigma: standard deviation (v, u, y, x). model: indices of MODEL_NAMES. misfit: readings missed,
-    in deviations of their noise. lossless: pictures as PNG, for comparisons to the last code.
-    """
-
-    title: str
-    light_field: Array
-    caption: str = ""
-    truth: Array | None = None
-    disparity: Array | None = None
-    sigma: Array | None = None
-    model: NDArray | None = None
-    misfit: Array | None = None
-    lossless: bool = field(default=False)
-
-
-def write_viewer(path: str | Path, content: ViewerContent) -> None:
-    """Write the page, whole or not at all; raises OSError."""
-    write_text(Path(path), render_viewer(content))
-
-
-def render_viewer(content: ViewerContent) -> str:
-    """Return the page as text."""
+def render_viewer(content: Export, lossless: bool = False) -> str:
+    """Return the page as text; lossless: pictures as PNG, for comparisons to the last code."""
     return fragment(
         "viewer_page.html",
         title=content.title,
         about=[content.caption] if content.caption else [],
         caveats=(), sections=(), lead="", styles=("viewer.css",), scripts=("viewer.js",),
-        data={"viewer-data": viewer_data(content)},
+        data={"viewer-data": viewer_data(content, lossless=lossless)},
     )  # fmt: skip
 
 
-def viewer_data(content: ViewerContent, atlases: bool = True) -> dict[str, object]:
-    """Return what viewer.js reads; without atlases it takes those of the report it is part of."""
+def viewer_data(content: Export, atlases: bool = True, lossless: bool = False) -> dict[str, object]:
+    """Return what viewer.js reads; without atlases it takes those of the report it is part of.
+
+    Disparity is estimated where the light field comes without.
+    """
     shown = reduced(content.light_field)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
@@ -126,14 +104,14 @@ def viewer_data(content: ViewerContent, atlases: bool = True) -> dict[str, objec
         "scale": shrink,
         "tile": TILE_MULTIPLE_PX,
         "gamma": curve.gamma,
-        **(_atlases(curve, shown, content) if atlases else {}),
+        **(_atlases(curve, shown, content, lossless) if atlases else {}),
         "disparity": {"atlas": _grey_atlas(codes), "low": low, "high": low + span},
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
         "overlays": [_overlay(one, shown) for one in overlays_of(content)],
     }
 
 
-def overlays_of(content: ViewerContent) -> list[Overlay]:
+def overlays_of(content: Export) -> list[Overlay]:
     """Return the maps that there are, ready to be drawn."""
     found = []
     rows, columns = content.light_field.shape[:2]
@@ -182,11 +160,13 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _atlases(curve: DisplayCurve, shown: Array, content: ViewerContent) -> dict[str, str | None]:
+def _atlases(
+    curve: DisplayCurve, shown: Array, content: Export, lossless: bool
+) -> dict[str, str | None]:
     truth = None if content.truth is None else reduced(content.truth)
     return {
-        "estimate": _atlas(curve, shown, content.lossless),
-        "truth": None if truth is None else _atlas(curve, truth, content.lossless),
+        "estimate": _atlas(curve, shown, lossless),
+        "truth": None if truth is None else _atlas(curve, truth, lossless),
     }
 
 
@@ -216,11 +196,7 @@ def _tiled(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _write(folder: Path, export: Export) -> None:
-    content = ViewerContent(
-        export.title, export.light_field, export.caption, export.truth, export.disparity,
-        export.sigma, export.model, export.misfit,
-    )  # fmt: skip
-    write_viewer(folder / "viewer.html", content)
+    write_text(folder / "viewer.html", render_viewer(export))
 
 
 VIEWER = Format(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.files.exports import LIGHT_FIELD, save_maps
 from emmc_rig.files.folders import result_folder
+from emmc_rig.files.formats import Export
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import (
@@ -25,7 +26,8 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.viewer import ViewerContent, render_viewer
+from emmc_rig.pages.result_figure import FigureSettings, draw_results
+from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.missed import missed_readings
 from reconstruction.verdict.rules import Verdict
@@ -165,17 +167,24 @@ class Result:
         save_maps(folder, {**self.maps, "misfit": self.misfit})
         write_metrics(folder, metrics)
 
-    def show(self) -> Figure:
-        """Draw centre view, epipolar image, disparity and deviation; return the figure.
+    def figure(
+        self,
+        *others: Result,
+        truth: ArrayLike | None = None,
+        settings: FigureSettings | None = None,
+    ) -> Figure:
+        """Draw view, close-ups, epipolar image, error and maps, beside other results' of one scene.
 
-        Opens a window where matplotlib has one; notebooks show the figure themselves.
+        truth: the true light field (v, u, y, x, c). settings: what is shown of each.
         """
+        results = [self._export(truth), *(one._export() for one in others)]
+        return draw_results(results, settings).figure
+
+    def show(self) -> Figure:
+        """Return `figure()`, in a window where matplotlib has one; notebooks show it themselves."""
         from matplotlib import pyplot
 
-        from emmc_rig.pages.result_figure import draw_result
-
-        figure = pyplot.figure(layout="constrained")
-        draw_result(figure, self.light_field, self.disparity, self.sigma)
+        figure = draw_results([self._export()], figure=pyplot.figure()).figure
         if getattr(type(figure.canvas), "required_interactive_framework", None):
             pyplot.show()
         return figure
@@ -192,12 +201,13 @@ class Result:
 
         truth: the true light field, to wipe against.
         """
-        return render_viewer(
-            ViewerContent(
-                self.method, self.light_field, self.verdict.words,
-                None if truth is None else np.asarray(truth),
-                self.disparity, self.sigma, self.maps.get("model"), self.misfit,
-            )
+        return render_viewer(self._export(truth))
+
+    def _export(self, truth: ArrayLike | None = None) -> Export:
+        return Export(
+            self.method, self.verdict.words, self.light_field,
+            None if truth is None else np.asarray(truth), self.disparity, self.sigma,
+            self.maps.get("model"), self.misfit, self.metrics(),
         )  # fmt: skip
 
     @cached_property

@@ -24,7 +24,7 @@ from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.capture.assessment import METHOD, Assessment, assessed
 from emmc_rig.capture.command import Wish, run_capture
 from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
@@ -125,7 +125,7 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
     described = rig_description(SIMULATED, rig)
     wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
     with held(folder):
-        taken = run_capture(wish, Unwatched(), _nobody)
+        taken = run_capture(wish, CaptureWatcher(), _nobody)
     assert taken is not None
     session, outcome = taken
     if not outcome.complete:

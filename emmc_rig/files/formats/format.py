@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +22,9 @@ class Export:
     """What is written: a light field (v, u, y, x, c), linear, in [0, 1], and its maps if any.
 
     disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
-    (v, u, y, x). model, misfit: (y, x), see `emmc_rig.pages.viewer`. truth: as light_field.
+    (v, u, y, x). model: (y, x), indices of `emmc_rig.pages.viewer.MODEL_NAMES`. misfit: (y, x),
+    readings missed, in deviations of their noise. truth: as light_field. caption: one line.
+    metrics: what metrics.json says of a result.
     """
 
     title: str
@@ -33,6 +35,7 @@ class Export:
     sigma: Array | None = None
     model: NDArray | None = None
     misfit: Array | None = None
+    metrics: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import http.client
 import json
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import uvicorn
 from numpy.typing import NDArray
 
 from drivers.clock import SYSTEM_CLOCK
@@ -30,7 +28,8 @@ from drivers.raw import RawFrame
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.scale import designed_scale
-from emmc_rig.live.server import application, new_token
+from emmc_rig.live.server import application, new_token, served
+from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
@@ -125,17 +124,12 @@ class StoppingStage(StillStage):
 @contextmanager
 def _served(watch: Watch) -> Iterator[tuple[int, str]]:
     """Serve a page; yield its port and the path that begins with its token."""
-    token, listening = new_token(), socket.create_server(("127.0.0.1", 0))
-    config = uvicorn.Config(application(watch, token), log_level="warning", lifespan="off")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    token = new_token()
     watch.start()
-    thread.start()
     try:
-        yield listening.getsockname()[1], f"/{token}"
+        with served(application(SetupPage(watch), token)) as port:
+            yield port, f"/{token}"
     finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)
         watch.close()
 
 
@@ -145,23 +139,23 @@ def _client(call: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
 
 
-def _poll(port: int, path: str, clients: int) -> None:
-    """Ask for the state again and again, as so many pages do, until ended; say when all do."""
+def _look(port: int, path: str, clients: int) -> None:
+    """Follow the state as so many pages do, until ended; say when all do."""
     begun = threading.Barrier(clients + 1)
 
     def one() -> None:
-        link, version = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S), 0
-        while True:
-            link.request("GET", f"{path}/state?after={version}")
-            if version == 0:
-                begun.wait()
-            version = json.loads(link.getresponse().read())["version"]
+        link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        link.request("GET", f"{path}/events")
+        answer = link.getresponse()
+        begun.wait()
+        while answer.readline():
+            pass
 
     threads = [threading.Thread(target=one, daemon=True) for _ in range(clients)]
     for thread in threads:
         thread.start()
     begun.wait()
-    print("all ask", flush=True)
+    print("all look", flush=True)
     for thread in threads:
         thread.join()
 
@@ -170,7 +164,7 @@ def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
     """Return how soon the stage receives a stop while so many pages follow a running camera."""
     stage = StoppingStage()
     watch = Watch(memory_camera((480, 640)), stage)
-    with _served(watch) as (port, path), _client(f"_poll({port}, {path!r}, {clients})") as crowd:
+    with _served(watch) as (port, path), _client(f"_look({port}, {path!r}, {clients})") as crowd:
         assert crowd.stdout is not None
         crowd.stdout.readline()
         delays_s = []
@@ -190,19 +184,18 @@ def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
 def _fetch(port: int, path: str, seconds: float) -> None:
     """Follow the page for some seconds as its script does; print pictures per second, bytes."""
     links = [http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S) for _ in range(2)]
-
-    def ask(link: http.client.HTTPConnection, what: str) -> bytes:
-        link.request("GET", f"{path}/{what}")
-        return link.getresponse().read()
-
-    version, frame, pictures, size, started_s = 0, 0, 0, 0, 0.0
+    links[0].request("GET", f"{path}/events")
+    events = links[0].getresponse()
+    frame, pictures, size, started_s = 0, 0, 0, 0.0
     begin_s = time.monotonic() + WARM_UP_S
     while time.monotonic() < begin_s + seconds:
-        state = json.loads(ask(links[0], f"state?after={version}"))
-        version = state["version"]
+        line = events.readline()
+        state = json.loads(line.removeprefix(b"data: ")) if line.strip() else {"frame": frame}
         if state["frame"] == frame:
             continue
-        frame, data = state["frame"], ask(links[1], "picture.jpg?px=1600")
+        frame = state["frame"]
+        links[1].request("GET", f"{path}/picture.jpg?px=1600")
+        data = links[1].getresponse().read()
         if time.monotonic() >= begin_s:
             started_s = started_s or time.monotonic()
             pictures, size = pictures + 1, len(data)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
-from emmc_rig.pages.pictures import Pictures, epipolar_lines, pictures_of
+from emmc_rig.pages.drawing import FAINT, INK, save_publication
+from emmc_rig.pages.pictures import Pictures, Piece, detailed_pieces, epipolar_lines, pictures_of
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (
@@ -34,20 +35,6 @@ Codes = NDArray[np.uint8]
 TILE_PX, GAP_PX, MARGIN_PX, DPI = 400, 8, 16, 100
 TITLE_PX, HEAD_PX, NOTE_PX = 44, 44, 26
 FRAMES = ((255, 176, 0), (0, 190, 255))
-INK, FAINT = "#17202c", "#5b6776"
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A square of a picture to enlarge."""
-
-    y: int
-    x: int
-    side: int
-
-    def of(self, picture: NDArray) -> NDArray:
-        """Cut it out of (y, x, c)."""
-        return picture[self.y : self.y + self.side, self.x : self.x + self.side]
 
 
 @dataclass(frozen=True)
@@ -66,31 +53,6 @@ class Tile:
 def screen(picture: Array, curve: DisplayCurve) -> Codes:
     """Return screen codes (y, x, 3) of a linear picture (y, x, 3) or (y, x)."""
     return curve.encode(picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=-1))
-
-
-def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
-    """Return the squares of a picture (y, x, c) with most edges and colour, away from each other.
-
-    They lie inside the border, which has no neighbours in other views.
-    """
-    height, width = picture.shape[:2]
-    side = min(side, height, width)
-    grey = picture.mean(axis=-1, dtype=np.float32)
-    slope_y, slope_x = np.gradient(grey)
-    spread = np.abs(picture - grey[..., None]).mean(axis=-1)
-    interest = np.minimum(np.hypot(slope_y, slope_x), 0.2) + 0.5 * np.abs(np.gradient(spread)[0])
-    sums = cv2.boxFilter(interest.astype(np.float32), -1, (side, side), anchor=(0, 0))
-    sums = sums[: height - side + 1, : width - side + 1].copy()
-    border = [min((length - side) // 2, length // 12) for length in (height, width)]
-    inside = np.zeros(sums.shape, dtype=bool)
-    inside[border[0] : height - side + 1 - border[0], border[1] : width - side + 1 - border[1]] = 1
-    sums[~inside] = -1
-    found = []
-    for _ in range(count):
-        y, x = np.unravel_index(int(sums.argmax()), sums.shape)
-        found.append(Piece(int(y), int(x), side))
-        sums[max(0, y - side) : y + side, max(0, x - side) : x + side] = -1
-    return found
 
 
 def composed(tile: Tile, width_px: int = TILE_PX) -> Codes:
@@ -129,7 +91,7 @@ def write_mosaic(
     note: str = "",
     tile_px: int = TILE_PX,
 ) -> None:
-    """Write a PNG: rows of tiles, each row under a heading of its own where it has one."""
+    """Write rows of tiles, each row under its heading if any, as PNG and beside it as PDF."""
     columns = max(len(tiles) for _, tiles in rows)
     pictures = [[t and composed(t, tile_px) for t in tiles] for _, tiles in rows]
     heights = [max(p.shape[0] for p in line if p is not None) for line in pictures]
@@ -174,9 +136,9 @@ def write_mosaic(
             axes.set_axis_off()
         y += HEAD_PX + tall + MARGIN_PX
     figure.savefig(path, format="png", dpi=DPI)
+    save_publication(figure, path.with_suffix(".pdf"), f"{title}. {note}")
 
 
-Array = NDArray[np.floating]
 PIECE_SHARE, LEAST_PIECE_PX = 0.16, 28
 EPI_PX, EPI_ROW_PX = 80, 3
 MASK_CELLS = 24

@@ -1,0 +1,57 @@
+"""
+From plan to light field
+========================
+
+The whole bench without a bench: a plan is captured on the simulated rig, whose devices speak the
+real ones' bytes, Psi is measured from its whiteboards, and the light field is reconstructed.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import emmc_rig as emmc
+
+PLAN = """
+camera: rgbw-bayer-1shot
+shots:
+  - exposure_s: 0.05
+whiteboards:
+  views: [[2, 2]]
+  shots: [0]
+  references: 2
+  open:
+    - repeats: 2
+    - held_out: true
+darks:
+  repeats: 2
+"""
+
+work = TemporaryDirectory()
+plan = Path(work.name, "plan.yaml")
+plan.write_text(PLAN)
+rig = emmc.rig("simulated", scene="near-planar", size=(24, 32), rays=256)
+session = emmc.capture(plan, rig)
+session
+
+# %%
+# A capture that was interrupted goes on where it stopped: the same call captures what is missing,
+# here nothing.
+
+print(emmc.capture(plan, rig).is_complete)
+
+# %%
+# Psi is measured; the whiteboard held out says how well:
+
+calibration = emmc.calibrate(session)
+calibration
+
+# %%
+# Frames and Psi of the session are what every method takes:
+
+psi, frames = emmc.open_frames(session.folder)
+result = emmc.reconstruct(psi, frames, "adaptive-fast")
+print(result.verdict.words)
+result.show()
+
+# %%
+work.cleanup()

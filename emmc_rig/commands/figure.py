@@ -1,0 +1,63 @@
+"""The command `emmc-rig figure`: results of one capture side by side, for a paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.commands.options import OutOption
+
+
+def figure(
+    results: Annotated[
+        list[str], typer.Argument(help="folders of `reconstruct` or `demo`, or sessions")
+    ],
+    truth: Annotated[
+        str | None, typer.Option("--truth", help="the scene that was captured: adds errors, PSNR")
+    ] = None,
+    view: Annotated[
+        str | None, typer.Option("--view", metavar="V,U", help="its row and column")
+    ] = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option("--at", metavar="Y,X", help="centre of a close-up, pixels; may repeat"),
+    ] = None,
+    side: Annotated[
+        int | None, typer.Option("--side", min=4, help="pixels of a close-up's side")
+    ] = None,
+    width: Annotated[
+        float, typer.Option("--width", min=2, max=40, help="of the figure, inches")
+    ] = 7.16,
+    out: OutOption = Path("emmc-figure"),
+) -> None:
+    """Draw results of one capture side by side: PDF, SVG, PNG and a caption with their sources."""
+    from emmc_rig.files.exports import open_export
+    from emmc_rig.files.folders import result_folder
+    from emmc_rig.files.results import write_metrics
+    from emmc_rig.pages.result_figure import FigureSettings, draw_results
+
+    settings = FigureSettings(
+        None if view is None else _pair("--view", view),
+        [_pair("--at", one) for one in at or ()],
+        side,
+        width,
+    )
+    with result_folder(out, "figure") as folder:
+        opened = [open_export(results[0], truth), *(open_export(one) for one in results[1:])]
+        drawn = draw_results(opened, settings)
+        drawn.save(folder)
+        write_metrics(
+            folder, {"results": results, "truth": truth, "caption": drawn.caption, **drawn.measured}
+        )
+    typer.echo(drawn.caption)
+    typer.echo(f"wrote {out / 'figure.pdf'}, .svg, .png and caption.txt")
+
+
+def _pair(option: str, text: str) -> tuple[int, int]:
+    """Return two whole numbers from "2,3"; raises BadParameter."""
+    first, comma, second = (part.strip() for part in text.partition(","))
+    if not (comma and first.isdecimal() and second.isdecimal()):
+        raise typer.BadParameter(f"{option} {text}: write two whole numbers, for instance 2,3")
+    return int(first), int(second)

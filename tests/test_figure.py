@@ -1,0 +1,118 @@
+"""Figures for papers: what stands where, on which scale, and where it came from."""
+
+import re
+
+import numpy as np
+import pytest
+from programs import program
+
+from emmc_rig.errors import AppError, WrongUsageError
+from emmc_rig.files.formats import Export
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.pages.result_figure import FigureSettings, draw_results
+
+SIZE = (36, 48)
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Two results of one capture, the second without a deviation, and the truth with the first."""
+    scene = open_scene("deep-occlusions", size=SIZE)
+    rng = np.random.default_rng(1)
+
+    def result(name, error, sigma=None):
+        noise = rng.normal(0, error, scene.light_field.shape)
+        estimate = np.clip(scene.light_field + noise, 0, 1).astype(np.float32)
+        return Export(
+            name, "", estimate, scene.light_field, scene.disparity_px, sigma,
+            metrics={"method": name, "command": f"emmc-rig reconstruct --method {name}"},
+        )  # fmt: skip
+
+    sigma = np.full(scene.light_field.shape[:4], 0.2, np.float32)
+    return result("careful", 0.01, sigma), result("hasty", 0.1)
+
+
+def maps_of(figure):
+    """Return the values and the ends of the scale of every map drawn, in order."""
+    images = [image for axes in figure.axes for image in axes.images]
+    drawn = [one for one in images if one.get_array().ndim == 2]
+    return [(np.asarray(one.get_array()), one.get_clim()) for one in drawn]
+
+
+def test_error_and_deviation_of_all_methods_share_one_scale(results):
+    drawn = draw_results(results)
+    careful, hasty, sigma, *disparities = maps_of(drawn.figure)
+    truth = results[0].truth[2, 2]
+    for (values, _), one in zip((careful, hasty), results, strict=True):
+        expected = np.sqrt(((one.light_field[2, 2] - truth) ** 2).mean(-1))
+        np.testing.assert_allclose(values, expected, atol=1e-6)
+    assert careful[1] == hasty[1] == sigma[1]
+    assert careful[1][0] == 0
+    assert careful[1][1] >= 0.2
+    assert len(disparities) == 2
+    assert disparities[0][1] == disparities[1][1]
+
+
+def test_psnr_stands_over_its_method_and_the_caption_names_every_source(results):
+    drawn = draw_results(results)
+    texts = [text.get_text() for text in drawn.figure.texts]
+    for one in results:
+        psnr = psnr_db(one.light_field, one.truth)
+        assert any(text.startswith(f"{one.title}\n{psnr:.2f} dB") for text in texts)
+        assert drawn.measured[one.title]["psnr_db"] == psnr
+        assert one.metrics["command"] in drawn.caption
+    assert texts.count("none") == 1  # the second method has no deviation
+    assert "true" in texts
+
+
+def test_a_close_up_shows_the_pixels_around_its_point_of_the_view_asked_for(results):
+    settings = FigureSettings(view=(0, 4), at=[(20, 30), (0, 0)], side_px=8)
+    drawn = draw_results(results[1:], settings)
+    whole, first, corner, *_ = (
+        np.asarray(image.get_array()) for axes in drawn.figure.axes for image in axes.images
+    )
+    np.testing.assert_array_equal(first, whole[16:24, 26:34])
+    np.testing.assert_array_equal(corner, whole[:8, :8])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (FigureSettings(view=(5, 0)), "--view 5,0: there are 5x5 views"),
+        (FigureSettings(at=[(36, 0)]), "--at 36,0: the pictures have 36x48 pixels"),
+        (FigureSettings(side_px=37), "--side 37: the pictures have 36x48 pixels"),
+    ],
+)
+def test_places_outside_the_picture_are_refused(results, settings, message):
+    with pytest.raises(WrongUsageError, match=message):
+        draw_results(results, settings)
+
+
+def test_results_of_different_captures_are_refused(results):
+    other = Export("other", "", results[0].light_field[:3])
+    with pytest.raises(AppError, match="other has shape"):
+        draw_results([results[0], other])
+
+
+def test_the_command_writes_vectors_with_their_fonts_and_the_caption_inside(tmp_path):
+    out = tmp_path / "figure"
+    typed = ["figure", "near-planar", "--at", "100,80", "--side", 20, "--out", out]
+    code, printed, complaint = program(*typed)
+    assert code == 0, complaint
+    pdf, svg = (out / "figure.pdf").read_bytes(), (out / "figure.svg").read_text()
+    assert b"/FontFile2" in pdf  # TrueType
+    assert b"/Type3" not in pdf
+    assert "<text" not in svg
+    assert "font-family" not in svg
+    caption = " ".join((out / "caption.txt").read_text().split())
+    assert caption in " ".join(printed.split())
+    assert "Close-ups of 20x20 pixels around (y, x) = (100, 80)." in caption
+    assert re.sub(r"\s", "", caption)[:40] in re.sub(r"\s", "", svg)
+
+
+@pytest.mark.parametrize("typed", [("--at", "3"), ("--view", "a,b"), ("--side", "2")])
+def test_a_place_that_is_no_place_is_wrong_usage(tmp_path, typed):
+    code, _, complaint = program("figure", "near-planar", *typed, "--out", tmp_path / "out")
+    assert code == 2, complaint
+    assert not (tmp_path / "out").exists()
