@@ -20,6 +20,7 @@ from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import preview, thinned
 from emmc_rig.pages.page import (
     Card,
+    Head,
     Section,
     data_address,
     fragment,
@@ -93,7 +94,33 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     sections.append(provenance_section(sources))
     lead = fragment("cards.html", cards=_cards(session))
     about = [_about(session)]
-    return framed(session.header["title"], about, (), sections, ["session.css"], lead=lead)
+    return framed(
+        session.header["title"],
+        about,
+        (),
+        sections,
+        ["session.css"],
+        lead=lead,
+        head=_head(session),
+    )
+
+
+def _head(session: Session) -> Head:
+    """Return whether all is captured and well exposed, and the next command."""
+    name = session.folder.name
+    if missing := len(session.missing()):
+        why = f"{missing} of {len(session.needed)} frames are missing"
+        return Head("not complete", why, [f"go on with: emmc-rig capture {name}"], "watch")
+    reasons = exposure_reasons(shot_exposures(session))
+    commands = [f"emmc-rig reconstruct {name}"]
+    if any(frame.kind == "whiteboard" for frame in session.needed):
+        commands.insert(0, f"emmc-rig calibrate {name}")
+    return Head(
+        "complete",
+        "; ".join(reason.what for reason in reasons) or "every frame is stored and verified",
+        [*(reason.remedy for reason in reasons), *commands],
+        "watch" if reasons else "good",
+    )
 
 
 def _about(session: Session) -> str:

@@ -75,7 +75,8 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
         "viewer_page.html",
         title=content.title,
         about=[content.caption] if content.caption else [],
-        caveats=(), sections=(), lead="", styles=("viewer.css",), scripts=("viewer.js",),
+        caveats=(), sections=(), lead="", summary=None,
+        styles=("viewer.css",), scripts=("viewer.js",),
         data={"viewer-data": viewer_data(content, lossless=lossless)},
     )  # fmt: skip
 
