@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.frame_view import preview, thinned
+from emmc_rig.pages.frame_view import preview, thinned, white_balance
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -48,6 +49,8 @@ LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES = 200
 QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
+BOARDS = ("reference", "open")
+"""Kinds of frames that show a whiteboard through the whole aperture."""
 HEADINGS = {
     "dark": "Darks",
     "metering": "Metering",
@@ -113,7 +116,7 @@ def _head(session: Session) -> Head:
         return Head("not complete", why, [f"go on with: emmc-rig capture {name}"], "watch")
     reasons = exposure_reasons(shot_exposures(session))
     commands = [f"emmc-rig reconstruct {name}"]
-    if any(frame.kind == "whiteboard" for frame in session.needed):
+    if any(frame.kind in BOARDS for frame in session.needed):
         commands.insert(0, f"emmc-rig calibrate {name}")
     return Head(
         "complete",
@@ -171,7 +174,7 @@ def _exposure_cards(session: Session) -> list[Card]:
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
-    left = pictures
+    left, balance = pictures, _balance(session)
     for kind in reversed(KINDS):
         frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
         if not frames:
@@ -180,7 +183,7 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         left -= len(shown)
         body = fragment(
             "session_frames.html",
-            pictures=[_picture(session, frame) for frame in shown],
+            pictures=[_picture(session, frame, balance) for frame in shown],
             total=len(frames),
         )
         title = HEADINGS[kind]
@@ -199,20 +202,34 @@ def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
     return [frames[i * len(frames) // max(most, 1)] for i in range(most)]
 
 
-def _picture(session: Session, planned: PlannedFrame) -> dict[str, object]:
+def _balance(session: Session) -> tuple[float, float, float]:
+    """Return the white balance of the first whiteboard under white light; none without one."""
+    for planned in session.needed:
+        entry = session.stored.get(planned.id)
+        if entry and planned.kind in BOARDS and planned.bench.lamp == "white":
+            with suppress(AppError, DriverError):
+                return white_balance(decode_frame(session.read(planned.id), entry))
+    return 1.0, 1.0, 1.0
+
+
+def _picture(
+    session: Session, planned: PlannedFrame, balance: tuple[float, float, float]
+) -> dict[str, object]:
     """Return what the page shows of a frame: its picture, or why there is none."""
     entry = session.stored.get(planned.id)
     if entry is None:
         return {"id": planned.id, "why": "not captured"}
     try:
-        return {**entry, "why": "", "picture": _jpeg(session, planned, entry)}
+        return {**entry, "why": "", "picture": _jpeg(session, planned, entry, balance)}
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
 
-def _jpeg(session: Session, planned: PlannedFrame, entry: Entry) -> str:
+def _jpeg(
+    session: Session, planned: PlannedFrame, entry: Entry, balance: tuple[float, float, float]
+) -> str:
     frame = decode_frame(session.read(planned.id), entry)
-    picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)))
+    picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)), balance)
     scale = LONGEST_PX / max(picture.shape[:2])
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
