@@ -90,13 +90,10 @@ def write_calibration_report(
 
 def _head(outcome: Outcome) -> Head:
     """Return whether the whiteboards agree with the Psi chosen, and what to measure again."""
-    agrees = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2
-    good = agrees and not outcome.advice
+    good = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2 and not outcome.advice
     return Head(
         "trust" if good else "doubt",
-        outcome.why
-        if agrees
-        else f"whiteboards are missed by more than their noise; {outcome.why}",
+        outcome.why,
         outcome.advice or ["nothing to measure again: reconstruct with this Psi"],
         "good" if good else "watch",
     )
