@@ -45,8 +45,8 @@ from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
-SIZE = (144, 192)
-"""Of a built-in scene: half the samples of its own 192x256, for a first run of seconds."""
+SIZE = (112, 144)
+"""Of a built-in scene: a third of the samples of its own 192x256, for a first run of seconds."""
 
 
 @dataclass(frozen=True)

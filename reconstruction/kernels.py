@@ -246,7 +246,9 @@ def _sweep_band(data, steps, light_field, dual, begin, end, moved, first, last):
         if row == begin:
             first[:] = ahead
         else:
-            _dual_rows(steps, ring[(row - 1) % 2], ahead, True, dual, (row - 1) * data.binning)
+            # A constant True would be a type of its own, and compiled once more.
+            below = row > begin
+            _dual_rows(steps, ring[(row - 1) % 2], ahead, below, dual, (row - 1) * data.binning)
     last[:] = ring[(end - 1) % 2]
 
 

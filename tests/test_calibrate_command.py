@@ -70,7 +70,7 @@ def test_calibrate_writes_psi_its_uncertainty_and_a_page(run, camera_file, tmp_p
         assert np.asarray(file["good"]).shape == (32, 40)
         assert set(SCALARS) <= set(file.attrs) or metrics["chosen"] == "free"
     page = (out / "report.html").read_text()
-    for words in ("What to measure again", "Residual maps", "Photon transfer", "Edge blur"):
+    for words in ("What to do next", "Residual maps", "Photon transfer", "Edge blur"):
         assert words in page
     assert "http" not in page.split("</style>")[1].replace("http://www.w3.org", "")
 

@@ -18,7 +18,13 @@ from drivers.raw import decode_raw
 from emmc_rig.commands import device_cameras
 from emmc_rig.commands.device_cameras import register, save_frame
 from emmc_rig.errors import AppError
-from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text, preview
+from emmc_rig.pages.frame_view import (
+    frame_figures,
+    histogram,
+    histogram_text,
+    preview,
+    white_balance,
+)
 from emmc_rig.rig import hardware
 from emmc_rig.rig.hardware import open_camera, scene_simulator
 from emmc_rig.study.benchmarks.devices import picture_timing
@@ -220,6 +226,18 @@ def test_a_preview_shows_each_colour_where_it_is(cfa):
     picture = preview(frame_of(mosaic, cfa))
     assert picture.shape == (20, 20, 3)
     assert (picture == [0, 0, 255]).all()
+
+
+def test_a_whiteboard_s_balance_makes_it_grey_and_leaves_green():
+    mosaic = np.tile(np.array([[400, 1000], [1000, 700]], np.uint16), (16, 16))
+    board = frame_of(mosaic, "rggb")
+    blue, green, red = white_balance(board)
+    black = float(board.black_level_dn.mean())
+    assert green == 1
+    assert red == pytest.approx((1000 - black) / (400 - black))
+    assert blue == pytest.approx((1000 - black) / (700 - black))
+    assert np.ptp(preview(board, (blue, green, red)).astype(int), axis=-1).max() <= 1
+    assert white_balance(frame_of(mosaic, "mono")) == (1, 1, 1)
 
 
 def test_a_large_frame_has_a_small_preview():

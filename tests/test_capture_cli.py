@@ -125,6 +125,27 @@ def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run
     assert path.read_bytes() == good
 
 
+KILLED_EXPORT = """
+import os, signal, sys
+from pathlib import Path
+from emmc_rig.session.export import export_hdf5
+from emmc_rig.session.session import Session
+export_hdf5(Session(Path(sys.argv[1])), Path(sys.argv[2]),
+            on_frame=lambda frame: os.kill(os.getpid(), signal.SIGKILL))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGKILL")
+def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, run, tmp_path):
+    session, path = captured / "plan-session", tmp_path / "x.h5"
+    typed = [sys.executable, "-c", KILLED_EXPORT, str(session), str(path)]
+    assert subprocess.run(typed, check=False).returncode == -signal.SIGKILL
+    assert not path.exists()
+    code, _, err = run("session", "export", session, "--out", path)
+    assert code == 0, err
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured, run):
     os.chdir(captured)
     code, _, err = run("session", "export", "plan-session", "--out", "x.h5", "--compress")

@@ -17,6 +17,7 @@ from emmc_rig.pages.display import png_of
 from emmc_rig.pages.drawing import ACCENT, FAINT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import (
     Card,
+    Head,
     Section,
     data_address,
     fragment,
@@ -47,6 +48,10 @@ WORDS = {
 }
 
 
+GOOD_CHI2 = 1.5
+"""Held-out residual, in variances of the noise, above which something is not modelled."""
+
+
 def write_calibration_report(
     path: Path,
     outcome: Outcome,
@@ -64,7 +69,6 @@ def write_calibration_report(
         Section("choice", "Chosen", _choice(outcome, metrics)),
         *_listed("found", "Found and taken into account", outcome.findings),
         *_listed("unwatched", "Not measured", outcome.unwatched),
-        Section("redo", "What to measure again", fragment("advice.html", lines=outcome.advice)),
     ]
     best = outcome.mixed or outcome.parametric
     first = outcome.parametric
@@ -81,7 +85,18 @@ def write_calibration_report(
         sections.append(Section("stage", "Stage map", body))
     sections.append(provenance_section(_provenance(metrics)))
     title = f"Calibration of {metrics['camera']}"
-    write_text(path, framed(title, [outcome.why], (), sections, ["calibration.css"]))
+    write_text(path, framed(title, (), (), sections, ["calibration.css"], head=_head(outcome)))
+
+
+def _head(outcome: Outcome) -> Head:
+    """Return whether the whiteboards agree with the Psi chosen, and what to measure again."""
+    good = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2 and not outcome.advice
+    return Head(
+        "trust" if good else "doubt",
+        outcome.why,
+        outcome.advice or ["nothing to measure again: reconstruct with this Psi"],
+        "good" if good else "watch",
+    )
 
 
 def _choice(outcome: Outcome, metrics: Mapping) -> str:
@@ -97,7 +112,7 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
             "Held-out residual",
             f"{judged.chi2:.2f}",
             "times the noise's variance",
-            "good" if judged.chi2 < 1.5 else "watch",
+            "good" if judged.chi2 < GOOD_CHI2 else "watch",
         ),
         Card("Frames", str(outcome.frames[outcome.chosen]), "for this route"),
         Card("Error of Psi", known(outcome.chosen, ".2%"), "against the simulated bench's own"),

@@ -87,10 +87,30 @@ def histogram_text(counts: dict[str, NDArray[np.int64]]) -> Text:
     return text
 
 
-def preview(frame: RawFrame) -> NDArray[np.uint8]:
+def white_balance(whiteboard: RawFrame) -> tuple[float, float, float]:
+    """Return what blue, green and red are multiplied by to make a whiteboard grey; green by 1.
+
+    A colour that reads nothing stays as it is. 1, 1, 1 for a mosaic that is not Bayer.
+    """
+    planes = colour_planes(whiteboard)
+    if "grey" in planes:
+        return 1.0, 1.0, 1.0
+    black = float(whiteboard.black_level_dn.mean())
+    light = {
+        name: float(np.mean([part.mean() for part in planes[name]])) - black for name in planes
+    }
+    blue, red = (
+        float(light["green"] / light[one]) if light[one] > 0 else 1.0 for one in ("blue", "red")
+    )
+    return blue, 1.0, red
+
+
+def preview(
+    frame: RawFrame, balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> NDArray[np.uint8]:
     """Return a picture of the frame, (y, x) or (y, x, BGR), brightness as exposed, sRGB gamma.
 
-    A Bayer tile becomes one pixel, its greens averaged; no white balance.
+    A Bayer tile becomes one pixel, its greens averaged. balance: see `white_balance`.
     """
     planes = colour_planes(frame)
     if "grey" in planes:
@@ -106,7 +126,8 @@ def preview(frame: RawFrame) -> NDArray[np.uint8]:
             axis=-1,
         )
     black = float(frame.black_level_dn.mean())
-    linear = np.clip((linear - black) / max(1.0, frame.white_level_dn - black), 0, 1)
+    linear = (linear - black) / max(1.0, frame.white_level_dn - black)
+    linear = np.clip(linear * np.asarray(balance if linear.ndim == 3 else 1, np.float32), 0, 1)
     scale = LONGEST_PREVIEW_PX / max(linear.shape[:2])
     if scale < 1:
         linear = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

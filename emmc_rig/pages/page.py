@@ -44,6 +44,16 @@ class Card:
     tone: str = ""
 
 
+@dataclass(frozen=True)
+class Head:
+    """The first thing on a page: what came out, why, and what to do next. tone: see `Card`."""
+
+    level: str
+    why: str
+    next: Sequence[str] = ()
+    tone: str = ""
+
+
 def number(value: float | None, form: str) -> str:
     """Return a number by its format, a dash for None and for values that are not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)
@@ -79,16 +89,17 @@ def framed(
     scripts: Sequence[str] = (),
     data: Mapping[str, object] | None = None,
     lead: str = "",
+    head: Head | None = None,
 ) -> str:
     """Return a page of sections.
 
     about: sentences under the title. caveats: how to read it. styles, scripts: files beside the
     templates that only this page needs; data: what the scripts read, by the name of its element.
-    lead: HTML before the sections.
+    head: comes first. lead: HTML before the sections.
     """
     return fragment(
         "page.html", title=title, about=about, caveats=caveats, sections=sections, styles=styles,
-        scripts=scripts, data=data or {}, lead=lead,
+        scripts=scripts, data=data or {}, lead=lead, summary=head,
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from emmc_rig.pages.display import (
     three_colours,
 )
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
-from emmc_rig.pages.page import Card, data_address, fragment
+from emmc_rig.pages.page import Card, Head, data_address, fragment
 from emmc_rig.pages.psi_panels import psi_panels
 from emmc_rig.pages.viewer import viewer_data
 
@@ -116,7 +116,7 @@ def render(content: ReportContent) -> str:
         styles=("viewer.css",),
         heat=HEAT,
         warnings=_warnings(content),
-        verdict=_verdict_head(content),
+        summary=_verdict_head(content),
         cards=_cards(content),
         capture={
             "shots": frames.shape[0],
@@ -366,16 +366,7 @@ def _cost_card(exact_db: object, cost_db: object) -> Card:
     return Card("Calibration costs", _written(cost_db, "z.2f", "dB"), with_exact)
 
 
-class VerdictHead(NamedTuple):
-    """The first thing on the page. next: remedies; tone: see `Card`."""
-
-    level: str
-    why: str
-    next: list[str]
-    tone: str
-
-
-def _verdict_head(content: ReportContent) -> VerdictHead | None:
+def _verdict_head(content: ReportContent) -> Head | None:
     """Return whether to trust the light field and what to do next; None where nobody judged."""
     verdict = content.metrics.get("verdict")
     if not isinstance(verdict, dict):
@@ -383,7 +374,7 @@ def _verdict_head(content: ReportContent) -> VerdictHead | None:
     level, reasons = verdict["level"], verdict["reasons"]
     why = [reason["what"] for reason in reasons]
     advice = str(content.metrics.get("advice") or "")
-    return VerdictHead(
+    return Head(
         level,
         "; ".join(why) or "frames, Psi and light field agree",
         [reason["remedy"] for reason in reasons] + ([advice] if advice else []),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.frame_view import preview, thinned
+from emmc_rig.pages.frame_view import preview, thinned, white_balance
 from emmc_rig.pages.page import (
     Card,
+    Head,
     Section,
     data_address,
     fragment,
@@ -48,6 +50,10 @@ LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES = 200
 QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
+BOARDS = ("reference", "open")
+Balance = tuple[float, float, float]
+NO_BALANCE: Balance = (1.0, 1.0, 1.0)
+"""Kinds of frames that show a whiteboard through the whole aperture."""
 HEADINGS = {
     "dark": "Darks",
     "metering": "Metering",
@@ -94,7 +100,33 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     sections.append(provenance_section(sources))
     lead = fragment("cards.html", cards=_cards(session))
     about = [_about(session)]
-    return framed(session.header["title"], about, (), sections, ["session.css"], lead=lead)
+    return framed(
+        session.header["title"],
+        about,
+        (),
+        sections,
+        ["session.css"],
+        lead=lead,
+        head=_head(session),
+    )
+
+
+def _head(session: Session) -> Head:
+    """Return whether all is captured and well exposed, and the next command."""
+    name = session.folder.name
+    if missing := len(session.missing()):
+        why = f"{missing} of {len(session.needed)} frames are missing"
+        return Head("not complete", why, [f"go on with: emmc-rig capture {name}"], "watch")
+    reasons = exposure_reasons(shot_exposures(session))
+    commands = [f"emmc-rig reconstruct {name}"]
+    if any(frame.kind in BOARDS for frame in session.needed):
+        commands.insert(0, f"emmc-rig calibrate {name}")
+    return Head(
+        "complete",
+        "; ".join(reason.what for reason in reasons) or "every frame is stored and verified",
+        [*(reason.remedy for reason in reasons), *commands],
+        "watch" if reasons else "good",
+    )
 
 
 def _about(session: Session) -> str:
@@ -145,7 +177,7 @@ def _exposure_cards(session: Session) -> list[Card]:
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
-    left = pictures
+    left, balance = pictures, _balance(session)
     for kind in reversed(KINDS):
         frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
         if not frames:
@@ -154,7 +186,7 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         left -= len(shown)
         body = fragment(
             "session_frames.html",
-            pictures=[_picture(session, frame) for frame in shown],
+            pictures=[_picture(session, frame, balance) for frame in shown],
             total=len(frames),
         )
         title = HEADINGS[kind]
@@ -173,29 +205,36 @@ def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
     return [frames[i * len(frames) // max(most, 1)] for i in range(most)]
 
 
-def _picture(session: Session, planned: PlannedFrame) -> dict[str, object]:
+def _balance(session: Session) -> Balance:
+    """Return the white balance of the first whiteboard under white light; none without one."""
+    for planned in session.needed:
+        entry = session.stored.get(planned.id)
+        if entry and planned.kind in BOARDS and planned.bench.lamp == "white":
+            with suppress(AppError, DriverError):
+                return white_balance(decode_frame(session.read(planned.id), entry))
+    return NO_BALANCE
+
+
+def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[str, object]:
     """Return what the page shows of a frame: its picture, or why there is none."""
     entry = session.stored.get(planned.id)
     if entry is None:
         return {"id": planned.id, "why": "not captured"}
     try:
-        return {
-            **entry,
-            "why": "",
-            "picture": data_address(stored_jpeg(session, planned.id), ".jpg"),
-        }
+        picture = data_address(stored_jpeg(session, planned.id, balance), ".jpg")
+        return {**entry, "why": "", "picture": picture}
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
 
-def stored_jpeg(session: Session, name: str) -> bytes:
+def stored_jpeg(session: Session, name: str, balance: Balance = NO_BALANCE) -> bytes:
     """Return a small picture of a stored frame; raises AppError or a `DriverError`."""
-    return small_jpeg(decode_frame(session.read(name), session.stored[name]))
+    return small_jpeg(decode_frame(session.read(name), session.stored[name]), balance)
 
 
-def small_jpeg(frame: RawFrame) -> bytes:
+def small_jpeg(frame: RawFrame, balance: Balance = NO_BALANCE) -> bytes:
     """Return a small picture of a frame, of whole colour tiles evenly spread over it."""
-    picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)))
+    picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)), balance)
     scale = LONGEST_PX / max(picture.shape[:2])
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

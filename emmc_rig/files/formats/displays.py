@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -55,13 +56,13 @@ def walk(export: Export) -> Iterator[NDArray[np.uint8]]:
         yield codes_of(srgb_of(between(export.light_field, disparities, float(v), float(u))))
 
 
-def _write_video(folder: Path, export: Export) -> None:
-    path = folder / "parallax.mp4"
+def _write_video(folder: Path, export: Export, ending: str, codec: str) -> None:
+    path = folder / f"parallax.{ending}"
     height, width = (n // 2 * 2 for n in export.light_field.shape[2:4])  # codecs want even sides
-    fourcc = cv2.VideoWriter.fourcc(*"mp4v")
+    fourcc = cv2.VideoWriter.fourcc(*codec)
     video = cv2.VideoWriter(str(path), fourcc, FRAMES_PER_S, (width, height))
     if not video.isOpened():
-        raise AppError(f"{path}: this OpenCV writes no MP4; choose --format gif")
+        raise AppError(f"{path.name}: this OpenCV has no encoder {codec}; choose --format gif")
     for picture in walk(export):
         video.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
     video.release()
@@ -81,6 +82,13 @@ FORMATS = (
         "quilt", f"quilt of {QUILT_COLUMNS * QUILT_ROWS} views for light-field displays",
         "8-bit sRGB, views of the middle row and between them", _write_quilt,
     ),
-    Format("video", "parallax.mp4, a round over the views", "8-bit video", _write_video),
+    Format(
+        "video", "parallax.mp4, a round over the views", "8-bit video",
+        partial(_write_video, ending="mp4", codec="mp4v"),
+    ),
+    Format(
+        "webm", "parallax.webm (VP8), the same for web pages", "8-bit video",
+        partial(_write_video, ending="webm", codec="VP80"),
+    ),
     Format("gif", "parallax.gif, a round over the views", "256 colours", _write_gif),
 )  # fmt: skip

@@ -29,6 +29,7 @@ from emmc_rig.pages.drawing import (
 )
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import (
+    Head,
     Section,
     embedded,
     fragment,
@@ -184,8 +185,25 @@ def chart_page(
     marks = {chart.mark_name(mark): _shown(sweep, mark) for chart in charts for mark in chart.marks}
     return framed(
         "Speed against accuracy", about, CAVEATS, sections, ["chart.css"], ["chart.js"],
-        marks_data(marks),
+        marks_data(marks), head=_head(next(iter(charts), None)),
     )  # fmt: skip
+
+
+def _head(chart: Chart | None) -> Head | None:
+    """Return the most accurate configuration and the quicker ones that none beats."""
+    if chart is None or not chart.marks:
+        return None
+    *quicker, best = chart.front()
+    return Head(
+        best.configuration.label,
+        f"the most accurate in {chart.title}: {best.psnr_db:.2f} dB in {best.seconds:.3g} s, "
+        f"{best.psnr_db - chart.replicate_db:+.2f} dB against the copied centre view",
+        [
+            f"in {one.seconds:.3g} s take {one.configuration.label}: "
+            f"{best.psnr_db - one.psnr_db:.2f} dB less"
+            for one in reversed(quicker)
+        ],
+    )
 
 
 def _chart_section(sweep: ChartSweep, chart: Chart, path: Path) -> Section:

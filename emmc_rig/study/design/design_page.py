@@ -8,6 +8,7 @@ from pathlib import Path
 from emmc_rig.pages.drawing import ACCENT, FAINT, INK, save_drawing, sheet, titled
 from emmc_rig.pages.page import (
     Card,
+    Head,
     Section,
     embedded,
     fragment,
@@ -77,7 +78,6 @@ def design_page(
     body = fragment(
         "design.html",
         cards=cards,
-        verdict=verdict,
         picture=embedded(picture),
         tried=_tried(found),
         held=(
@@ -91,7 +91,12 @@ def design_page(
     )
     sections = [Section("design", found.winner.label, body, "Design")]
     sections.append(provenance_section(provenance))
-    return framed("Which mask to order", about, CAVEATS, sections)
+    head = Head(
+        found.winner.label,
+        verdict,
+        ["try it on your own scenes: emmc-rig simulate --camera camera.yaml --scene SCENE"],
+    )
+    return framed("Which mask to order", about, CAVEATS, sections, head=head)
 
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
@@ -135,9 +140,8 @@ def check_page(
     provenance: Mapping[str, str],
 ) -> str:
     """Return the page of the check. ranks: the rank correlations, in words."""
-    body = fragment(
-        "design_check.html", ranks=ranks, picture=embedded(picture), rows=simulated_table(found)
-    )
+    body = fragment("design_check.html", picture=embedded(picture), rows=simulated_table(found))
     sections = [Section("check", "Theory beside simulation", body, "Check")]
     sections.append(provenance_section(provenance))
-    return framed("Does theory order masks as simulation does?", about, CAVEATS, sections)
+    title = "Does theory order masks as simulation does?"
+    return framed(title, about, CAVEATS, sections, head=Head("rank correlation (Spearman)", ranks))

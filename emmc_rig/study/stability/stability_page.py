@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
-from emmc_rig.pages.page import Section, fragment, framed, inline_svg, number
+from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
 from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows
 from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep
 
@@ -158,8 +159,27 @@ def stability_page(
     """Return the page. about: sentences under the title. curves: whose points show pictures."""
     return framed(
         "Where methods fail", about, CAVEATS, sections, ["chart.css", "stability.css"],
-        ["chart.js"], marks_data(_marks(sweep, curves)),
+        ["chart.js"], marks_data(_marks(sweep, curves)), head=_head(curves),
     )  # fmt: skip
+
+
+def _head(curves: Sequence[Curve]) -> Head | None:
+    """Return the method that breaks under the fewest faults; curves: pooled first."""
+    shown = [one for one in curves if one.scene == curves[0].scene]
+    faults = len({one.fault.name for one in shown})
+    broken = Counter({one.label: 0 for one in shown})
+    broken.update(one.label for one in shown if one.below_best() is not None)
+    if not broken:
+        return None
+    (best, least), *others = reversed(broken.most_common())
+    return Head(
+        best,
+        f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
+        [
+            "keep your bench below the strengths of the breaking points",
+            *(f"{name}: under {count} of {faults}" for name, count in others),
+        ],
+    )
 
 
 def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:

@@ -14,7 +14,7 @@ from rich.text import Text
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.page import Section, embedded, fragment, framed, provenance_section
+from emmc_rig.pages.page import Head, Section, embedded, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import csv_text, provenance, sweep_folder
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
@@ -63,7 +63,22 @@ def tables_page(
         sections.append(_section(f"{name}-picture", PARTS[name].title, body))
     sections.append(provenance_section(provenance))
     title = "The paper's tables and figures, reproduced"
-    return framed(title, about, [CAVEAT], sections, ["tables.css"])
+    return framed(title, about, [CAVEAT], sections, ["tables.css"], head=_head(findings))
+
+
+def _head(findings: Sequence[Finding]) -> Head | None:
+    """Return how many of the paper's findings hold; None where none was measured."""
+    measured = [one for one in findings if one.judged is not None]
+    broken = [one.claim.says for one in measured if one.verdict != "holds"]
+    if not measured:
+        return None
+    holding = len(measured) - len(broken)
+    return Head(
+        f"{holding} of {len(measured)} findings hold",
+        f"{len(findings) - len(measured)} of the paper's are not measured here",
+        [f"look at what does not hold: {says}" for says in broken],
+        "watch" if broken else "good",
+    )
 
 
 def _section(key: str, title: str, body: str) -> Section:
