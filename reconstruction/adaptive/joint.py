@@ -39,9 +39,9 @@ class TextureSettings(Settings):
     chroma: float = Field(default=1.4, gt=0, description="that of chrominance over luminance")
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
-    fit_steps: int = Field(default=4, ge=1, description="of conjugate gradients in each step")
+    fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
     sweeps: tuple[int, ...] = Field(
-        default=(8,), description="steps that search the disparity again first"
+        default=(5, 10), description="steps that search the disparity again first"
     )
     refine_steps: int = Field(
         default=8, ge=0, description="last steps, of which every second sharpens the disparity"
