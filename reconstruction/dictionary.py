@@ -117,10 +117,7 @@ class Dictionary:
                 file.attrs["format"] = FORMAT
                 file.attrs["kind"] = self.kind
                 file.create_dataset(
-                    "atoms",
-                    data=self.atoms,
-                    chunks=(rows, *self.atoms.shape[1:]),
-                    fletcher32=True,
+                    "atoms", data=self.atoms, chunks=(rows, *self.atoms.shape[1:]), fletcher32=True
                 )
                 file["provenance"] = self.provenance
         except OSError as fault:
@@ -196,10 +193,7 @@ def dct_dictionary(
     _check_patch(views, patch, colours)
     sizes = *views, *patch
     counts = frequencies or (*(min(3, n) for n in views), *patch)
-    chroma = chroma_frequencies or (
-        *(min(2, n) for n in views),
-        *(max(1, n // 2) for n in patch),
-    )
+    chroma = chroma_frequencies or (*(min(2, n) for n in views), *(max(1, n // 2) for n in patch))
     sets = [_cosines(sizes, counts), *[_cosines(sizes, chroma)] * (colours - 1)]
     return Dictionary.normalised(_coloured(sets), "dct")
 

@@ -23,6 +23,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.settings import Settings
+from emmc_rig.pages.page import number
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.reconstruct.pool import Pool
 from emmc_rig.version import __version__
@@ -191,7 +192,11 @@ class Sweep(Generic[P]):
 
     def words(self, point: P, result: dict) -> str:
         """Return a measured point in words."""
-        return self.label(point)
+        if "failed" in result:
+            return f"{self.label(point)}: {result['failed']}"
+        if "psnr_db" not in result:
+            return self.label(point)
+        return f"{number(result['psnr_db'], '.2f')} dB, {self.label(point)}"
 
     def label(self, point: P) -> str:
         """Return a point in words."""

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera import CameraIdentity
+from drivers.clock import SYSTEM_CLOCK
 from drivers.raw import RawFrame
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField
@@ -35,6 +35,7 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
+from simulators.still import PreparedCamera, StillStage
 
 CLIENTS, STOPS = 100, 20
 LARGE_PX = (4000, 6000)
@@ -48,7 +49,7 @@ FOLLOWED = 12
 
 @dataclass(frozen=True)
 class StopTiming(Figures):
-    """From sending `stop` to the stage being told, of several, in ms."""
+    """From sending `stop` to the stage receiving it, of several, in ms."""
 
     clients: int
     median_ms: float
@@ -100,51 +101,24 @@ def raw_frame(
     )
 
 
-class MemoryCamera:
-    """A camera that has one frame in memory, and counts."""
-
-    identity = CameraIdentity(model="memory")
-    exposure_limits_s, gain_limits = (0.01, 0.01), (1.0, 1.0)
-    exposure_s, gain = 0.01, 1.0
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        mosaic = np.random.default_rng(0).integers(256, 4000, shape).astype(np.uint16)
-        self.shape, self.cfa = shape, "rggb"
-        self._frame = raw_frame(mosaic, "rggb", 256, 4095, 0.01)
-
-    def set_exposure_s(self, exposure_s: float) -> None:
-        """Do nothing: there is one exposure."""
-
-    def set_gain(self, gain: float) -> None:
-        """Do nothing: there is one gain."""
-
-    def snap(self) -> RawFrame:
-        """Return the frame."""
-        return self._frame
-
-    def close(self) -> None:
-        """Do nothing."""
+def memory_camera(shape: tuple[int, int]) -> PreparedCamera:
+    """Return a camera that has one frame in memory."""
+    mosaic = np.random.default_rng(0).integers(256, 4000, shape).astype(np.uint16)
+    frame = raw_frame(mosaic, "rggb", 256, 4095, 0.01)
+    return PreparedCamera(lambda exposure_s: frame, shape, "rggb")
 
 
-class StoppingStage:
-    """A stage of one axis that does nothing but note when it was told to stop."""
-
-    axes = ("mask_x",)
+class StoppingStage(StillStage):
+    """A stage of one axis that notes when it receives a stop."""
 
     def __init__(self) -> None:
-        self.told_s: list[float] = []
+        super().__init__(("mask_x",), SYSTEM_CLOCK)
+        self.home()
+        self.stopped_s: list[float] = []
 
     def stop(self, axes: object = None) -> None:
         """Note the time."""
-        self.told_s.append(time.monotonic())
-
-    def position_um(self, axis: str) -> float:
-        """Return a place."""
-        return 0.0
-
-    def limits_um(self, axis: str) -> tuple[float, float]:
-        """Return a travel."""
-        return 0.0, 1.0
+        self.stopped_s.append(time.monotonic())
 
 
 @contextmanager
@@ -187,20 +161,20 @@ def _look(port: int, path: str, clients: int) -> None:
 
 
 def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
-    """Return how soon the stage is told to stop while so many pages follow a running camera."""
-    stage, camera = StoppingStage(), MemoryCamera((480, 640))
-    watch = Watch(camera, stage)  # pyright: ignore[reportArgumentType]
+    """Return how soon the stage receives a stop while so many pages follow a running camera."""
+    stage = StoppingStage()
+    watch = Watch(memory_camera((480, 640)), stage)
     with _served(watch) as (port, path), _client(f"_look({port}, {path!r}, {clients})") as crowd:
         assert crowd.stdout is not None
         crowd.stdout.readline()
         delays_s = []
         for _ in range(stops):
             link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-            before, sent_s = len(stage.told_s), time.monotonic()
+            before, sent_s = len(stage.stopped_s), time.monotonic()
             link.request("POST", f"{path}/do/stop", "{}", {"Content-Type": "application/json"})
             link.getresponse().read()
             link.close()
-            delays_s.append(stage.told_s[before] - sent_s)
+            delays_s.append(stage.stopped_s[before] - sent_s)
             time.sleep(0.1)
         crowd.kill()
     ms = [1e3 * one for one in delays_s]
@@ -230,7 +204,7 @@ def _fetch(port: int, path: str, seconds: float) -> None:
 
 def shown_timing(shape: tuple[int, int] = LARGE_PX, seconds: float = WATCHED_S) -> ShownTiming:
     """Return how many pictures a second of a large camera reach one page, with all its figures."""
-    with _served(Watch(MemoryCamera(shape))) as (port, path):
+    with _served(Watch(memory_camera(shape))) as (port, path):
         before_s, began_s = time.process_time(), time.monotonic()
         with _client(f"_fetch({port}, {path!r}, {seconds})") as client:
             answer, _ = client.communicate(timeout=PATIENCE_S + seconds)

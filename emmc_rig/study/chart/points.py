@@ -6,7 +6,6 @@ are; VARIATIONS adds settings for those it knows.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 from pydantic import Field
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
 from emmc_rig.study.chart.captures import Capture
 from emmc_rig.study.chart.peers import PEERS
@@ -143,9 +143,7 @@ def check_methods(names: Sequence[str]) -> None:
     known = [*METHODS, *PEERS]
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise AppError(f"--method {name}: {hint}known are {', '.join(known)}")
+            raise AppError(f"--method {name}: {nearest_of(name, known)}")
 
 
 def configurations(settings: ChartSettings) -> list[Configuration]:

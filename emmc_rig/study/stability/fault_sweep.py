@@ -18,7 +18,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
-from emmc_rig.pages.page import number
 from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
@@ -260,12 +259,6 @@ class StabilitySweep(Sweep[Point]):
             "advice": result.advice,
             "screening": "; ".join(result.screening),
         }
-
-    def words(self, point: Point, result: dict) -> str:
-        """Return a measured point in words."""
-        if "failed" in result:
-            return f"{point.label}: {result['failed']}"
-        return f"{number(result['psnr_db'], '.2f')} dB, {point.label}"
 
 
 def _settings(point: Point, binning: int = 1) -> MethodSettings:

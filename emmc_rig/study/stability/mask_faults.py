@@ -62,10 +62,7 @@ def _misplaced(setup: Setup, **changed: float) -> Trial:
 def _diagonal(px: float, setup: Setup) -> dict[str, float]:
     """Return a shift in samples, at 30 degrees to the rows."""
     um = px * setup.camera.sensor.sample_pitch_um
-    return {
-        "offset_x_um": um * math.cos(math.pi / 6),
-        "offset_y_um": -um * math.sin(math.pi / 6),
-    }
+    return {"offset_x_um": um * math.cos(math.pi / 6), "offset_y_um": -um * math.sin(math.pi / 6)}
 
 
 def shift(setup: Setup, px: float) -> Trial:
@@ -98,11 +95,7 @@ def vignetting(setup: Setup, percent: float) -> Trial:
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     lens = setup.camera.lens
-    lengths = (
-        lens.distance_mm * 1e3,
-        setup.camera.sensor.sample_pitch_um,
-        lens.aperture_cell_um,
-    )
+    lengths = (lens.distance_mm * 1e3, setup.camera.sensor.sample_pitch_um, lens.aperture_cell_um)
     natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, setup.camera.views, lengths)
     power = math.log(1 - percent / 100) / math.log(float(natural.min()))
     passed = (natural**power).astype(psi.weights.dtype)

@@ -28,11 +28,7 @@ METHOD_COLOURS = {"dict-admm": "#7a869a", "tv-dict": "#1d5a9e", "tv": "#18794e"}
 
 
 def mean_db(
-    measured: Measured,
-    scenes: Sequence[str],
-    capture: Capture,
-    method: str,
-    what: str = "psnr_db",
+    measured: Measured, scenes: Sequence[str], capture: Capture, method: str, what: str = "psnr_db"
 ) -> float | None:
     """Return the mean of a figure over the scenes that have it; None without any."""
     values = []
