@@ -31,7 +31,7 @@ from emmc_rig.study.stability.rounding import (
     step_sizes,
 )
 from emmc_rig.study.trial import Trial
-from reconstruction.methods import installed_methods
+from reconstruction.methods import METHODS
 from reconstruction.result import Reconstruction
 
 OPAQUE = 0.02
@@ -119,6 +119,7 @@ CONDITIONS = (
 SAME_DB, FEW_DB = 0.1, 3.0
 SCALES = (1e-6, 1e-3, 1e-1, 1e1, 1e3, 1e6)
 QUICK_SCALES = (1e-6, 1e6)
+ANY_VIEWS = tuple(name for name, method in METHODS.items() if method.package is None)
 SLOW = ("dict-ista", "dict-fista", "dict-lars", "dict-sl0")
 
 
@@ -206,14 +207,12 @@ def identical(one: Reconstruction, other: Reconstruction) -> bool:
 
 
 def measure_numerics(
-    watcher: Watcher, fast: bool = False, every: Sequence[str] | None = None
+    watcher: Watcher, fast: bool = False, every: Sequence[str] = ANY_VIEWS
 ) -> Numerics:
     """Return every check, on small captures of a built-in scene.
 
-    every: methods run twice (default: all that are installed); fast: of those, the slow ones are
-    not run under every condition.
+    every: methods run twice; fast: of those, the slow ones are not run under every condition.
     """
-    every = installed_methods() if every is None else every
     methods = [name for name in every if not (fast and name in SLOW)]
     scales = QUICK_SCALES if fast else SCALES
     watcher.begin("numerical stability", 4 + len(CONDITIONS) + len(scales))
