@@ -237,6 +237,8 @@ class Sequencer:
     def _home(self) -> None:
         if self._rig.stage.axes:
             self._rig.stage.home()
+        if self._rig.stands_um:
+            self._rig.stage.move_to_um(self._rig.stands_um)
         self._applied = _Applied()
 
     def _take_all(self, frames: tuple[PlannedFrame, ...]) -> bool:

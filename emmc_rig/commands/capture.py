@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import AppError
@@ -25,6 +26,7 @@ OptionalPath = Path | None
 
 
 def capture(
+    context: typer.Context,
     plan: Annotated[
         OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
     ] = None,
@@ -90,7 +92,7 @@ def capture(
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
     from emmc_rig.files.results import parse_psnr, parse_size
     from emmc_rig.model.settings import validated
-    from emmc_rig.rig.rig_config import ImagedRig, rig_description
+    from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 
     given: dict[str, Any] = {} if rays is None else {"rays": rays}
     if flaws is not None:
@@ -99,6 +101,11 @@ def capture(
     imaged = validated(ImagedRig, settings | given, "the simulated rig", AppError)
     until_db = None if until is None else parse_psnr(until, "--until")
     chosen = None if rig is None else rig_description(rig, imaged)
+    if chosen is None or chosen["kind"] != SIMULATED:
+        where = "on a session's own rig" if chosen is None else "on a rig of real devices"
+        refuse(context, given_names(context) & set(SIMULATED_ONLY), where)
+    if dry_run and (page or steer):
+        refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
     shown = None if not (page or steer) else "steers" if steer else "shows"
     _run(plan, chosen, until_db, dry_run, json_lines, out, shown)
 

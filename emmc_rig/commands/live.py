@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.errors import AppError
 
@@ -23,6 +24,7 @@ EVERYWHERE = ("0.0.0.0", "::")
 
 
 def live(
+    context: typer.Context,
     rig: RigOption = None,
     camera: Annotated[
         str | None, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
@@ -39,11 +41,16 @@ def live(
         str | None,
         typer.Option(
             "--psi",
-            help="show the light field too: a session, a calibration's folder, psi.h5, or `design`",
+            help="show the light field too: a session, a calibration's folder, psi.h5, or `design` "
+            "(what the simulated rig has by default)",
         ),
     ] = None,
     method: Annotated[
         str | None, typer.Option("--method", help="of the light field when nothing moves")
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option("--plan", help="a plan that the page may write what it found into; --rig too"),
     ] = None,
     host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
@@ -64,10 +71,19 @@ def live(
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
+    if rig is None:
+        refuse(context, given_names(context) & {"scene", "size"}, "without --rig simulated")
+    if read_only and plan is not None:
+        refuse(context, ("plan",), "with --read-only")
+    if rig == "simulated":
+        psi = psi or DESIGN
     if method is not None and psi is None:
         raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
     listening = listening_socket(host, port)
-    with closing(listening), _watch(rig, camera, stage, design, scene, size, psi, method) as watch:
+    with (
+        closing(listening),
+        _watch(rig, camera, stage, design, scene, size, psi, method, plan) as watch,
+    ):
         token = new_token()
         number = listening.getsockname()[1]
         shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
@@ -102,13 +118,19 @@ def _watch(
     size: str | None,
     psi: str | None,
     method: str | None,
+    plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
+    from emmc_rig.capture.plan import load_plan
     from emmc_rig.files.cameras import find_camera
+    from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
-    from emmc_rig.rig.hardware import SimulatedRig, open_camera, open_stage
+    from emmc_rig.rig.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
 
     described, scale = find_camera(design), _scale(psi)
+    files = Files(plan, None if rig is None or rig == SIMULATED else Path(rig))
+    if plan is not None:
+        load_plan(plan)
     with ExitStack() as stack:
         if rig is not None:
             from emmc_rig.files.results import parse_size
@@ -126,12 +148,14 @@ def _watch(
             if "aperture_x" in centre_um:
                 centre_um["aperture_x"] += opened.window_um
             field = _light_field(psi, scale, method, described, opened.camera.shape)
-            watch = Watch(opened.camera, opened.stage, look, targets, centre_um, described, field)
+            watch = Watch(
+                opened.camera, opened.stage, look, targets, centre_um, described, field, files
+            )
         else:
             device = stack.enter_context(closing(open_camera(camera or "ptp:")))
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
             field = _light_field(psi, scale, method, described, device.shape)
-            watch = Watch(device, driven, design=described, light_field=field)
+            watch = Watch(device, driven, design=described, light_field=field, files=files)
         stack.callback(watch.close)
         yield watch
 

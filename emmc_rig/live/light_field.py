@@ -67,6 +67,10 @@ class LiveLightField:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._scale, self._method, self._solve, self._clock = scale, method, solve, clock
+        white = scale.white_dn_per_s
+        usable = (white > 0) & scale.good
+        self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
+        self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
         self._since_s = clock()
         self.preview: Preview | None = None
@@ -147,7 +151,9 @@ class LiveLightField:
 
     def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
         """Return DN per second above the dark, (y, x)."""
-        return (frame.mosaic - self._scale.dark.mean_dn) / np.float32(_exposure_s(frame))
+        rate = frame.mosaic - np.asarray(self._scale.dark.mean_dn, np.float32)
+        rate /= np.float32(_exposure_s(frame))
+        return rate
 
     def _of_shots(self) -> tuple[list[int], ImagingMatrix]:
         shots = sorted(self._held)
@@ -157,11 +163,12 @@ class LiveLightField:
     def _go_on(self) -> None:
         """Move the preview on by the frames held."""
         shots = sorted(self._held)
-        white = self._scale.white_dn_per_s[shots]
-        seen = (white > 0) & self._scale.good
+        # 0 where a pixel is not to be used, so that nothing is chosen among the readings.
+        share = self._reading_per_rate[shots]
         readings = np.stack([self._rate(self._held[shot]) for shot in shots])
-        readings = np.where(seen, readings / np.where(seen, white, 1), 0).astype(np.float32)
-        level = float(readings[seen].mean())
+        readings *= share
+        seen = share > 0
+        level = float(readings.mean() / max(seen.mean(), 1e-12))
         if level <= 0:
             raise ReconstructionError("the picture is dark: no light field to see")
         factor = max(self._level / level, level / max(self._level, 1e-12))

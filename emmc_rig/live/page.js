@@ -39,6 +39,7 @@ function draw() {
   drawSetting("gain", settings.gain, settings.gain_limits, "");
   drawTargets();
   drawAxes();
+  drawSteps();
   write("zoom", `${Math.round(1 / PARTS[view.level])}x`);
   drawMask();
   if (!figures) return;
@@ -77,6 +78,56 @@ function drawHint() {
   $("hint-do").hidden = !hint?.action;
   write("hint-do", ACTIONS[hint?.action] || "");
   $("hint-do").disabled = state.read_only || state.busy !== "";
+}
+
+// Steps are made once and then written to: a button that has the focus keeps it.
+const LABELS = { autoexpose: "expose", centre: "centre", autofocus: "focus", preview: "save ..." };
+function drawSteps() {
+  const parent = $("steps");
+  if (parent.children.length !== state.steps.length)
+    fill(parent, state.steps.map((step, i) => {
+      const row = document.createElement("li");
+      row.append(cell("b", step.name), cell("span", ""), button("", () => doStep(i)));
+      return row;
+    }));
+  state.steps.forEach((step, i) => {
+    const [, words, press] = parent.children[i].children;
+    const look = step.look && state.targets.includes(step.look);
+    const label = look ? "look at the " + step.look : LABELS[step.action] || "";
+    if (words.textContent !== step.text) words.textContent = step.text;
+    if (press.textContent !== label) press.textContent = label;
+    press.hidden = !label;
+    press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
+    parent.children[i].classList.toggle("done", step.done);
+  });
+}
+
+function doStep(i) {
+  const step = state.steps[i];
+  if (step.action === "preview") openSave();
+  else if (step.action === "autofocus") act("autofocus", { span_um: 1000 });
+  else if (step.action) act(step.action);
+  else if (step.look) act("look", { target: step.look });
+}
+
+function openSave() {
+  $("save-form").hidden = false;
+  fill($("takes"), state.takes.map((name) => {
+    const label = document.createElement("label"), box = document.createElement("input");
+    Object.assign(box, { type: "checkbox", checked: true, value: name });
+    box.addEventListener("change", previewSave);
+    label.append(box, " " + name);
+    return label;
+  }));
+  previewSave();
+}
+
+async function previewSave() {
+  const what = [...$("takes").querySelectorAll("input:checked")].map((one) => one.value);
+  const answer = await act("preview", { what });
+  write("saved", "");
+  write("diff", answer ? answer.diff || "nothing to change" : "");
+  $("save").disabled = !answer?.diff;
 }
 
 function drawSetting(id, value, limits, unit) {
@@ -233,6 +284,13 @@ $("take").addEventListener("click", () => act("reference", { taken: !state.refer
 $("hint-do").addEventListener("click", () => act(state.hint.action));
 for (const name of ["home", "centre", "stop", "autoexpose", "refocus"])
   $(name).addEventListener("click", () => act(name));
+
+$("save-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  $("save").disabled = true;
+  const answer = await act("save");
+  if (answer) { write("saved", "wrote " + answer.written.join(", ")); write("diff", ""); }
+});
 
 // Escape stops from anywhere; moves are by key only while the stage's panel has the focus.
 document.addEventListener("keydown", (event) => {

@@ -37,6 +37,9 @@ class SetupPage:
             "look": watch.look_at,
             "reference": lambda taken: watch.take_reference(taken),
             "refocus": watch.forget_focus,
+            "autofocus": lambda span_um: watch.autofocus(finite(span_um)),
+            "preview": watch.preview,
+            "save": watch.save,
         }
 
     @property

@@ -85,6 +85,11 @@ else:
     MethodSettings = create_model("MethodSettings", __base__=ShippedSettings, **_own)
 
 
+def installed_methods() -> tuple[str, ...]:
+    """Return the names of the methods that can run here: all, but for extras not installed."""
+    return tuple(name for name, method in METHODS.items() if method.installed)
+
+
 def find_method(name: str) -> Method:
     """Return a method by name; raises ReconstructionError naming the nearest."""
     if name in METHODS:

@@ -17,7 +17,7 @@ from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
 from emmc_rig.study.chart.captures import Capture
 from emmc_rig.study.chart.peers import PEERS
-from reconstruction.methods import METHODS, MethodSettings
+from reconstruction.methods import METHODS, MethodSettings, installed_methods
 from simulators.scenes import SCENES
 
 FAST_SCENES = ("near-planar", "deep-occlusions", "wide-disparity")
@@ -150,7 +150,7 @@ def configurations(settings: ChartSettings) -> list[Configuration]:
     """Return the methods with their settings, quick ones first, other libraries' last."""
     check_methods(settings.methods)
     found = []
-    for method in METHODS:
+    for method in METHODS if settings.methods else installed_methods():
         if settings.fast and method in SLOW_METHODS and method not in settings.methods:
             continue
         for level, changed in VARIATIONS.get(method, {DEFAULT: {}}).items():
@@ -189,7 +189,7 @@ _FIXED = {
     "dict-admm": ("fast", {"sparse": _QUICK_PATCHES}),
 }
 """Settings whose work does not depend on how soon they converge, where there are such."""
-_NOT_SWEPT = (*SLOW_METHODS, "tv-dict")
+_NOT_SWEPT = (*SLOW_METHODS, "tv-dict", "unrolled")
 _NOT_SWEPT_FAST = ("dict-admm", "adaptive-fast")
 
 
@@ -214,7 +214,7 @@ def scalings(settings: ChartSettings, cores: int) -> list[Scaling]:
         "cores": [(k, middle, k) for k in _core_counts(cores)],
     }
     found = []
-    for method in METHODS:
+    for method in installed_methods():
         if method in _NOT_SWEPT or (settings.fast and method in _NOT_SWEPT_FAST):
             continue
         if settings.methods and method not in settings.methods:

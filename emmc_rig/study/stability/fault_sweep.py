@@ -32,13 +32,15 @@ from emmc_rig.study.sweep import (
     machine,
 )
 from emmc_rig.study.trial import Fault, Setup, Trial
-from reconstruction.methods import METHODS, MethodSettings, find_method
+from reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
 from reconstruction.sparse import SparseSettings
 
 SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 FAST_METHODS = ("tv", "dict-omp", "adaptive-fast")
 SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
 FAST_SCENES = ("deep-occlusions",)
+ALL = "all"
+"""Instead of a method's name: every one that is installed."""
 CAMERA = "rgbw-bayer-3shots"
 SIZE, ZOOM = (96, 128), 2
 FAST_SIZE, FAST_ZOOM = (64, 80), 3
@@ -114,11 +116,21 @@ def chosen_faults(settings: StabilitySettings) -> list[Fault]:
     return [find_fault(name) for name in settings.faults] or list(FAULTS.values())
 
 
-def chosen_methods(settings: StabilitySettings) -> tuple[str, ...]:
-    """Return the methods; raises ReconstructionError naming the nearest for one not known."""
-    for name in settings.methods:
+def named_methods(names: Sequence[str], fast: bool) -> tuple[str, ...]:
+    """Return methods by name, those usually compared where none is given, every one for ALL.
+
+    Raises ReconstructionError naming the nearest for one not known.
+    """
+    if ALL in names:
+        return installed_methods()
+    for name in names:
         find_method(name)
-    return settings.methods or (FAST_METHODS if settings.fast else SWEPT_METHODS)
+    return tuple(names) or (FAST_METHODS if fast else SWEPT_METHODS)
+
+
+def chosen_methods(settings: StabilitySettings) -> tuple[str, ...]:
+    """Return the methods of a sweep; raises what `named_methods` does."""
+    return named_methods(settings.methods, settings.fast)
 
 
 def strengths(fault: Fault, settings: StabilitySettings) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import colours_of
 from emmc_rig.pages.page import Section, provenance_section
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruct.pool import opened_pool
 from emmc_rig.study.stability.curves import Curve, break_row, curves
 from emmc_rig.study.stability.fault_sweep import (
     Point,
@@ -180,12 +182,14 @@ def run_stability(
     more: Sequence[Section] = (),
     figures: Mapping[str, object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    workers: int | None = None,
 ) -> StabilityOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
     more: sections of the page between the curves and where they came from. figures: of them, for
-    metrics.json. Raises SweepStopped at Ctrl-C, AppError for wrong input and a folder that cannot
-    be written, and the errors of the layers below; what is done is kept in each case.
+    metrics.json. workers: processes that share the trials; None: this one. Raises SweepStopped at
+    Ctrl-C, AppError for wrong input and a folder that cannot be written, and the errors of the
+    layers below; what is done is kept in each case.
     """
     started = clock()
     points = planned(settings)
@@ -196,7 +200,8 @@ def run_stability(
         open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
     with sweep_folder(out, StabilitySweep.journal, "stability") as folder:
         sweep = StabilitySweep(settings, folder)
-        sweep.run(points, watcher)
+        with opened_pool(workers) if workers else nullcontext() as pool:
+            sweep.run(points, watcher, pool)
         left_out = [*sweep.unmeasured(), *sweep.failures()]
         found = curves(sweep.results)
         if not found:
