@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivers.clock import SYSTEM_CLOCK
 from emmc_rig.errors import AppError
@@ -81,6 +81,12 @@ class WiredRig(AnyRig):
     kind: Literal["simulated"]
     trigger: SimulatedTrigger | None = None
     focus_um: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _says_something(self) -> WiredRig:
+        if self.trigger is None and self.focus_um is None:
+            raise ValueError("give trigger or focus_um; without either name the rig simulated")
+        return self
 
 
 class ImagedRig(AnyRig):
