@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from calibration.boards import Board
@@ -33,10 +34,13 @@ LARGEST_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Defects:
-    """The mask with its defects: grains (row, column), the share each takes off, and the mask."""
+    """The mask with its defects: grains (row, column), the share each takes off, and the mask.
+
+    covariance: of the losses, (grain, grain) over the flat mask; sparse, since specks lie apart.
+    """
 
     lost: NDArray[np.float32]
-    deviation: NDArray[np.float32]
+    covariance: sparse.csr_array
     mask: ShadowMask
 
     @property
@@ -74,19 +78,25 @@ def _influence(corners, shares_y, shares_x, weights, starts, through, channels, 
                         )
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """Through which views (v, u) the mask is seen, and where it stands: as `Board` says."""
+
+    views_open: NDArray[np.bool_]
+    stage_um: tuple[float, float]
+    shot: int
+
+
 def _entries(
-    shadow: Shadow, board: Board, pixels: NDArray[np.int64]
+    shadow: Shadow, seen: View | Board, pixels: NDArray[np.int64], channels: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return (pixel, grain) indices into the flat mask and their influences."""
-    channels = board.channels[pixels[:, 0], pixels[:, 1]]
-    corners, shares_y, shares_x, weights = shadow.footprints(
-        pixels, board.views_open, board.stage_um
-    )
+    corners, shares_y, shares_x, weights = shadow.footprints(pixels, seen.views_open, seen.stage_um)
     count = shares_x.shape[2]
     starts = corners.min(axis=1)
     spans = (corners.max(axis=1) - starts).max(axis=0) + count
     placement = shadow.placement
-    cells = shadow.mask.cells[board.shot % len(shadow.mask.cells)]
+    cells = shadow.mask.cells[seen.shot % len(shadow.mask.cells)]
     through = placement.leak + (placement.clear - placement.leak) * cells.astype(np.float64)
     out = np.empty((len(pixels), *spans))
     _influence(corners, shares_y, shares_x, weights, starts, through, channels, out)
@@ -105,7 +115,7 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
     fine = _grained(mask)
     height, width = fine.cells.shape[1:3]
     lost = np.zeros(height * width)
-    deviation = np.zeros(height * width)
+    covariance = sparse.csr_array((height * width, height * width))
     for _ in range(ROUNDS):
         shadow = Shadow(fine, placement)
         gradient, curvature = np.zeros(height * width), np.zeros(height * width)
@@ -113,11 +123,11 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
         residuals = [_residual(current, board) for board in boards]
         spread = max(1.0, 1.4826 * float(np.median(np.abs(np.concatenate(residuals)))))
         for board, residual in zip(boards, residuals, strict=True):
-            pixels = np.argwhere(board.usable)
+            pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
             deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
             for first in range(0, len(pixels), CHUNK):
                 part = slice(first, first + CHUNK)
-                index, influence = _entries(shadow, board, pixels[part])
+                index, influence = _entries(shadow, board, pixels[part], channels[part])
                 scaled = influence / deviations[part, None]
                 pull = -scaled * (residual[part, None] / spread)
                 gradient += np.bincount(index.ravel(), pull.ravel(), height * width)
@@ -127,11 +137,11 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
         chosen |= lost != 0
         if not chosen.any() or chosen.mean() > LARGEST_SHARE:
             break
-        lost, deviation = _solved(boards, shadow, fine, placement, np.flatnonzero(chosen), spread)
+        lost, covariance = _solved(boards, shadow, fine, placement, np.flatnonzero(chosen), spread)
     losses = lost.reshape(height, width)
     return Defects(
         losses.astype(np.float32),
-        deviation.reshape(height, width).astype(np.float32),
+        covariance,
         _with_losses(fine, placement, losses),
     )
 
@@ -157,19 +167,19 @@ def _solved(
     placement: Placement,
     chosen: NDArray[np.intp],
     spread: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the losses of the chosen grains and their deviations, on the flat mask."""
+) -> tuple[NDArray[np.float64], sparse.csr_array]:
+    """Return the losses of the chosen grains and their covariance, on the flat mask."""
     place = np.full(fine.cells.shape[1] * fine.cells.shape[2], -1)
     place[chosen] = np.arange(len(chosen))
     matrix = sparse.csc_array(sparse.diags_array(np.full(len(chosen), 1 / SIZE**2)))
     right = np.zeros(len(chosen))
     for board in boards:
         residual = _residual(shadow, board)
-        pixels = np.argwhere(board.usable)
+        pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
         deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
         for first in range(0, len(pixels), CHUNK):
             part = slice(first, first + CHUNK)
-            index, influence = _entries(shadow, board, pixels[part])
+            index, influence = _entries(shadow, board, pixels[part], channels[part])
             column = place[index]
             rows, entries = np.nonzero((column >= 0) & (influence > 0))
             values = influence[rows, entries] / deviations[part][rows]
@@ -179,10 +189,39 @@ def _solved(
             right += slopes.T @ (residual[part] / spread)
     matrix = sparse.csc_array(matrix)
     solution = np.ravel(np.asarray(spsolve(matrix, right)))
-    lost, deviation = np.zeros(len(place)), np.zeros(len(place))
+    lost = np.zeros(len(place))
     lost[chosen] = np.clip(solution, -1, 1)
-    deviation[chosen] = 1 / np.sqrt(matrix.diagonal())
-    return lost, deviation
+    blocks, rows, columns = [], [], []
+    count, part_of = connected_components(matrix, directed=False)
+    for part in range(count):
+        grains = np.flatnonzero(part_of == part)
+        blocks.append(np.linalg.inv(matrix[grains][:, grains].toarray()).ravel())
+        rows.append(chosen[grains].repeat(len(grains)))
+        columns.append(np.tile(chosen[grains], len(grains)))
+    entries = np.concatenate(blocks), (np.concatenate(rows), np.concatenate(columns))
+    return lost, sparse.csr_array(entries, shape=(len(place), len(place)))
+
+
+def loss_variance(
+    defects: Defects,
+    mask: ShadowMask,
+    placement: Placement,
+    pixels: NDArray[np.int64],
+    channels: NDArray[np.uint8],
+    seen: View,
+) -> NDArray[np.float64]:
+    """Return what the losses' covariance makes of the variance of readings at pixels (n, 2).
+
+    mask: without the defects.
+    """
+    if len(pixels) == 0:
+        return np.zeros(0)
+    index, influence = _entries(Shadow(_grained(mask), placement), seen, pixels, channels)
+    rows = np.arange(len(pixels)).repeat(index.shape[1])
+    shape = (len(pixels), defects.lost.size)
+    slopes = sparse.csr_array((influence.ravel(), (rows, index.ravel())), shape=shape)
+    spread = sparse.csr_array(slopes @ defects.covariance)
+    return np.ravel(sparse.csr_array(spread.multiply(slopes)).sum(axis=1))
 
 
 def _with_losses(fine: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:

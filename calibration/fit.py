@@ -29,7 +29,8 @@ from calibration.placement import (
     with_aperture_mean_one,
 )
 from calibration.registration import register
-from calibration.shadow import Shadow, ShadowMask
+from calibration.shadow import OF_VIEW, Shadow, ShadowMask
+from calibration.view_errors import bias_covariance
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings
 
@@ -222,6 +223,36 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
     return _Normal(matrix, gradient, information, spread, squares, kept, count)
 
 
+def _view_terms(
+    mask: ShadowMask, placement: Placement, samples: Sequence[_Sample], spread: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `bias_covariance` takes of the views' own displacements and softenings."""
+    shadow = Shadow(mask, placement)
+    size, own_size = len(placement.vector()), OF_VIEW * mask.views[0] * mask.views[1]
+    mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
+    pull = np.zeros(own_size)
+    for sample in samples:
+        board = sample.board
+        scaled = _scaled_residuals(shadow, sample) / spread
+        weight = _weights(scaled)
+        for first in range(0, len(scaled), CHUNK):
+            part = slice(first, first + CHUNK)
+            slope, by_view = shadow.slopes_by_view(
+                sample.pixels[part],
+                sample.channels[part],
+                board.views_open,
+                board.stage_um,
+                board.shot,
+            )
+            scale = 1 / (sample.deviation[part, None] * spread)
+            slope, by_view = slope * scale, by_view * scale
+            weighted = by_view * weight[part, None]
+            mixed += slope.T @ weighted
+            own += by_view.T @ weighted
+            pull += weighted.T @ scaled[part]
+    return mixed, own, pull
+
+
 def _posterior(
     mask: ShadowMask,
     placement: Placement,
@@ -297,9 +328,10 @@ def fit_placement(
     lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
     kept = max(normal.kept, 1)
+    terms = _view_terms(mask, placement, samples, normal.spread)
     return Fit(
         placement,
-        covariance,
+        covariance + bias_covariance(covariance, *terms),
         bound,
         correlation,
         normal.squares / kept,

@@ -12,7 +12,8 @@ from calibration.shadow import ANY_COLOUR, Shadow
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
-ROWS = 256
+BAND_PIXELS = 2**16
+"""Of Psi at once: its derivatives by 41 parameters take 20 MB."""
 Stages = Sequence[tuple[float, float]]
 SAMPLED = 3_000
 
@@ -34,8 +35,9 @@ def _bands(
 ) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.uint8]]]:
     """Yield rows of samples with their indices (n, 2) and colours (n,)."""
     rows, columns = layout.size
-    for first in range(0, rows, ROWS):
-        band = slice(first, min(first + ROWS, rows))
+    step = max(BAND_PIXELS // columns, 1)
+    for first in range(0, rows, step):
+        band = slice(first, min(first + step, rows))
         y, x = np.mgrid[band, :columns]
         samples = np.stack([y.ravel(), x.ravel()], axis=1)
         if layout.colour is None:

@@ -10,9 +10,9 @@ part of the distance. The mask is seen through the convolution of three kernels:
 the aperture cell's box, and a Gaussian of deviation blur_um (rounded cells, diffraction).
 
 The coefficient of view j at pixel p is w_j(p) (leak + (clear - leak) T_j(p)), T the design's
-transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j + falloff |u_j|^2) / sum over the
-views, x and u as shares of the picture's corner and of the aperture's: what falls off evenly over
-the views cancels against the white board seen without masks. The falloff could be part of the
+transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j) (1 + falloff |u_j|^2) / sum over
+the views, x and u as shares of the picture's corner and of the aperture's: what falls off evenly
+over the views cancels against the white board seen without masks. The falloff could be part of the
 a_j; told apart, what is left of those is small.
 """
 

@@ -23,13 +23,19 @@ from calibration.choice import (
 )
 from calibration.colours import crosstalk, in_three_colours, mixing, other_colours
 from calibration.combine import combined
-from calibration.defects import Defects, find_defects
+from calibration.defects import Defects, View, find_defects, loss_variance
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
 from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
 from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, measured_misfit
-from calibration.parametric import Stages, psi_at, psi_deviation, shot_stages
+from calibration.parametric import (
+    Stages,
+    coefficient_planes,
+    psi_at,
+    psi_deviation,
+    shot_stages,
+)
 from calibration.placement import Tolerances, designed_placement
 from calibration.refusals import refuse_another_bench, refuse_unfit, refuse_without_mask
 from calibration.registration import register
@@ -38,8 +44,9 @@ from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, meas
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 
-MOST_PIXELS_WITH_DEVIATION = 2_000_000
 LARGEST_FLICKER = 0.01
+LEAST_LOSS = 1e-5
+"""Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
 
 
@@ -47,13 +54,15 @@ LARGEST_MOVE_UM = 1.0
 class Parametric:
     """What the parametric routes know of the bench: fit and mask, with its defects if sought.
 
-    misfit: of the model at whiteboards through the pinhole, by view; None without any.
+    misfit: of the model at whiteboards of few views, by view; None without any. of_defects: mean
+    square of what is missed where the mask has defects, over the square of what they take.
     """
 
     fit: Fit
     mask: ShadowMask
     defects: Defects | None = None
     misfit: Mapping[tuple[int, int], Misfit] | None = None
+    of_defects: float = 0.0
 
     @property
     def shadow(self) -> Shadow:
@@ -151,6 +160,7 @@ def calibrate(
             mixed = with_misfit(_mixed(seen, camera, parametric, fit_settings, tolerances), seen)
         for name, one in (("parametric", parametric), ("mixed", mixed)):
             if one is not None:
+                one = replace(one, of_defects=_missed_at_defects(one, [*seen, *judges]))
                 on_stage(f"Psi, {name}")
                 bare[name] = _calibration(one, camera, design, few, good)
                 calibrations[name] = _counting_misfit(bare[name], one)
@@ -178,11 +188,10 @@ def calibrate(
         if "combined" in routes and best is not None and few is not None:
             on_stage("Psi, combined")
             model = bare["mixed" if mixed is not None else "parametric"]
-            if np.isfinite(model.deviation).all():
-                both = combined(free, model, good)
-                calibrations["combined"] = both
-                judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
-                frames["combined"] = few.exposures
+            both = combined(free, model, good)
+            calibrations["combined"] = both
+            judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
+            frames["combined"] = few.exposures
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > AT_THE_NOISE:
@@ -309,6 +318,30 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     )
 
 
+def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
+    """Return the mean square that whiteboards miss at defects, over that of what defects take.
+
+    Half cells do not draw the outline of a speck. Give it those held out as well: to those fitted
+    the losses of the grains are fitted too.
+    """
+    if one.defects is None or one.defects.count == 0:
+        return 0.0
+    clean, soiled = Shadow(one.mask, one.fit.placement), one.shadow
+    missed = taken = 0.0
+    for board in boards:
+        predicted = predicted_by_shadow(soiled, board)
+        lost = np.abs(predicted - predicted_by_shadow(clean, board)) > LEAST_LOSS
+        excess = np.square(board.reading - predicted, dtype=np.float64) - board.variance
+        there, elsewhere = (board.usable & chosen for chosen in (lost, ~lost))
+        if not there.any() or not elsewhere.any():
+            continue
+        missed += float(excess[there].sum() - there.sum() * excess[elsewhere].mean())
+        where = np.argwhere(there), board.channels[there], board.stage_um, board.shot
+        of_views = clean.coefficients(*where) - soiled.coefficients(*where)
+        taken += float(np.square(of_views[:, board.views_open]).sum())
+    return max(missed / taken, 0.0) if taken > 0 else 0.0
+
+
 def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
     groups = {
@@ -354,12 +387,37 @@ def _calibration(
 ) -> Calibration:
     stages = shot_stages(camera)
     psi = one.psi(design, stages)
-    if np.prod(design.size) <= MOST_PIXELS_WITH_DEVIATION:
-        deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
-    else:
-        deviation = np.broadcast_to(np.float32(np.nan), psi.weights.shape)
+    deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
+    if one.defects is not None and one.defects.count:
+        deviation = _counting_defects(deviation, one, design, stages)
     white = np.stack([_white(boards, design, shot) for shot in range(design.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
+
+
+def _counting_defects(
+    deviation: NDArray[np.float32], one: Parametric, design: ImagingMatrix, stages: Stages
+) -> NDArray[np.float32]:
+    """Return the deviation of Psi with what is not known of the defects of its mask."""
+    assert one.defects is not None
+    clean, soiled = (
+        coefficient_planes(Shadow(mask, one.fit.placement), design.layout, stages)
+        for mask in (one.mask, one.defects.mask)
+    )
+    for ((shot, v, u, stored), bare), (_, plane) in zip(clean, soiled, strict=True):
+        touched = np.argwhere(bare != plane)
+        y, x = touched.T
+        opened = np.zeros(one.mask.views, dtype=bool)
+        opened[v, u] = True
+        channels = np.full(len(touched), stored, dtype=np.uint8)
+        if design.colour is not None:
+            channels = design.colour[shot, y, x]
+        seen = View(opened, stages[shot], shot)
+        of_losses = loss_variance(one.defects, one.mask, one.fit.placement, touched, channels, seen)
+        of_outline = one.of_defects * np.square(bare - plane)[y, x]
+        place = (shot, v, u, y, stored, x)
+        more = of_losses / deviation.shape[4] ** 2 + of_outline
+        deviation[place] = np.sqrt(np.square(deviation[place]) + more)
+    return deviation
 
 
 def _counting_misfit(known: Calibration, one: Parametric) -> Calibration:

@@ -25,6 +25,8 @@ BLOCKS = 12
 FIT_SHARE = 0.7
 LINEAR_RANGE = (0.05, 0.95)
 CLIPPED_SHARE = 0.01
+FALLEN_SHARE = 0.8
+"""Of the greatest variance: beyond what noise makes of the variance of a frame of any size."""
 QUANTISATION_DN2 = 1 / 12
 BRIGHTER_DEVIATIONS = 10.0
 HOT_DEVIATIONS = 8.0
@@ -54,6 +56,7 @@ class SensorSheet:
     """The EMVA 1288 quantities; `deviations` by their names.
 
     linearity_residual: percent, per point of the curve. good: (y, x), neither hot nor dead.
+    saturated: the flats reach saturation; else what follows from it is a lower bound.
     """
 
     gain_dn_per_electron: float
@@ -74,11 +77,17 @@ class SensorSheet:
     linearity_residual: Array
     good: NDArray[np.bool_]
     deviations: dict[str, float] = field(default_factory=dict)
+    saturated: bool = True
 
     def rows(self) -> list[tuple[str, float, float | None, str]]:
         """Return (quantity, value, standard deviation or None, unit) for a table."""
         return [
-            (words, float(getattr(self, name)), self.deviations.get(name), unit)
+            (
+                words if self.saturated or name not in OF_SATURATION else f"{words}, at least",
+                float(getattr(self, name)),
+                self.deviations.get(name),
+                unit,
+            )
             for name, (words, unit) in QUANTITIES.items()
         ]
 
@@ -98,6 +107,7 @@ QUANTITIES = {
     "hot_pixels": ("Hot pixels", ""),
     "dead_pixels": ("Dead pixels", ""),
 }
+OF_SATURATION = ("full_well_electrons", "saturation_dn", "snr_max_db", "dynamic_range_db")
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +205,7 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
         linearity_residual=residual,
         good=good,
         deviations=deviations,
+        saturated=_saturated(levels),
     )
 
 
@@ -224,6 +235,14 @@ def _saturation(signal: Array, spread: Array, clipped: Array) -> float:
     """Return the signal at which the variance is greatest: EMVA 1288's saturation point."""
     free = np.where(clipped < CLIPPED_SHARE, spread, 0)
     return float(max(signal[np.argmax(free[:, phase]), phase] for phase in range(4)))
+
+
+def _saturated(flats: Sequence[_Level]) -> bool:
+    """Return whether the brightest flat lies past saturation: clipped, or of less variance."""
+    brightest = max(flats, key=lambda one: one.exposure_s)
+    most = np.max([one.variance.mean(axis=0) for one in flats], axis=0)
+    fell = brightest.variance.mean(axis=0) < FALLEN_SHARE * most
+    return bool(brightest.clipped.max() >= CLIPPED_SHARE or fell.any())
 
 
 def _figures(

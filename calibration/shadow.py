@@ -27,6 +27,8 @@ TAILS = 4.0
 NARROWEST_CELLS = 1e-3
 GLASS_INDEX = 1.52
 ANY_COLOUR = 3
+OF_VIEW = 5
+"""Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
 """Beyond the beam, for a mask that sits askew."""
 
@@ -195,10 +197,13 @@ def _read(
     out,
     slope,
     each,
+    by_view,
 ):
     """Set out (n,) to the readings of pixels (n, 2), and slope (n, parameter) if it has rows.
 
-    each (n, view), if it has rows, is set to what every open view adds.
+    each (n, view), if it has rows, is set to what every open view adds, and by_view (n, view, 5) to
+    the reading's derivatives by the mask as that view alone sees it: its x and y, its blur along
+    columns and rows, and across both.
 
     numbers: size (rows, columns), binning. lengths: cell, rho, d / D, pitch, aperture cell, corner,
     aperture corner, offset x, y, bend, clear, leak, vignetting, falloff, tilt x, y, bow, glass,
@@ -237,9 +242,10 @@ def _read(
                     u_um = (u - (views_u - 1) / 2) * view_um
                     lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
                     far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
-                    weight_sum += aperture[v, u] * (1 + vignetting * lean + falloff * far)
-                    leaning_sum += aperture[v, u] * lean
-                    far_sum += aperture[v, u] * far
+                    leaning, falling = 1 + vignetting * lean, 1 + falloff * far
+                    weight_sum += aperture[v, u] * leaning * falling
+                    leaning_sum += aperture[v, u] * lean * falling
+                    far_sum += aperture[v, u] * far * leaning
             here = 0.0
             here_gradient = np.zeros(scalars + views_v * views_u)
             for v in range(views_v):
@@ -294,7 +300,8 @@ def _read(
                             by_blur += down[0, a] * value[3] + down[3, a] * value[0]
                     lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
                     far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
-                    share = aperture[v, u] * (1 + vignetting * lean + falloff * far) / weight_sum
+                    leaning, falling = 1 + vignetting * lean, 1 + falloff * far
+                    share = aperture[v, u] * leaning * falling / weight_sum
                     through = leak + (clear - leak) * passed
                     here += share * through
                     if each.shape[0] > 0:
@@ -320,10 +327,25 @@ def _read(
                     )
                     here_gradient[6] += cube * (to_x * x_um + to_y * y_um)
                     here_gradient[7] += gain * by_blur
+                    if by_view.shape[0] > 0:
+                        blur_x, blur_y, crossed = 0.0, 0.0, 0.0
+                        for a in range(count):
+                            for b in range(count):
+                                if 0 <= top + a < height and 0 <= left + b < width:
+                                    cell = cells[top + a, left + b, channel]
+                                    blur_x += cell * down[0, a] * across[3, b]
+                                    blur_y += cell * down[3, a] * across[0, b]
+                                    crossed += cell * down[1, a] * across[1, b]
+                        view = by_view[n, v * views_u + u]
+                        view[0] -= to_x / parts
+                        view[1] -= to_y / parts
+                        view[2] += gain * blur_x / parts
+                        view[3] += gain * blur_y / parts
+                        view[4] += gain * crossed / (cell_um * parts)
                     here_gradient[8] += share * passed
                     here_gradient[9] += share * (1 - passed)
-                    here_gradient[10] += aperture[v, u] * lean / weight_sum * through
-                    here_gradient[11] += aperture[v, u] * far / weight_sum * through
+                    here_gradient[10] += share * lean / leaning * through
+                    here_gradient[11] += share * far / falling * through
                     along = to_x * to_u + to_y * to_v
                     here_gradient[12] += along * x_um
                     here_gradient[13] += along * y_um
@@ -341,7 +363,7 @@ def _read(
                         lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
                         far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
                         here_gradient[scalars + v * views_u + u] -= (
-                            here * (1 + vignetting * lean + falloff * far) / weight_sum
+                            here * (1 + vignetting * lean) * (1 + falloff * far) / weight_sum
                         )
                 for p in range(gradient.shape[0]):
                     gradient[p] += here_gradient[p] / parts
@@ -386,6 +408,24 @@ class Shadow:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the readings (n,) and their derivatives (n, parameter), as `readings`."""
         return self._both(pixels, channels, views_open, stage_um, frame, len(pixels))[:2]
+
+    def slopes_by_view(
+        self,
+        pixels: Pixels,
+        channels: NDArray[np.uint8],
+        views_open: NDArray[np.bool_],
+        stage_um: tuple[float, float] = (0.0, 0.0),
+        frame: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the derivatives of the readings by the parameters, (n, parameter), and by view.
+
+        The latter by what each view alone sees of the mask, (n, view x 5): x, y, blur along columns
+        and rows, all in um, and across both, in cells times um.
+        """
+        by_view = np.zeros((len(pixels), self._aperture.size, OF_VIEW))
+        count = len(pixels)
+        slope = self._both(pixels, channels, views_open, stage_um, frame, count, 0, by_view)[1]
+        return slope, by_view.reshape(count, -1)
 
     def coefficients(
         self,
@@ -449,7 +489,7 @@ class Shadow:
         def counted(v: Array, u: Array, y: Array, x: Array) -> Array:
             leaning = (x * u + y * v) / (mask.corner_um * self._far_um)
             far = (u**2 + v**2) / self._far_um**2
-            return 1 + at.vignetting * leaning + at.falloff * far
+            return (1 + at.vignetting * leaning) * (1 + at.falloff * far)
 
         every = np.argwhere(np.ones(mask.views, dtype=bool))
         totals = sum(
@@ -473,6 +513,7 @@ class Shadow:
         frame: int,
         slopes: int = 0,
         views: int = 0,
+        by_view: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         mask, at = self.mask, self.placement
         out = np.empty(len(pixels))
@@ -516,5 +557,6 @@ class Shadow:
             out,
             slope,
             each,
+            np.zeros((0, 0, OF_VIEW)) if by_view is None else by_view,
         )
         return out, slope, each

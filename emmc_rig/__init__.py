@@ -6,7 +6,7 @@
 >>> psi = camera.psi(scene.size)
 >>> frames = camera.expose(scene, seed=0, psi=psi)  # psi @ scene: the same without noise
 >>> result = emmc.reconstruct(psi, frames, "tv")  # by default the method "adaptive"
->>> result.light_field.shape, result.verdict.level in ("trust", "doubt", "do not use")
+>>> result.light_field.shape, result.verdict.level != "do not use"
 ((5, 5, 24, 32, 3), True)
 
 Functions: `camera`, `scene`, `reconstruct`, `rig`, `capture`, `calibrate`, `open_frames`.

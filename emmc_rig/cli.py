@@ -17,6 +17,7 @@ from emmc_rig.commands.devices import app as devices
 from emmc_rig.commands.export import export
 from emmc_rig.commands.figure import figure
 from emmc_rig.commands.live import live
+from emmc_rig.commands.modes import ModalCommand
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
@@ -43,7 +44,7 @@ for command in (
     capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart, train,
     tables, stability, design,
 ):  # fmt: skip
-    app.command()(command)
+    app.command(cls=ModalCommand)(command)
 
 
 @app.callback(invoke_without_command=True)

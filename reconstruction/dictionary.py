@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.reading import one_line, stored_arrays
 from reconstruction.errors import DictionaryError
 
@@ -25,8 +26,6 @@ FORMAT = "emmc-rig dictionary 1"
 _NORM_TOLERANCE = 1e-3
 _CHUNK_BYTES = 1 << 20
 
-OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-"""Luminance and two chrominances (opponent colour, RGB), orthonormal."""
 _BLUR_PX, _CHROMA_BLUR_PX = 0.7, 1.0
 _SAME = 0.995
 
@@ -118,10 +117,7 @@ class Dictionary:
                 file.attrs["format"] = FORMAT
                 file.attrs["kind"] = self.kind
                 file.create_dataset(
-                    "atoms",
-                    data=self.atoms,
-                    chunks=(rows, *self.atoms.shape[1:]),
-                    fletcher32=True,
+                    "atoms", data=self.atoms, chunks=(rows, *self.atoms.shape[1:]), fletcher32=True
                 )
                 file["provenance"] = self.provenance
         except OSError as fault:
@@ -197,10 +193,7 @@ def dct_dictionary(
     _check_patch(views, patch, colours)
     sizes = *views, *patch
     counts = frequencies or (*(min(3, n) for n in views), *patch)
-    chroma = chroma_frequencies or (
-        *(min(2, n) for n in views),
-        *(max(1, n // 2) for n in patch),
-    )
+    chroma = chroma_frequencies or (*(min(2, n) for n in views), *(max(1, n // 2) for n in patch))
     sets = [_cosines(sizes, counts), *[_cosines(sizes, chroma)] * (colours - 1)]
     return Dictionary.normalised(_coloured(sets), "dct")
 

@@ -37,48 +37,6 @@ def _fits(shape, reach, v, u, y):
     return v + reach[3] < shape[0] and u + reach[2] < shape[1] and y + reach[1] < shape[2]
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def gradient(light_field, stencils, colours, out):
-    """Set out (index, v, u, y, x c) to the derivatives of light_field (v, u, y, x c) that fit."""
-    reach, begin, offset, factor = stencils
-    views_v, views_u, rows, width = light_field.shape
-    for y in prange(rows):
-        for index in range(len(reach)):
-            inside = width - reach[index, 0] * colours
-            for v in range(views_v - reach[index, 3]):
-                for u in range(views_u - reach[index, 2]):
-                    if not _fits(light_field.shape, reach[index], v, u, y):
-                        continue
-                    line = out[index, v, u, y]
-                    for tap in range(begin[index], begin[index + 1]):
-                        dx, dy, du, dv = offset[tap]
-                        source = light_field[v + dv, u + du, y + dy][dx * colours :]
-                        for x in range(inside):
-                            line[x] += factor[tap] * source[x]
-
-
-@njit(cache=True, parallel=True, fastmath=True)
-def adjoint(derivatives, stencils, colours, out):
-    """Add to out (v, u, y, x c) the adjoint of `gradient` on derivatives (index, v, u, y, x c)."""
-    reach, begin, offset, factor = stencils
-    views_v, views_u, rows, width = out.shape
-    for y in prange(rows):
-        for v in range(views_v):
-            for u in range(views_u):
-                line = out[v, u, y]
-                for index in range(len(reach)):
-                    inside = width - reach[index, 0] * colours
-                    for tap in range(begin[index], begin[index + 1]):
-                        dx, dy, du, dv = offset[tap]
-                        if dv > v or du > u or dy > y:
-                            continue
-                        if _fits(out.shape, reach[index], v - dv, u - du, y - dy):
-                            source = derivatives[index, v - dv, u - du, y - dy]
-                            moved = line[dx * colours :]
-                            for x in range(inside):
-                                moved[x] += factor[tap] * source[x]
-
-
 @njit(cache=True, fastmath=True)
 def _differentiate(light_field, stencils, index, v, u, y, out):
     """Set out (3, x), colours apart, to a derivative that fits of a light field (v, u, y, 3 x).

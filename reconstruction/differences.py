@@ -5,7 +5,7 @@ differences, binomial stencils. It exists only where its whole stencil fits, so 
 light field is 0. DV_K sums over the distinct multi-indices, C(K + 3, 3) of them, as the paper
 defines it (its dual variable, of 4^K ordered derivatives, would count mixed ones repeatedly).
 
-Light fields have axes (v, u, y, x, c), derivatives (index, v, u, y, x, c).
+Light fields have axes (v, u, y, x, c).
 """
 
 from __future__ import annotations
@@ -73,37 +73,6 @@ def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> Stencils:
         np.array([tap for taps in offsets for tap in taps], dtype=np.int64),
         np.array(factors, dtype=dtype),
     )
-
-
-def gradient(light_field: Array, order: int) -> Array:
-    """Return all derivatives of an order that fit somewhere, 0 where their stencils do not.
-
-    Takes (v, u, y, x, c), returns (index, v, u, y, x, c), indices as in `fitting_indices`.
-    """
-    light_field = np.ascontiguousarray(light_field)
-    taps = stencils(order, light_field.shape, light_field.dtype)
-    found = np.zeros((len(taps.reach), *light_field.shape), dtype=light_field.dtype)
-    colours = light_field.shape[-1]
-    difference_kernels.gradient(_flat(light_field), taps, colours, _flat(found))
-    return found
-
-
-def adjoint(derivatives: Array, order: int) -> Array:
-    """Return the adjoint of `gradient`; values where a stencil does not fit have no influence."""
-    derivatives = np.ascontiguousarray(derivatives)
-    taps = stencils(order, derivatives.shape[1:], derivatives.dtype)
-    if len(derivatives) != len(taps.reach):
-        raise ReconstructionError(
-            f"{len(derivatives)} derivatives given, order {order} has {len(taps.reach)} here"
-        )
-    found = np.zeros(derivatives.shape[1:], dtype=derivatives.dtype)
-    difference_kernels.adjoint(_flat(derivatives), taps, derivatives.shape[-1], _flat(found))
-    return found
-
-
-def _flat(array: Array) -> Array:
-    """Return (..., x, c) as (..., x c)."""
-    return array.reshape(*array.shape[:-2], -1)
 
 
 def _difference_norm_squared(order: int, samples: int | None) -> float:

@@ -24,9 +24,9 @@ from numba import get_num_threads, njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.settings import Settings
 from reconstruction.batch_omp import NO_ATOM, Array, bands, batch_omp
-from reconstruction.dictionary import OPPONENT
 from reconstruction.errors import DictionaryError
 
 _ROWS_AT_ONCE = 2048

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,6 +76,7 @@ class Method:
 
     assumes, cost, when: for people; `cost` in the letters of COSTS. solve: from what is given and
     the settings of all methods. part, settings: the name and type of its own part of the settings.
+    package: what it needs beyond the core installation; it is then learned, for some views only.
     """
 
     name: str
@@ -87,6 +89,12 @@ class Method:
     settings: type[Settings]
     needs_dictionary: bool = False
     sensitivity: Sensitivity = field(default_factory=Sensitivity)
+    package: str | None = None
+
+    @property
+    def installed(self) -> bool:
+        """Whether what it needs is installed."""
+        return self.package is None or find_spec(self.package) is not None
 
 
 COSTS = (

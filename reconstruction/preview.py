@@ -120,10 +120,7 @@ class Preview:
             self._shared, frames, max(noise_sigma, PICTURE_NOISE * mean), good
         )
         self._coarse = _Following(
-            coarse,
-            self._cut(frames),
-            max(noise_sigma, COARSE_NOISE * mean),
-            self._cut(good),
+            coarse, self._cut(frames), max(noise_sigma, COARSE_NOISE * mean), self._cut(good)
         )
 
     def _cut(self, frames: NDArray) -> NDArray:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from reconstruction import kernels
 from reconstruction.differences import planar_variation
@@ -17,7 +18,6 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
-OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 
 
 def colour_metric(chroma_weight: float) -> NDArray[np.float64]:

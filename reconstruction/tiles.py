@@ -10,27 +10,22 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil, lcm
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.errors import SensingError
-from emmc_rig.model.reading import StoredArrays, stored_arrays
-from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.edges import SIDES, dark_edges
 from reconstruction.adaptive.parsimony import may_be_grey
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import TINY
+from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -82,60 +77,6 @@ class PsiSource(Protocol):
     def window(self, rows: slice, columns: slice) -> ImagingMatrix:
         """Return the imaging matrix of some samples; the slices are multiples of k."""
         ...
-
-
-class SavedPsi:
-    """The imaging matrix in a file, read window by window.
-
-    The file's checksum is not verified, which would need all of it: `ImagingMatrix.load` does.
-    Raises SensingError when the file is no imaging matrix.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        with self._opened() as stored:
-            weights = stored.dataset("weights")
-            self.shape = weights.shape
-            self.views = weights.shape[1], weights.shape[2]
-            self.size = weights.shape[3], weights.shape[5]
-            self.binning = int(np.asarray(stored.attributes["binning"]))
-            self.checksum = str(stored.attributes["sha256"])
-
-    @property
-    def frames_shape(self) -> tuple[int, int, int]:
-        """(shot, pixel_y, pixel_x)."""
-        rows, columns = (length // self.binning for length in self.size)
-        return self.shape[0], rows, columns
-
-    def verify(self) -> None:
-        """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
-        with self._opened() as stored:
-            camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
-            digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{camera}".encode())
-            for place in np.ndindex(self.shape[:3]):
-                digest.update(np.ascontiguousarray(weights[place]).view(np.uint8).data)
-            colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
-            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
-        if digest.hexdigest() != self.checksum:
-            raise SensingError(f"{self._path}: damaged (its checksum differs); measure Psi again")
-
-    @contextmanager
-    def _opened(self) -> Iterator[StoredArrays]:
-        with stored_arrays(self._path, SensingError, "measure Psi again") as stored:
-            if stored.attributes.get("format") != FORMAT or "weights" not in stored:
-                raise SensingError(f"{self._path}: not an imaging matrix of this program")
-            yield stored
-
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
-        """Return the imaging matrix of some samples; the slices are multiples of k."""
-        with self._opened() as stored:
-            colour = stored.dataset("colour") if "colour" in stored else None
-            return ImagingMatrix(
-                stored.dataset("weights")[:, :, :, rows, :, columns],
-                None if colour is None else colour[:, rows, columns],
-                self.binning,
-                str(stored.attributes["camera"]),
-            )
 
 
 @dataclass(frozen=True)
@@ -454,12 +395,15 @@ def surveyed(
                 )
         largest = max((one.largest_px for one in disparities), default=0.0)
         halo = TEXTURE_REACH * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
-        picture = smooth_guess(mosaic, read, use)
+        flat = flat_psi(mosaic)
+        picture = smooth_guess(flat, read, use).astype(np.float32)
+        noise = np.full(read.shape, noise_sigma**2)
         plane = _joint_plane(disparities, psi.size, k) if settings.adaptive.parsimony else None
         grey = settings.adaptive.parsimony and may_be_grey(picture)
         adaptive = settings.adaptive.model_copy(
             update={
-                "brightness": settings.adaptive.brightness or max(float(picture.mean()), TINY),
+                "contrast": settings.adaptive.contrast
+                or contrast_of(flat, read, picture, noise, use),
                 "parsimony": plane is not None or grey,
                 "plane": plane,
                 "edges": _dark_sides(psi, frames, usable),

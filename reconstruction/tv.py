@@ -10,7 +10,7 @@ resolves what mask and CFA leave ambiguous; a weight of 1 is the paper's DV_K ex
 The algorithm is over-relaxed primal-dual splitting (Condat 2013, algorithm 3.1) with the proximal
 step of frames and patches together: with a = 1/gamma + rho W and q what the dual variable descends
 to, z = (q / gamma + rho W M) / a, then z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I), one small block
-per pixel. The paper's eq. 10-13 (`full_splitting`) take gradients instead.
+per pixel. The paper's eq. 10-13 (`tests/full_splitting.py`) take gradients instead.
 
 Bytes of one step, float32, for N = v u y x c values, one stored colour of three and s shots:
 light field read and written 2 x 4N, dual variable read and written 2 x 16N, weights s x 4N/3; with

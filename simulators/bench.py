@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -44,6 +45,8 @@ LAMPS = {
 }
 RAYS_PER_VIEW = 128
 WINDOW_MARGIN = 0.05
+FOCUS_PX_PER_UM = 0.01
+"""Samples by which the scene moves from view to view for each um that the lens is out of focus."""
 KEPT_BYTES = 64_000_000
 """Of readings already traced: the standings of a small bench's whole calibration."""
 
@@ -248,7 +251,8 @@ class Bench:
 
     scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1.
     positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
-        axis), aperture_x, aperture_y (0: the pinhole on the axis).
+        axis), aperture_x, aperture_y (0: the pinhole on the axis), and focus (0: as the scene is),
+        where there is such an axis.
     window_um: the stage's x that brings the plate's window, as large as the aperture, onto the
         axis; but for it and the pinhole of one aperture cell the plate is opaque.
     """
@@ -326,6 +330,26 @@ class Bench:
             self._seen[state] = self._pixels(self._trace(at_um, lamp))
         return self._seen[state]
 
+    def _focused(self, offset_um: float) -> NDArray[np.float32]:
+        """Return the scene with the lens so far from focus: its views moved against each other."""
+        if offset_um == 0:
+            return self._scene
+        f, g = self._finer
+        step_px = FOCUS_PX_PER_UM * offset_um * g / f
+        moved = np.empty_like(self._scene)
+        middle = (np.array(self._scene.shape[:2]) - 1) / 2
+        for v, u in np.ndindex(self._scene.shape[:2]):
+            by_y, by_x = step_px * (np.array([v, u]) - middle)
+            matrix = np.array([[1.0, 0.0, by_x], [0.0, 1.0, by_y]])
+            moved[v, u] = cv2.warpAffine(
+                self._scene[v, u],
+                matrix,
+                self._scene.shape[3:1:-1],
+                flags=cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        return moved
+
     def _pixels(self, samples: Array) -> Array:
         k = self.camera.sensor.binning
         rows, columns = self._size[0] // k, self._size[1] // k
@@ -396,7 +420,11 @@ class Bench:
             errors = NO_ERRORS if at_lens else self._errors
             plates.append(self._standing(errors, plate.distance_mm, grain_um, moved))
         board = self.target == "whiteboard" or cell is not None
-        scene = np.ones((1, 1, 1, 1, 3), np.float32) if board else self._scene
+        scene = (
+            np.ones((1, 1, 1, 1, 3), np.float32)
+            if board
+            else self._focused(at_um.get("focus", 0.0))
+        )
         response = self._response[self.shot]
         seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
         samples = np.empty(self._size)

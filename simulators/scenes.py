@@ -75,7 +75,13 @@ def render(
         raise SceneError(f"{size[0]}x{size[1]} pixels: needs {_SMALLEST_PX}x{_SMALLEST_PX} or more")
     if seed < 0:
         raise SceneError(f"seed {seed}: needs 0 or more")
-    tables = _tables(name, seed) if change is None else tabulated(change(_world(name, seed)))
+    known = change is None
+    tables = _tables(name, seed) if known else tabulated(change(_world(name, seed)))
+    return rendered(tables, views, size)
+
+
+def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> RenderedScene:
+    """Return all views of a world that `tabulated` laid out, and the disparity, as `render`."""
     steps = max(views)
     apertures = [
         ((v - (views[0] - 1) / 2) / steps, (u - (views[1] - 1) / 2) / steps)

@@ -16,7 +16,7 @@ from capture_rigs import begun, plan_and_camera, still_rig
 
 from emmc_rig.capture import writer
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session import journal, lock, session, storage
 from emmc_rig.session.lock import held
@@ -32,7 +32,7 @@ settle_s: 0.1
 WATCHED = frozenset(module.__file__ for module in (storage, journal, lock, session, writer))
 
 
-class Countdown(Unwatched):
+class Countdown(CaptureWatcher):
     """Counts events, and kills the process at one of them."""
 
     def __init__(self, number):

@@ -8,13 +8,19 @@ from emmc_rig.capture.until import refuse_without_choice
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.progress import Silent
 from emmc_rig.session.session import Session
-from emmc_rig.study import ablation, next_shot
+from emmc_rig.study import ablation, constants, next_shot
 from emmc_rig.study.oracle import STEP_PX, matched_disparity
 from emmc_rig.study.sweep import open_folder
 from emmc_rig.study.trial import Setup
+from reconstruction.adaptive import parsimony, search
+from reconstruction.adaptive.joint import TextureSettings
+from reconstruction.adaptive.search import DECISIVE
+from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.tv import TVSettings
 from simulators.scenes import render
 
 CAMERA, SIZE = "scenario-ii-cfa", (36, 44)
+QUICK = MethodSettings(tv=TVSettings(max_steps=3))
 
 
 def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkeypatch, tmp_path):
@@ -34,6 +40,44 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkey
         assert row.buys_db == pytest.approx(rows[0].psnr_db - row.psnr_db)
     monkeypatch.setattr(ablation, "_reconstructed", None)
     assert ablation.ablations(given, tmp_path, Silent()) == rows
+
+
+def test_the_constants_of_the_method_are_those_that_its_modules_and_settings_have():
+    found = {one.label: one.value for one in constants.constants()}
+    assert found["search.DECISIVE"] == DECISIVE
+    assert found["settings.texture.steps"] == TextureSettings().steps
+    assert "search.NEAR_PX" in found, "assigned with another"
+    assert "parsimony.DECISIVE" not in found, "imported"
+    assert "settings.nearer" not in found, "no number"
+    assert "assembly.TAPS" not in found, "compiled into kernels"
+
+
+def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp_path):
+    some = [one for one in constants.constants() if one.name in ("DECISIVE", "momentum")]
+    monkeypatch.setattr(constants, "constants", lambda: some)
+    seen = []
+
+    def reconstructed(psi, frames, noise_sigma, settings, usable):
+        seen.append((search.DECISIVE, parsimony.DECISIVE, settings.texture.momentum))
+        return reconstruct("tv", psi, frames, noise_sigma, settings=QUICK, usable=usable)
+
+    monkeypatch.setattr(constants, "reconstruct_adaptive", reconstructed)
+    given = [Setup("deep-occlusions", find_camera(CAMERA), SIZE)]
+    costs, left_out = constants.constant_costs(given, tmp_path, Silent())
+    own = DECISIVE, DECISIVE, 0.5
+    assert sorted(seen) == sorted(
+        [own, (2 * DECISIVE,) * 2 + (0.5,), (DECISIVE / 2,) * 2 + (0.5,), (*own[:2], 0.25)]
+    )
+    assert left_out == ["settings.texture.momentum may not be 1.0"]
+    assert {(cost.constant, cost.factor) for cost in costs} == {
+        ("search.DECISIVE", 2.0),
+        ("search.DECISIVE", 0.5),
+        ("settings.texture.momentum", 0.5),
+    }
+    assert all(cost.mean_db == cost.worst_db == 0 for cost in costs)
+    assert search.DECISIVE == parsimony.DECISIVE == DECISIVE
+    monkeypatch.setattr(constants, "reconstruct_adaptive", None)
+    assert constants.constant_costs(given, tmp_path, Silent())[0] == costs
 
 
 def test_the_oracle_matches_the_disparity_that_a_scene_was_rendered_with():

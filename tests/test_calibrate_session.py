@@ -82,6 +82,22 @@ def test_the_free_route_takes_the_same_session(captured):
     assert free.relative_difference(both) < 0.01
 
 
+def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured, capsys):
+    out = captured / "sensor"
+    assert exit_code("calibrate", captured / "session", "--sensor", "--out", out) == 0
+    told = capsys.readouterr().out
+    # The series ends below saturation: what follows from it is no more than a bound.
+    assert "Saturation capacity, at least" in told
+    figures = json.loads((out / "sensor.json").read_text())
+    noise = find_camera("rgbw-bayer-1shot").sensor.noise
+    gain, read = (figures[name] for name in ("Overall system gain K", "Temporal dark noise"))
+    assert abs(gain["value"] - noise.gain_dn_per_electron) < 4 * gain["deviation"]
+    assert gain["value"] == pytest.approx(noise.gain_dn_per_electron, rel=0.1)
+    assert read["value"] == pytest.approx(noise.read_noise_electrons, rel=0.3)
+    assert len(figures["Photon transfer curve"]["signal_dn"]) >= 16
+    assert "Photon transfer" in (out / "report.html").read_text()
+
+
 def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path, capsys):
     for wrong, line in (
         ({"shots": [3]}, "none of the 1 shots"),
@@ -131,5 +147,9 @@ def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, caps
     capsys.readouterr()
     assert exit_code("calibrate", out, "--route", "mixed") == 0
     assert capsys.readouterr().out.count("not measured") == 4
+    assert exit_code("calibrate", out, "--sensor", "--out", tmp_path / "sheet") == 1
+    assert "two references at each of four (it has" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "sheet").exists()
+    assert exit_code("calibrate", "--sensor", "--out", tmp_path / "sheet") == 2
     assert exit_code("calibrate", "--plan", "--leave-out", "hue", "--out", tmp_path / "x") == 1
     assert "colours" in capsys.readouterr().err

@@ -31,7 +31,7 @@ from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.plan import Checks, Retries
 from emmc_rig.capture.retries import GaveUpError, Mending, mending
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.rig.hardware import simulated_rig
@@ -145,7 +145,7 @@ def stopped_after(count, text=SMALL):
     session, plan = started(rig, text)
     control = Control()
 
-    class Stopper(Unwatched):
+    class Stopper(CaptureWatcher):
         def taken(self, planned, frame, found):
             if len(taken) + 1 == count:
                 control.stop()
@@ -238,7 +238,7 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
     rig = still_rig()
     session, plan = started(rig)
 
-    class Impatient(Unwatched):
+    class Impatient(CaptureWatcher):
         def step(self, name, frame):
             if name == "expose" and frame.id == "reference-s1-white-r0":
                 raise KeyboardInterrupt
@@ -300,7 +300,7 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
     session, plan = started(rig)
     pushed = []
 
-    class Clumsy(Unwatched):
+    class Clumsy(CaptureWatcher):
         def step(self, name, frame):
             if name == "read back" and frame.kind == "whiteboard" and not pushed:
                 rig.chain.displace(1, 1, 30.0)
@@ -437,7 +437,7 @@ def test_the_stage_moves_on_while_a_frame_is_written():
     boards = [frame.id for frame in session.frames if frame.kind == "whiteboard"]
     last = boards[-1]
 
-    class Holding(Unwatched):
+    class Holding(CaptureWatcher):
         def step(self, name, frame):
             if name == "hand over" and frame.kind == "whiteboard":
                 moved.clear()
@@ -545,7 +545,7 @@ retries: {per_frame: 8, per_session: 2000}
     rng = np.random.default_rng(11)
     injected = []
 
-    class Saboteur(Unwatched):
+    class Saboteur(CaptureWatcher):
         count = 0
 
         def step(self, name, frame):

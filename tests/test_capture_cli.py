@@ -488,7 +488,7 @@ def test_sessions_are_found_by_camera_date_verdict_and_psnr_below_a_folder(captu
     ("arguments", "said"),
     [
         (["list", "--since", "yesterday"], "write a day as 2026-11-22"),
-        (["list", "--verdict", "fine"], "one of trust, doubt, do not use"),
+        (["list", "--verdict", "fine"], "one of trust, cannot tell, doubt, do not use"),
         (["list", "--psnr", "lots"], "PSNR"),
         (["compare", "one"], "name two sessions"),
     ],

@@ -1,8 +1,13 @@
 """A Dask cluster computes the blocks: the same bytes as here, and one line where it cannot."""
 
+import errno
+import json
+import os
 import pickle
+import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numba
@@ -13,10 +18,11 @@ from programs import program
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.reconstruct import block_tasks
 from emmc_rig.reconstruct import pool as pools
+from emmc_rig.reconstruct.block_tasks import BlockTask, Capture
 from emmc_rig.reconstruct.pool import WorkersError, opened_pool
 from emmc_rig.reconstruct.solve import reconstruct_folder
-from emmc_rig.reconstruct.tiles import BlockTask, Capture
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tiles import Grid
 from reconstruction.tv import TVSettings
@@ -93,6 +99,66 @@ def test_workers_of_another_version_are_refused(cluster, monkeypatch):
         opened_pool(1, cluster.scheduler_address),
     ):
         pass
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
+    cluster, monkeypatch, tmp_path
+):
+    frames, settings = tmp_path / "frames", tmp_path / "blocks.yaml"
+    frames.mkdir()
+    simulate_into(frames, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0)
+    settings.write_text(SETTINGS.model_dump_json(exclude_unset=True))
+    given = (
+        "reconstruct", frames, "--method", "tv", "--settings", settings, "--out", tmp_path / "out",
+        "--cluster", cluster.scheduler_address,
+    )  # fmt: skip
+    written, first = block_tasks._write_arrays, threading.Lock()
+
+    def write_arrays(path, arrays):
+        if path.name.startswith("block-") and first.acquire(blocking=False):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return written(path, arrays)
+
+    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
+    code, _, err = program(*given)
+    assert (code, "No space left" in err, "Traceback" in err) == (1, True, False), err
+    assert not (tmp_path / "out/light_field.h5").exists()
+    code, _, err = program(*given)
+    assert code == 0, err
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    monkeypatch.setattr(pools, "CONNECT_S", 10.0)
+    place = tmp_path / "scheduler.json"
+    parts = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{part}", "--scheduler-file", str(place),
+             *more, "--no-dashboard"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path,
+        )
+        for part, more in (
+            ("scheduler", ("--port", "0", "--host", "127.0.0.1")),
+            ("worker", ("--no-nanny", "--nthreads", "1", "--death-timeout", "60")),
+        )
+    ]  # fmt: skip
+    try:
+        while not place.exists():
+            assert all(part.poll() is None for part in parts)
+            time.sleep(0.05)
+        with opened_pool(1, json.loads(place.read_text())["address"]) as pool:
+            monkeypatch.setattr(pool._client, "_timeout", 0.5)
+            done = pool.run(time.sleep, [0.0, 600.0])
+            assert next(done)[0] == 0.0
+            parts[0].kill()
+            with pytest.raises(WorkersError, match=r"lost .*the same command goes on"):
+                next(done)
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
 
 
 def test_arrays_do_not_travel_with_the_tasks():

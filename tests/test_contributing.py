@@ -46,7 +46,7 @@ def test_the_mask_pattern_draws_stripes():
 
 def test_the_fault_darkens_so_much_of_the_readings():
     (fault,) = example("A fault")["FAULTS"]
-    assert fault.explained.startswith("So many percent")
+    assert fault.explained.startswith("A share of the picture")
     trial = fault.make(Setup("near-planar", find_camera("rgbw-bayer-1shot"), (20, 20)), 25)
     assert np.mean(trial.readings == 0) >= 0.25
 

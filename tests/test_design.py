@@ -15,6 +15,7 @@ from calibration.placement import designed_placement
 from calibration.registration import register
 from calibration.shadow import shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix, load_camera
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.masks import FILTERS
 from emmc_rig.study.design.bench import DesignBench
 from emmc_rig.study.design.candidates import MASK, Candidate, choices
@@ -29,7 +30,6 @@ from emmc_rig.study.design.mask_file import (
 )
 from emmc_rig.study.design.printed import Print, printed_psi
 from emmc_rig.study.design.search import pareto
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.periodic import Block, SceneTexture, _shift, prior_covariance
 
 RGBW = Candidate("random_rgbw", 0.5, 36.0, 0.12)

@@ -71,7 +71,7 @@ def small(tmp_path, monkeypatch):
     """A fresh folder, a small size, and servers that end at once."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(SIZE_VARIABLE, "32x40")
-    monkeypatch.setattr("emmc_rig.commands.live._serve", lambda *arguments: None)
+    monkeypatch.setattr("emmc_rig.live.server.Server.run", lambda *arguments, **more: None)
 
 
 @pytest.mark.usefixtures("small")

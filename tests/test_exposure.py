@@ -15,7 +15,7 @@ from emmc_rig.capture.metering import BRACKET_STEP, asked_of_scene
 from emmc_rig.capture.plan import Metering
 from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.rig.hardware import simulated_rig
 from emmc_rig.session.decisions import metered
@@ -134,7 +134,7 @@ def test_a_dark_scene_is_refused_with_what_to_do():
         asked_of_scene(frames, {"meter-shot-0": entry}, Metering(), (1e-3, 1.0))
 
 
-class StopsAfter(Unwatched):
+class StopsAfter(CaptureWatcher):
     """Stops a capture once a frame is taken."""
 
     def __init__(self, frame_id, control):

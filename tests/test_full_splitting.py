@@ -3,16 +3,16 @@
 import numba
 import numpy as np
 import pytest
-
-from emmc_rig.model.settings import validated
-from reconstruction.errors import ReconstructionError
-from reconstruction.full_splitting import (
+from full_splitting import (
     FullSplittingSettings,
+    from_patches,
     into_ball,
     reconstruct_full_splitting,
     step_sizes,
 )
-from reconstruction.patch_term import from_patches
+
+from emmc_rig.model.settings import validated
+from reconstruction.errors import ReconstructionError
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 

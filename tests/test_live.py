@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import uvicorn
 from programs import exit_code
 
 from drivers.camera import CameraIdentity
@@ -24,10 +23,12 @@ from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live import server as server_module
+from emmc_rig.live import setup_page as page_module
 from emmc_rig.live import watch as watch_module
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
 from emmc_rig.live.server import application
+from emmc_rig.live.server import served as serving
+from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.rig.hardware import simulated_rig
 
@@ -390,14 +391,6 @@ def test_an_exposure_beyond_the_camera_is_said_to_be():
 @contextmanager
 def served(watch, **options):
     """Serve; yield a function of method, path, body, headers to status, headers, body."""
-    listening = socket.create_server(("127.0.0.1", 0))
-    port = listening.getsockname()[1]
-    config = uvicorn.Config(
-        application(watch, TOKEN, **options), log_level="warning", lifespan="off"
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
 
     def ask(method, path, body=None, headers=None):
         link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
@@ -408,11 +401,8 @@ def served(watch, **options):
         link.close()
         return answer.status, answer.headers, data
 
-    try:
+    with serving(application(SetupPage(watch), TOKEN, **options)) as port:
         yield ask
-    finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)
 
 
 def test_the_page_its_state_and_its_pictures_are_served():
@@ -423,7 +413,7 @@ def test_the_page_its_state_and_its_pictures_are_served():
         assert b"emmc-rig live" in page
         assert b"http://" not in page
         assert b"https://" not in page
-        for name in ("page.js", "page.css"):
+        for name in ("common.js", "field.js", "page.js", "page.css"):
             assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
         status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
@@ -474,7 +464,7 @@ def test_values_that_make_no_sense_are_refused_in_one_line():
             assert told.endswith(b"\n")
             assert told.count(b"\n") == 1
         assert ask("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
-        assert ask("POST", f"/{TOKEN}/do/exposure", " " * 10_000)[0] == 413
+        assert ask("POST", f"/{TOKEN}/do/exposure", " " * 200_000)[0] == 413
         assert ask("GET", f"/{TOKEN}/picture.jpg?part=x")[0] == 400
         assert ask("GET", f"/{TOKEN}/picture.jpg?part=nan")[0] == 400
         assert ask("GET", f"/{TOKEN}/picture.jpg?kind=xray")[0] == 400
@@ -520,7 +510,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
         made.append(view)
         return picture(frame, view)
 
-    monkeypatch.setattr(server_module, "picture", counted)
+    monkeypatch.setattr(page_module, "picture", counted)
     camera = FakeCamera()
     with watching(camera) as watch, served(watch) as ask:
         until(watch, lambda state: state["frame"])

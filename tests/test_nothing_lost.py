@@ -21,7 +21,14 @@ from emmc_rig.model.lightfield import save_hdf5
 
 SIZE = ("--size", "24x32")
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
-ONE_FILE = {"capture --new", "session export", "train", "devices scale", "devices serve"}
+ONE_FILE = {
+    "capture --new",
+    "session export",
+    "train",
+    "train --network",
+    "devices scale",
+    "devices serve",
+}
 WRITERS = {
     "cameras": ("rgbw-mono",),
     "capture": ("other.yaml", *RIG),
@@ -33,6 +40,7 @@ WRITERS = {
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
     "chart --ablation": (*SIZE,),
+    "chart --constants": (*SIZE,),
     "chart --guard": (*SIZE,),
     "chart --kernels": (*SIZE,),
     "chart --live": (*SIZE,),
@@ -64,6 +72,7 @@ WRITERS = {
     "tables": ("--fast",),
     "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
               "--sparsity", 2, "--iterations", 1),
+    "train --network": ("--steps", 1),
 }  # fmt: skip
 READERS = {
     "devices camera", "devices conform", "devices home", "devices info", "devices jog",
@@ -73,6 +82,7 @@ READERS = {
 JOURNALS = {
     "calibrate --check": "checks.jsonl",
     "chart --ablation": "ablation.jsonl",
+    "chart --constants": "constants.jsonl",
     "chart": "points.jsonl",
     "chart --next-shot": "next_shots.jsonl",
     "design": "simulations.jsonl",

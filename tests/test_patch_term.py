@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from full_splitting import from_patches
 from scipy import sparse
 
 from reconstruction.errors import ReconstructionError
-from reconstruction.patch_term import PatchTerm, combine, from_estimate, from_patches
+from reconstruction.patch_term import PatchTerm
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 SHAPE = (2, 3, 7, 9, 3)
@@ -20,7 +21,7 @@ def collection(places, seed=0):
     rng = np.random.default_rng(seed)
     positions = [place[:2] for place in places]
     patches = [rng.random((*SHAPE[:2], *place[2:], 3)).astype(np.float32) for place in places]
-    return positions, patches, rng.random(len(places)) + 0.1
+    return positions, patches, list(rng.random(len(places)) + 0.1)
 
 
 def extraction(places, weights):
@@ -72,14 +73,6 @@ def test_patches_may_be_weighted_sample_by_sample():
     np.testing.assert_allclose(term.weight, covers[0, 0, :, :, 0], rtol=1e-6)
 
 
-def test_patches_are_taken_one_by_one():
-    positions, patches, weights = collection(REGULAR)
-    whole = from_patches(positions, patches, weights, SHAPE)
-    streamed = from_patches(iter(positions), (p for p in patches), iter(weights), SHAPE)
-    np.testing.assert_array_equal(streamed.target, whole.target)
-    np.testing.assert_array_equal(streamed.weight, whole.weight)
-
-
 def test_samples_that_no_patch_covers_have_no_weight_and_no_influence():
     term = from_patches(*collection(SPARSE), SHAPE)
     covered = np.zeros(SHAPE[2:4], dtype=bool)
@@ -92,67 +85,11 @@ def test_samples_that_no_patch_covers_have_no_weight_and_no_influence():
     assert term.value(changed) == term.value(light_field)
 
 
-def test_a_whole_estimate_is_one_patch():
-    estimate = np.random.default_rng(3).random(SHAPE).astype(np.float32)
-    term = from_estimate(estimate, 0.3)
-    as_patch = from_patches([(0, 0)], [estimate], [0.3], SHAPE)
-    np.testing.assert_allclose(term.target, as_patch.target, rtol=1e-6)
-    np.testing.assert_array_equal(term.weight, as_patch.weight)
-    some = np.zeros(SHAPE[2:4])
-    some[2:4] = 0.7
-    estimate[:, :, 5] = np.nan
-    partly = from_estimate(estimate, some)
-    np.testing.assert_array_equal(partly.weight, some.astype(np.float32))
-    np.testing.assert_array_equal(partly.target[:, :, 2:4], estimate[:, :, 2:4])
-
-
-def test_combined_terms_are_their_sum_but_for_a_constant():
-    terms = [
-        from_patches(*collection(SPARSE, 4), SHAPE),
-        from_patches(*collection(REGULAR, 5), SHAPE),
-        from_estimate(np.random.default_rng(6).random(SHAPE), 0.2),
-    ]
-    both = combine(terms)
-    rng = np.random.default_rng(7)
-    fields = [rng.random(SHAPE) for _ in range(3)]
-    rest = [sum(t.value(f) for t in terms) - both.value(f) for f in fields]
-    np.testing.assert_allclose(rest, rest[0], rtol=1e-5)
-    np.testing.assert_allclose(both.weight, sum(t.weight for t in terms), rtol=1e-6)
-    alone = combine(terms[:1])
-    np.testing.assert_allclose(alone.target, terms[0].target, rtol=1e-6)
-
-
 def test_a_window_is_the_term_of_a_part():
     term = from_patches(*collection(IRREGULAR), SHAPE)
     part = term.window(slice(2, 6), slice(3, 9))
     np.testing.assert_array_equal(part.target, term.target[:, :, 2:6, 3:9])
     np.testing.assert_array_equal(part.weight, term.weight[2:6, 3:9])
-
-
-@pytest.mark.parametrize(
-    ("positions", "patches", "weights", "complaint"),
-    [
-        ([(0, 0)], [np.ones((2, 3, 4, 4))], None, r"patch 0 has shape \(2, 3, 4, 4\)"),
-        ([(0, 0)], [np.ones((2, 2, 4, 4, 3))], None, "patch 0 has shape"),
-        ([(0, 0)], [np.ones((2, 3, 0, 4, 3))], None, "patch 0 has shape"),
-        ([(4, 0)], [np.ones((2, 3, 4, 4, 3))], None, r"at \(4, 0\), leaves the 7x9 light field"),
-        ([(0, -1)], [np.ones((2, 3, 4, 4, 3))], None, "leaves the 7x9 light field"),
-        ([(0.5, 0)], [np.ones((2, 3, 4, 4, 3))], None, "two whole numbers"),
-        ([0], [np.ones((2, 3, 4, 4, 3))], None, "two whole numbers"),
-        ([(0, 0)] * 2, [np.ones((2, 3, 4, 4, 3))], None, "give as many of each"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))] * 2, None, "give as many of each"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))], [], "give as many of each"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))], [1, 2], "give as many of each"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))], [-1.0], "weight of -1: weights must be at least"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))], [np.nan], "weights hold values that are not"),
-        ([(0, 0)], [np.ones((2, 3, 4, 4, 3))], [np.ones(3)], "weights of patch 0 have shape"),
-        ([(0, 0)], [np.full((2, 3, 4, 4, 3), np.nan)], None, "patch 0 is not finite"),
-    ],
-)
-def test_patches_that_do_not_fit_are_refused_in_one_line(positions, patches, weights, complaint):
-    with pytest.raises(ReconstructionError, match=complaint) as fault:
-        from_patches(positions, patches, weights, SHAPE)
-    assert "\n" not in str(fault.value)
 
 
 @pytest.mark.parametrize(
@@ -168,14 +105,6 @@ def test_patches_that_do_not_fit_are_refused_in_one_line(positions, patches, wei
 def test_a_term_that_makes_no_sense_is_refused(target, weight, complaint):
     with pytest.raises(ReconstructionError, match=complaint):
         PatchTerm(target.astype(np.float32), weight.astype(np.float32))
-
-
-def test_terms_that_do_not_combine_are_refused():
-    with pytest.raises(ReconstructionError, match="give at least one"):
-        combine([])
-    other = from_estimate(np.zeros((2, 3, 7, 8, 3)))
-    with pytest.raises(ReconstructionError, match="do not combine"):
-        combine([from_estimate(np.zeros(SHAPE)), other])
 
 
 def test_pixels_of_several_samples_need_one_weight_each(coded_psi):
@@ -195,7 +124,12 @@ def test_patches_and_starts_of_another_size_are_refused(coded_psi):
     frames = np.full(psi.frames_shape, 0.3, np.float32)
     other = np.zeros((2, 3, 6, 9, 3))
     with pytest.raises(ReconstructionError, match="patches for a light field of shape"):
-        reconstruct_tv(psi, frames, 0.01, patch_term=from_estimate(other))
+        reconstruct_tv(
+            psi,
+            frames,
+            0.01,
+            patch_term=PatchTerm(other.astype(np.float32), np.ones((6, 9), np.float32)),
+        )
     with pytest.raises(ReconstructionError, match="a start of shape"):
         reconstruct_tv(psi, frames, 0.01, start=other)
     with pytest.raises(ReconstructionError, match="the start holds values that are not finite"):

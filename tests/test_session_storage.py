@@ -14,7 +14,7 @@ from capture_rigs import PLAN_YAML, begun, frame_bytes, plan_and_camera, still_r
 from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.lock import held
@@ -27,7 +27,7 @@ from simulators.disk import PowerCutError, SimulatedDisk
 ROOT = Path("/disk")
 
 
-class Promised(Unwatched):
+class Promised(CaptureWatcher):
     """Keeps the frames that the program said are safe."""
 
     def __init__(self):

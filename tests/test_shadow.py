@@ -14,7 +14,7 @@ from calibration.placement import (
     labels,
     with_aperture_mean_one,
 )
-from calibration.shadow import ANY_COLOUR, Shadow, shadow_mask, share_tables
+from calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, shadow_mask, share_tables
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 
 SIZE = (16, 22)
@@ -110,6 +110,18 @@ def test_derivatives_are_those_of_the_readings(name, binning):
     expected = (ahead - behind) / (2 * step[place])
     error = np.linalg.norm(slopes[:, place] - expected) / np.linalg.norm(expected)
     assert error < 0.01
+
+
+def test_what_each_view_adds_to_a_derivative_is_all_of_it():
+    camera = camera_of()
+    shadow = Shadow(shadow_mask(camera, SIZE), askew(camera))
+    pixels, colours = everywhere(), np.full(SIZE[0] * SIZE[1], ANY_COLOUR, np.uint8)
+    every = np.ones(VIEWS, dtype=bool)
+    slopes, by_view = shadow.slopes_by_view(pixels, colours, every)
+    sums = by_view.reshape(len(pixels), -1, OF_VIEW).sum(axis=1)
+    softer = SCALARS.index("blur_um")
+    np.testing.assert_allclose(sums[:, :2], slopes[:, :2], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(sums[:, 2] + sums[:, 3], slopes[:, softer], rtol=1e-9, atol=1e-12)
 
 
 def test_moving_the_stage_is_moving_the_mask():

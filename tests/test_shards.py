@@ -7,13 +7,17 @@ import h5py
 import numpy as np
 import pytest
 from pools import Here
+from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
+from emmc_rig.files import psi as psis
 from emmc_rig.files import shards
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.files.psi import SavedPsi
 from emmc_rig.files.scenes import open_scene
+from emmc_rig.reconstruct.inputs import open_frames
 from emmc_rig.reconstruct.solve import reconstruct_folder
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tv import TVSettings
@@ -56,6 +60,42 @@ def test_shards_hold_what_the_file_holds_and_open_as_a_scene(frames, tmp_path, m
     np.testing.assert_array_equal(stored[...], expected)
     np.testing.assert_array_equal(np.asarray(open_scene(str(group), views=(5, 5))), expected)
     assert not (tmp_path / "sharded/light_field.h5").exists()
+
+
+def test_psi_in_shards_gives_the_bytes_of_psi_in_a_file(frames, tmp_path, monkeypatch):
+    zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    monkeypatch.setattr(psis, "SHARD", 32)
+    monkeypatch.setattr(psis, "CHUNK", 16)
+    sharded = tmp_path / "sharded"
+    sharded.mkdir()
+    simulate_into(sharded, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0, as_zarr=True)
+    assert not (sharded / "psi.h5").exists()
+    weights = zarr.open_group(sharded / "psi.zarr", mode="r")["weights"]
+    assert weights.shards == (1, 5, 5, 32, 1, 32)
+    results = [reconstructed(one, tmp_path / f"from-{one.name}") for one in (frames, sharded)]
+    assert results[0]["psi_sha256"] == results[1]["psi_sha256"]
+    one, two = (tmp_path / f"from-{name}/light_field.h5" for name in ("frames", "sharded"))
+    assert one.read_bytes() == two.read_bytes()
+    whole, _ = open_frames(sharded)
+    np.testing.assert_array_equal(whole.weights, open_frames(frames)[0].weights)
+
+
+@pytest.mark.parametrize("name", ["weights", "colour"])
+def test_a_missing_part_of_psi_is_one_line_and_others_are_read(frames, name, monkeypatch):
+    pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    monkeypatch.setattr(psis, "SHARD", 32)
+    monkeypatch.setattr(psis, "CHUNK", 16)
+    psi = SavedPsi(frames / "psi.h5").load()
+    psis.save_shards(psi, frames / "psi.zarr")
+    parts = sorted(part for part in (frames / "psi.zarr" / name / "c").rglob("*") if part.is_file())
+    parts[-1].unlink()
+    saved = psis.open_psi(frames / "psi.zarr")
+    here = slice(0, 30), slice(0, 60)
+    np.testing.assert_array_equal(saved.window(*here).weights, psi.window(*here).weights)
+    code, _, err = program("reconstruct", frames, "--method", "tv", "--out", frames / "out")
+    assert (code, "psi.zarr: a file of it is missing; copy" in err) == (1, True), err
+    assert "Traceback" not in err
+    assert not (frames / "out").exists()
 
 
 def test_without_the_extra_or_without_the_array_one_line_says_so(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 from scipy.fft import dct, dctn, idctn
 from scipy.linalg import hadamard
 
-from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.lightfield import OPPONENT, psnr_db
 from reconstruction.adaptive.shrinkage import (
     ALIKE,
     SIDE,
@@ -14,7 +14,6 @@ from reconstruction.adaptive.shrinkage import (
     _columns_synthesised,
     denoised,
 )
-from reconstruction.problem import OPPONENT
 
 
 def places_alike(guide, y, x, sigma, reach):

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from pages import Page
+from pools import Posting
 
 from emmc_rig import cli
 from emmc_rig.errors import AppError
@@ -173,6 +174,20 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
     run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
     lines = (tmp_path / "out" / StabilitySweep.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
+
+
+def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undrawn, tmp_path):
+    chosen, found = quick(faults=("flicker", "missing-shot")), []
+    for name, pool in (("alone", None), ("shared", Posting(backwards=True))):
+        (tmp_path / name).mkdir()
+        sweep = StabilitySweep(chosen, tmp_path / name)
+        found.append(sweep.run(planned(chosen), Silent(), pool))
+        lines = (tmp_path / name / StabilitySweep.journal).read_text().splitlines()
+        assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
+    assert list(found[0]) == list(found[1])
+    for point, one in found[0].items():
+        assert found[1][point]["psnr_db"] == pytest.approx(one["psnr_db"], abs=1e-3)
+        assert sweep.is_whole(point, one)
 
 
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):

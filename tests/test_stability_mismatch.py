@@ -62,9 +62,9 @@ def test_a_sensor_without_colours_is_refused_in_words():
 def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera, monkeypatch):
     monkeypatch.setattr(mismatch, "QUICK_ERRORS", (("mask-shift", 1.0),))
     monkeypatch.setattr(mismatch, "QUICK_DRIFT", DRIFT)
-    settings = stability_settings(True, ["deep-occlusions"], SIZE, camera=camera)
+    settings = stability_settings(True, ["deep-occlusions"], SIZE, camera=camera, methods=("tv",))
     watcher = Counted()
-    (row,) = measure_mismatch(settings, tmp_path, watcher, ("tv",))
+    (row,) = measure_mismatch(settings, tmp_path, watcher)
     assert watcher.steps == watcher.total == 2
     assert row.mismatched < row.ideal - 0.3
     assert abs(row.oracle - row.ideal) < 1.0
@@ -73,7 +73,7 @@ def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera
     # A second run measures nothing again.
     again = Counted()
     monkeypatch.setattr(type(settings), "trial", None)
-    assert measure_mismatch(settings, tmp_path, again, ("tv",)) == [row]
+    assert measure_mismatch(settings, tmp_path, again) == [row]
     sections = mismatch_sections([row], tmp_path)
     assert f"{row.blind:.2f}" in sections[0].body
     assert f"{row.recovered:.0%}" in sections[0].body

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.study.stability import fault_sweep, sweeping, theory
 from emmc_rig.study.stability.fault_sweep import stability_settings
 from emmc_rig.study.stability.faults import FAULTS, trial
@@ -29,7 +30,6 @@ from emmc_rig.study.stability.theory_section import (
 )
 from emmc_rig.study.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.patch import SIDE, PatchModel, Texture
 
 CAMERA = find_camera("rgbw-bayer-1shot").model_copy(update={"views": (3, 3)})

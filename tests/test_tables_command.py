@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from emmc_rig.model.lightfield import save_hdf5
-from emmc_rig.pages.pictures import Piece, telling_pieces
+from emmc_rig.pages.pictures import Piece, detailed_pieces
 from emmc_rig.progress import Silent
 from emmc_rig.study.tables import reproducing
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
@@ -261,7 +261,7 @@ def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
 def test_the_most_telling_piece_is_where_the_texture_is():
     picture = np.full((60, 80, 3), 0.5, np.float32)
     picture[30:42, 50:62] = np.random.default_rng(0).random((12, 12, 3))
-    (piece,) = telling_pieces(picture, 16)
+    (piece,) = detailed_pieces(picture, 16)
     assert 26 <= piece.y <= 32
     assert 46 <= piece.x <= 52
 

@@ -1,4 +1,4 @@
-"""The paper's findings are judged from cells: by how much, in which scenes, either way."""
+"""The paper's findings are tested on cells: by how much, in which scenes, either way."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import METHODS, PARTS, Capture, Cell, cells_of
-from emmc_rig.study.tables.findings import CLAIMS, judge, printed_figures
+from emmc_rig.study.tables.findings import CLAIMS, findings_from, printed_figures
 
 SCENES = ["dragons", "dice", "buttercup", "tulip"]
 FLAT = 25.0
@@ -32,18 +32,18 @@ def changed(cells, choose, **gains):
 
 
 def found(cells, name):
-    return {finding.claim.name: finding for finding in judge(cells, SCENES)}[name]
+    return {finding.claim.name: finding for finding in findings_from(cells, SCENES)}[name]
 
 
 def test_a_tie_does_not_hold():
-    for finding in judge(flat_cells(), SCENES):
+    for finding in findings_from(flat_cells(), SCENES):
         assert finding.verdict == "does not hold"
-        assert finding.judged is not None
-        assert finding.judged.mean_db == 0
+        assert finding.spread is not None
+        assert finding.spread.mean_db == 0
 
 
 def test_without_cells_nothing_is_claimed():
-    for finding in judge({}, SCENES):
+    for finding in findings_from({}, SCENES):
         assert finding.verdict == "not measured"
         assert finding.ours == {}
 
@@ -69,23 +69,23 @@ CASES = {
 def test_a_finding_holds_or_not_by_what_was_measured(name, gain_db):
     cells = changed(flat_cells(), CASES[name], psnr_db=gain_db, chroma_psnr_db=gain_db)
     finding = found(cells, name)
-    assert finding.judged is not None
-    assert finding.judged.mean_db == pytest.approx(gain_db)
+    assert finding.spread is not None
+    assert finding.spread.mean_db == pytest.approx(gain_db)
     assert finding.verdict == ("holds" if gain_db > 0 else "does not hold")
-    assert finding.judged.holding == (finding.judged.scenes if gain_db > 0 else 0)
+    assert finding.spread.holding == (finding.spread.scenes if gain_db > 0 else 0)
 
 
 @pytest.mark.parametrize("scenario", ["i", "ii", "iii"])
-def test_more_shots_are_judged_by_the_smallest_step(scenario):
+def test_more_shots_are_by_method_the_smallest_step(scenario):
     cells = flat_cells()
     step = {"i": 3}.get(scenario, 1)
     for cell in cells:
         if cell.capture.binning == 2 and cell.capture.scenario == scenario:
             rises = (0, 3.0, 3.5, 5.0)[cell.capture.shots // step - 1]
             cells[cell] = {"psnr_db": FLAT + rises}
-    judged = found(cells, f"shots-{scenario}").judged
-    assert judged is not None
-    assert judged.mean_db == pytest.approx(0.5)
+    spread = found(cells, f"shots-{scenario}").spread
+    assert spread is not None
+    assert spread.mean_db == pytest.approx(0.5)
     for cell in cells:
         if cell.capture == Capture(scenario, 4 * step, 2):
             cells[cell] = {"psnr_db": FLAT}
@@ -95,14 +95,14 @@ def test_more_shots_are_judged_by_the_smallest_step(scenario):
 def test_the_mean_and_the_range_are_over_scenes():
     cells = changed(flat_cells(), lambda c: c.capture.scenario == "i", psnr_db=2.0)
     cells = changed(cells, lambda c: c.capture.scenario == "i" and c.scene == "tulip", psnr_db=-3.0)
-    judged = found(cells, "rgb-per-acquisition").judged
-    assert judged is not None
-    assert (judged.mean_db, judged.low_db, judged.high_db) == pytest.approx((0.5, -1.0, 2.0))
-    assert (judged.holding, judged.scenes) == (1, 2)
-    assert str(judged) == "+0.50 (-1.00 to +2.00)"
+    spread = found(cells, "rgb-per-acquisition").spread
+    assert spread is not None
+    assert (spread.mean_db, spread.low_db, spread.high_db) == pytest.approx((0.5, -1.0, 2.0))
+    assert (spread.holding, spread.scenes) == (1, 2)
+    assert str(spread) == "+0.50 (-1.00 to +2.00)"
 
 
-def test_the_other_methods_are_judged_beside():
+def test_the_other_methods_are_tested_beside():
     cells = changed(
         flat_cells(), lambda c: c.capture.scenario == "i" and c.method == "tv", psnr_db=4.0
     )
@@ -115,21 +115,21 @@ def test_the_other_methods_are_judged_beside():
 def test_a_scene_that_lacks_a_cell_is_left_out():
     cells = flat_cells()
     del cells[Cell("tulip", Capture("iii", 1), "tv-dict")]
-    judged = found(cells, "rgb-per-acquisition").judged
-    assert judged is not None
-    assert judged.scenes == 1
+    spread = found(cells, "rgb-per-acquisition").spread
+    assert spread is not None
+    assert spread.scenes == 1
 
 
 def test_an_infinite_figure_leaves_its_scene_out():
     cells = changed(flat_cells(), lambda c: False)
     cells[Cell("tulip", Capture("iii", 1), "tv-dict")] = {"psnr_db": None}
-    judged = found(cells, "rgb-per-acquisition").judged
-    assert judged is not None
-    assert judged.scenes == 1
+    spread = found(cells, "rgb-per-acquisition").spread
+    assert spread is not None
+    assert spread.scenes == 1
 
 
 def test_the_papers_own_numbers_hold_by_what_its_tables_say():
-    findings = {f.claim.name: f for f in judge(printed_figures(), list(paper.TITLES))}
+    findings = {f.claim.name: f for f in findings_from(printed_figures(), list(paper.TITLES))}
     noise = findings["cfa-noise"].printed
     # Dragon: min(30.22 - 28.40, 30.52 - 26.68) - (27.98 - 27.82) = 1.66; Fish 0.06.
     assert noise is not None
@@ -146,7 +146,7 @@ def test_every_claim_says_what_it_compares_and_where_the_paper_says_so():
     names = [claim.name for claim in CLAIMS]
     assert len(names) == len(set(names))
     for claim in CLAIMS:
-        assert claim.judged_by in claim.methods
+        assert claim.by_method in claim.methods
         assert claim.part in PARTS
         assert claim.sentence
         assert claim.compares

@@ -11,12 +11,12 @@ import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
-from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.pictures import Pictures, epipolar_lines, pictures_of
 from emmc_rig.progress import Silent
+from emmc_rig.study.scores import colour_scored
 from emmc_rig.study.sweep import Journal, SweepStopped, digest_of, open_folder
 from emmc_rig.study.tables.cell_sweep import FAST, Forecast, TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import PARTS, Capture, Cell, Part
-from emmc_rig.study.tables.colour_scores import scored
 from emmc_rig.study.tables.library import (
     Cut,
     Given,
@@ -181,7 +181,7 @@ def test_nothing_is_done_twice(scenes, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "reconstruct", None)
     monkeypatch.setattr(module, "estimate_patches", None)
-    monkeypatch.setattr(module, "scored", None)
+    monkeypatch.setattr(module, "colour_scored", None)
     assert do_cells(a_run(scenes, tmp_path / "out"), Silent()) == first
 
 
@@ -431,23 +431,23 @@ def test_brightness_and_colour_share_the_error():
     truth = light_field(0)
     rng = np.random.default_rng(1)
     estimate = (truth + 0.05 * rng.normal(size=truth.shape)).astype(np.float32)
-    found = scored(estimate, truth)
+    found = colour_scored(estimate, truth)
     whole, luma, chroma = (
         10 ** (-db / 10) for db in (found.psnr_db, found.luma_psnr_db, found.chroma_psnr_db)
     )
     assert luma + 2 * chroma == pytest.approx(3 * whole, rel=1e-4)
     grey = np.repeat(truth.mean(axis=-1, keepdims=True), 3, axis=-1)
-    dull = scored(grey, truth)
+    dull = colour_scored(grey, truth)
     assert dull.chroma_share == pytest.approx(0, abs=1e-5)
     assert dull.luma_psnr_db > 100
-    assert scored((grey + truth) / 2, truth).chroma_share == pytest.approx(0.5, abs=1e-5)
+    assert colour_scored((grey + truth) / 2, truth).chroma_share == pytest.approx(0.5, abs=1e-5)
 
 
 def test_epipolar_lines_are_taken_where_views_differ():
     lf = np.zeros((5, 5, 20, 30, 3), np.float32)
     lf[:, -1, 11] = 1
     lf[-1, :, :, 17] += 0.5
-    assert telling_lines(lf) == (11, 17)
+    assert epipolar_lines(lf) == (11, 17)
     kept = pictures_of(lf, (11, 17))
     assert (kept.across.shape, kept.down.shape) == ((5, 30, 3), (5, 20, 3))
 

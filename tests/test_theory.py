@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.bounds import (
     disparity_information,
     distances,

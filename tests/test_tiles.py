@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from emmc_rig.files.psi import SavedPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.edges import SIDES
@@ -14,7 +15,6 @@ from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
 from reconstruction.sparse import SparseSettings
 from reconstruction.tiles import (
     Grid,
-    SavedPsi,
     reconstruct_in_blocks,
     samples,
     surveyed,

@@ -13,10 +13,10 @@ import yaml
 from capture_rigs import begun, still_rig
 from programs import program
 
-from emmc_rig.capture.enough import judged, stated_psnr_db
+from emmc_rig.capture.assessment import assessed, stated_psnr_db
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.until import Until
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
@@ -218,7 +218,7 @@ def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_pa
     rig = still_rig(SIZE)
     session = Session(copy)
 
-    class Impatient(Unwatched):
+    class Impatient(CaptureWatcher):
         def tell(self, message):
             if "reconstructing" in message:
                 raise KeyboardInterrupt
@@ -295,18 +295,18 @@ def test_shots_that_tell_nothing_are_not_worth_taking(coded_psi):
     dark = psi.weights.copy()
     dark[1:] = 0
     blind = ImagingMatrix(dark, psi.colour)
-    found = judged(blind, planar_result(0.1), (0,), 0.004, 40.0)
+    found = assessed(blind, planar_result(0.1), (0,), 0.004, 40.0)
     assert found.next is None
     assert "no further shot is expected to gain" in found.why
     assert found.expected_db == pytest.approx({1: 20.0, 2: 20.0}, abs=1e-6)
-    assert judged(psi, planar_result(0.1), (0,), 0.004, 40.0).next in (1, 2)
+    assert assessed(psi, planar_result(0.1), (0,), 0.004, 40.0).next in (1, 2)
 
 
 def test_enough_is_enough_and_all_is_all(coded_psi):
     psi = coded_psi(shots=2, size=(8, 8), views=(3, 3))
-    found = judged(psi, planar_result(0.1), (0,), 0.004, 19.9)
+    found = assessed(psi, planar_result(0.1), (0,), 0.004, 19.9)
     assert (found.next, found.why) == (None, "the target is reached")
-    found = judged(psi, planar_result(0.1), (1, 0), 0.004, math.inf)
+    found = assessed(psi, planar_result(0.1), (1, 0), 0.004, math.inf)
     assert (found.next, found.why) == (None, "every planned shot is taken")
 
 

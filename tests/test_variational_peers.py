@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from full_splitting import from_patches, gradient
 
 from emmc_rig.files.cameras import find_camera
-from reconstruction.differences import gradient, norm_squared, variation
-from reconstruction.patch_term import from_patches
+from reconstruction.differences import norm_squared, variation
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 

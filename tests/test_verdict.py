@@ -266,7 +266,7 @@ def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
     worse = dataclasses.replace(evidence, off=0.03, displaced_px=2.0)
     verdict = verdict_from(worse)
     assert verdict.level == "do not use"
-    assert [LEVELS.index(one.level) for one in verdict.reasons] == [2, 1]
+    assert [LEVELS.index(one.level) for one in verdict.reasons] == [3, 2]
 
 
 def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
@@ -276,6 +276,32 @@ def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
         verdict = verdict_from(dataclasses.replace(clean, parameters=missed))
         assert verdict.level == level
     assert "row 12, column 30" in verdict.words
+
+
+@pytest.mark.parametrize(
+    ("errors", "level"), [(0.01, "trust"), (0.06, "cannot tell"), (None, "cannot tell")]
+)
+def test_where_masks_hardly_show_nobody_can_tell_whether_psi_is_right(three, errors, level):
+    clean = clean_evidence(three)
+    shots = len(clean.strengths)
+    strengths = (None if errors is None else 1.0,) * shots
+    weak = dataclasses.replace(clean, strengths=strengths, strength_errors=(errors,) * shots)
+    verdict = verdict_from(weak)
+    assert verdict.level == level, verdict.words
+    # What speaks against the light field is still the graver.
+    assert verdict_from(dataclasses.replace(weak, noise=0.5)).level == "doubt"
+
+
+def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_psi():
+    psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
+    frames = grey(psi)
+    usable = everywhere(psi)
+    read = Read(frames, usable, kept_readings(usable), np.zeros(psi.frames_shape))
+    light_field = np.full(psi.light_field_shape, 0.5, np.float32)
+    result = Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 0.0, {})
+    verdict = verdict_from(gathered(psi, read, 1e-3, result))
+    assert verdict.level == "cannot tell"
+    assert "cannot be tested" in verdict.words
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import numba
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.reconstruct import tiles
+from emmc_rig.reconstruct import block_tasks
 from emmc_rig.reconstruct.inputs import load_settings
 from emmc_rig.reconstruct.memory import parse_memory
 from emmc_rig.reconstruct.solve import reconstruct_folder
@@ -51,11 +52,11 @@ def place(tmp_path_factory):
     return folder
 
 
-def here(folder, out, pool=None, frames="frames", settings="blocks.yaml", **more):
+def here(folder, out, pool=None, frames="frames", settings="blocks.yaml", method="tv", **more):
     """Reconstruct in this process; return the metrics."""
     with result_folder(folder / out, "reconstruct", resumes=True) as new:
         return reconstruct_folder(
-            folder / frames, new, "tv", settings=load_settings(folder / settings),
+            folder / frames, new, method, settings=load_settings(folder / settings),
             pool=pool or Here(), **more,
         )  # fmt: skip
 
@@ -84,6 +85,18 @@ def test_the_truth_and_the_verdict_cover_all_blocks(place):
     assert 10 < metrics["psnr_db"] < 40
     assert metrics["verdict"]["features"]["kept"] > 30
     assert content(place / "compared") == content(place / "alone")
+
+
+def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
+    (place / "wide.yaml").write_text(yaml.safe_dump({"blocks": {"whole": 1000, "side": 64}}))
+    metrics = here(place, "stated", settings="wide.yaml", method="adaptive-fast")
+    assert metrics["blocks"] == [1, 2]
+    with h5py.File(place / "stated/maps.h5") as maps:
+        sigma = np.asarray(maps["sigma"], dtype=np.float64)
+    # The map is blended between blocks, the sum is of each block's own part.
+    expected = -10 * np.log10(np.mean(np.square(sigma)))
+    assert metrics["stated_db"] == pytest.approx(expected, abs=0.3)
+    assert json.loads((place / "alone/metrics.json").read_text())["stated_db"] is None
 
 
 def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others(place):
@@ -211,14 +224,14 @@ def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
 
 
 def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, monkeypatch):
-    pool, written = Here(), tiles._write_arrays
+    pool, written = Here(), block_tasks._write_arrays
 
     def write_arrays(path, arrays):
         if len(pool.done) == 4:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return written(path, arrays)
 
-    monkeypatch.setattr(tiles, "_write_arrays", write_arrays)
+    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
     with pytest.raises(AppError, match="No space left"):
         here(place, "full", pool)
     monkeypatch.undo()
@@ -230,14 +243,14 @@ def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, mon
 
 
 def test_a_block_that_fails_is_named_and_the_others_are_kept(place, monkeypatch):
-    pool, solved = Here(), tiles.solve_block
+    pool, solved = Here(), block_tasks.solve_block
 
     def solve_block(*given):
         if len(pool.done) == 4:
             raise ReconstructionError("the frames hold values that are not finite: exclude them")
         return solved(*given)
 
-    monkeypatch.setattr(tiles, "solve_block", solve_block)
+    monkeypatch.setattr(block_tasks, "solve_block", solve_block)
     with pytest.raises(AppError, match=r"rows 0 to 32, columns 54 to 80 .* not finite"):
         here(place, "bad-block", pool)
     assert len(list(kept(place, "bad-block").glob("block-*.json"))) == 2

@@ -8,17 +8,26 @@ from pathlib import Path
 from typing import Any
 
 from calibration.routes import Outcome
+from calibration.sensor import SensorSheet, characterise
 from calibration.whiteboard import Calibration
 from emmc_rig.calibrate.settings import ROUTES
 from emmc_rig.calibrate.stored import REPORT, outcome_figures, save_outcome
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.session.readings import camera_json_of, session_outcome, taken_shots
+from emmc_rig.session.readings import (
+    camera_json_of,
+    camera_of,
+    sensor_pairs,
+    session_outcome,
+    taken_shots,
+)
 from emmc_rig.session.session import CALIBRATION, Session
+
+SENSOR = "sensor.json"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,6 +41,7 @@ class SessionCalibration:
     outcome: Outcome
     calibration: Calibration
     metrics: dict[str, Any]
+    sensor: SensorSheet | None = None
 
     @property
     def psi(self) -> ImagingMatrix:
@@ -55,8 +65,20 @@ class SessionCalibration:
     def write(self, folder: Path) -> None:
         """Write the same files into an existing folder."""
         save_outcome(folder, self.outcome, self.calibration)
-        write_calibration_report(folder / REPORT, self.outcome, self.metrics)
+        write_calibration_report(folder / REPORT, self.outcome, self.metrics, sensor=self.sensor)
         write_metrics(folder, self.metrics)
+        if self.sensor is not None:
+            figures = {
+                name: {"value": value, "deviation": deviation, "unit": unit}
+                for name, value, deviation, unit in self.sensor.rows()
+            }
+            curve = self.sensor.curve
+            figures["Photon transfer curve"] = {
+                "signal_dn": curve.mean_dn.tolist(),
+                "variance_dn2": curve.variance_dn2.tolist(),
+                "exposure_s": curve.exposure_s.tolist(),
+            }
+            (folder / SENSOR).write_text(metrics_text(figures), encoding="utf-8")
 
     def __repr__(self) -> str:
         return (
@@ -66,12 +88,17 @@ class SessionCalibration:
 
 
 def calibrate(
-    session: Session | str | Path, route: str = "auto", *, watcher: Watcher | None = None
+    session: Session | str | Path,
+    route: str = "auto",
+    *,
+    sensor: bool = False,
+    watcher: Watcher | None = None,
 ) -> SessionCalibration:
     """Return Psi as a session's whiteboards measure it; `.save(folder)` writes it with a report.
 
     session: itself, or its folder. route: parametric, mixed or free; `auto` takes every one that
-    the session has whiteboards for, and chooses.
+    the session has whiteboards for, and chooses. sensor: its figures too, from the darks and the
+    references at several exposures.
     Raises AppError or CalibrationError.
     """
     session = session if isinstance(session, Session) else Session(Path(session))
@@ -100,4 +127,9 @@ def calibrate(
     if len(shots) < chosen.psi.shots:
         # What `reconstruct --psi` takes with the session's own shots.
         chosen = chosen.of_shots(shots, camera_json_of(session, shots))
-    return SessionCalibration(outcome, chosen, metrics)
+    sheet = None
+    if sensor:
+        watcher.begin("sensor", None)
+        white_dn = camera_of(session).sensor.noise.white_level_dn
+        sheet = characterise(*sensor_pairs(session), white_dn)
+    return SessionCalibration(outcome, chosen, metrics, sheet)

@@ -31,7 +31,7 @@ class CalibrateSettings:
 
     target: relative error of Psi. most_frames: of the plan, None: as many as it takes. leave_out:
     names of WATCHES that the rig cannot take. few: plan for the fitted mask alone, without the
-    pinhole before every view.
+    pinhole before every view. psnr: measure effects by what they cost a reconstruction, too.
     """
 
     camera_name: str
@@ -46,6 +46,7 @@ class CalibrateSettings:
     most_frames: int | None = None
     leave_out: frozenset[str] = frozenset()
     few: bool = False
+    psnr: bool = False
 
     def __post_init__(self) -> None:
         for name in sorted(self.leave_out):

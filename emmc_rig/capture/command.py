@@ -9,11 +9,12 @@ import errno
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from emmc_rig.capture.amend import amendment
+from emmc_rig.capture.amend import Amendment, amendment
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import (
     Estimate,
@@ -32,9 +33,10 @@ from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import RunEnd, Sequencer
 from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
+from emmc_rig.files.replaced import replace_text
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
@@ -76,6 +78,11 @@ class Wish:
 def session_folder(plan_path: Path) -> Path:
     """Return the folder of a plan's session unless another is named."""
     return plan_path.with_name(f"{plan_path.stem}-session")
+
+
+def asked_folder(plan: Path, out: Path | None) -> Path:
+    """Return the folder of the session that a plan or session, and --out, name."""
+    return out or (plan if is_session(plan) else session_folder(plan))
 
 
 def wish_from_plan(
@@ -283,24 +290,65 @@ def run_capture(
         if session is None:
             session = new_session(wish, planned)
             open_things.enter_context(held(session.folder))
-        with interruptible(control, watcher.tell), disk_faults_told(session):
-            if edit is not None:
-                session = session.amend(_frozen(wish, edit.frames), edit.changes)
-            with way_on_told(wish, session):
-                if wish.until_db not in (None, session.target_db):
-                    session.note("until", target_db=wish.until_db, wall=wall_time())
-                choose = None if session.target_db is None else Until(session, watcher)
-                run = Sequencer(
-                    session,
-                    wish.plan,
-                    rig,
-                    watcher,
-                    control,
-                    choose,
-                    exposures=Exposures(wish.plan, earlier),
-                    suspended=suspended,
-                )
-                return session, run.run()
+        exposures = Exposures(wish.plan, earlier)
+        with interruptible(control, watcher.tell):
+            while True:
+                with disk_faults_told(session):
+                    if edit is not None:
+                        session = session.amend(_frozen(wish, edit.frames), edit.changes)
+                    with way_on_told(wish, session):
+                        if wish.until_db not in (None, session.target_db):
+                            session.note("until", target_db=wish.until_db, wall=wall_time())
+                        control.preview = partial(_edit_words, wish, session, rig)
+                        choose = None if session.target_db is None else Until(session, watcher)
+                        run = Sequencer(
+                            session,
+                            wish.plan,
+                            rig,
+                            watcher,
+                            control,
+                            choose,
+                            exposures=exposures,
+                            suspended=suspended,
+                        ).run()
+                text, control.edited = control.edited, None
+                if text is None:
+                    return session, run
+                edit = None
+                try:
+                    wish, edit = edited_plan(wish, session, rig, text)
+                except AppError as fault:
+                    watcher.tell(f"the plan stays as it was: {fault}")
+
+
+def edited_plan(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
+    """Write an edited plan in place of the wish's, and return what follows for its session.
+
+    Raises AppError, nothing written, for a plan that the session or the rig contradicts, and where
+    the file was changed meanwhile.
+    """
+    other, edit = _edit(wish, session, rig, text)
+    refuse_impossible(
+        rig, tuple(f for f in (edit.frames if edit else ()) if f.id not in session.stored)
+    )
+    if not is_session(wish.plan_path):
+        replace_text(wish.plan_path, wish.plan_yaml, text)
+    return other, edit
+
+
+def _edit(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
+    source = "the edited plan"
+    plan = validated(Plan, parse_yaml(text, source, AppError), source, AppError)
+    camera = planned_camera(plan, wish.plan_path.parent)
+    other = replace(wish, plan=plan, plan_yaml=text, camera=camera)
+    edit = amendment(session, plan, camera, wish.rig, planned_frames(other, rig))
+    return other, edit
+
+
+def _edit_words(wish: Wish, session: Session, rig: Rig, text: str) -> str:
+    """Return what an edited plan changes, in words; raises AppError where it cannot hold."""
+    _, edit = _edit(wish, session, rig, text)
+    return "nothing changes" if edit is None else edit.words(len(session.stored))
 
 
 def asked_for(
@@ -338,7 +386,7 @@ def capture_session(
     """
     if not plan.exists():
         raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
-    folder = out or (plan if is_session(plan) else session_folder(plan))
+    folder = asked_folder(plan, out)
     go_on = f"go on with: emmc-rig capture {folder}"
     with held(folder):
         wish = asked_for(plan, folder, rig, until_db)
@@ -399,7 +447,7 @@ def capture(
     """
     description = None if rig is None else rig.description
     folder = None if out is None else Path(out)
-    told = watcher or Unwatched()
+    told = watcher or CaptureWatcher()
     if on_event is not None:
         told = EventWatcher(on_event, told)
     captured = capture_session(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -19,11 +19,38 @@ class Control:
 
     The sequencer looks between frames. Plain flags: a lock could be held by the very code that a
     signal interrupts.
+
+    stays: at the end the capture waits until it is stopped, so that frames may be taken again.
+    preview: set by the capture; takes the text of an edited plan, and says what it changes.
+    edited: the text of an edited plan that is to hold from the next frame on.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stays: bool = False) -> None:
         self.paused = False
         self.stopping = False
+        self.stays = stays
+        self.preview: Callable[[str], str] | None = None
+        self.edited: str | None = None
+        self._again: list[str] = []
+
+    @property
+    def ending(self) -> bool:
+        """Whether the present run is to end: for good, or to go on by an edited plan."""
+        return self.stopping or self.edited is not None
+
+    def take_again(self, ids: Iterable[str]) -> None:
+        """Take these frames once more."""
+        self._again += ids
+
+    @property
+    def again(self) -> bool:
+        """Whether frames are to be taken once more."""
+        return bool(self._again)
+
+    def pop_again(self) -> list[str]:
+        """Return the frames to take once more, and forget them."""
+        ids, self._again = self._again, []
+        return list(dict.fromkeys(ids))
 
     def pause(self) -> None:
         """Begin no further frame until `resume`."""

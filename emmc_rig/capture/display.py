@@ -27,7 +27,7 @@ from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.keyboard import pressed_keys
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
@@ -36,7 +36,7 @@ KEY_POLL_S = 0.1
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
-class CaptureDisplay(Unwatched):
+class CaptureDisplay(CaptureWatcher):
     """A `CaptureWatcher` of the sequencer."""
 
     def __init__(self, console: Console, control: Control) -> None:

@@ -19,19 +19,20 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
-from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
 if TYPE_CHECKING:
     from emmc_rig.capture.sequencer import RunEnd
+    from reconstruction.result import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Event:
 OnEvent = Callable[[Event], None]
 
 
-class EventWatcher(Unwatched):
+class EventWatcher(CaptureWatcher):
     """A `CaptureWatcher` that makes events of what it is told, and tells another watcher too.
 
     on_event: called from the thread in which it happens, one call at a time. One that raises is
@@ -59,8 +60,8 @@ class EventWatcher(Unwatched):
 
     def __init__(self, on_event: OnEvent, other: CaptureWatcher | None = None) -> None:
         self._on_event: OnEvent | None = on_event
-        self._other = other or Unwatched()
-        self._began_s = time.perf_counter()
+        self._other = other or CaptureWatcher()
+        self._began_s = self._asked_s = time.perf_counter()
         self._lock = threading.RLock()
         self._done = self._planned = 0
 
@@ -102,10 +103,23 @@ class EventWatcher(Unwatched):
         self._other.shot_done(shot)
         self._emit("shot.done", shot=shot)
 
+    def light_field(self, shots: Sequence[int], result: Reconstruction) -> None:
+        """What shots give so far: no event, the journal states its figures."""
+        self._other.light_field(shots, result)
+
     def left(self, seconds: float, guessed: int) -> None:
         """How long the rest will take."""
         self._other.left(seconds, guessed)
         self._emit("left", seconds=round(seconds, 3), guessed=guessed)
+
+    def asked(self, what: str) -> None:
+        """Somebody has to do something at the bench: a pause."""
+        self._other.asked(what)
+        if what:
+            self._asked_s = time.perf_counter()
+            self._emit("pause", reason=f"please {what}")
+        else:
+            self._emit("resume", seconds=round(time.perf_counter() - self._asked_s, 3))
 
     def paused(self, reason: str) -> None:
         """The capture waits."""
@@ -124,6 +138,7 @@ class EventWatcher(Unwatched):
 
     def ended(self, session: Session, outcome: RunEnd) -> None:
         """A run is over."""
+        self._other.ended(session, outcome)
         reasons = exposure_reasons(shot_exposures(session))
         level = reasons[0].level if reasons else "trust"
         self._emit("verdict", level=level, reasons=[asdict(one) for one in reasons])

@@ -42,7 +42,7 @@ from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
 from emmc_rig.capture.suspend import Suspend
-from emmc_rig.capture.watcher import CaptureWatcher, Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -60,6 +60,7 @@ TOLD_BYTES = 1_000_000_000
 """Hashing more takes long enough to be told."""
 TELL_LEFT_S = 1.0
 """Between two times that the time left is said."""
+ALL_TAKEN = "all frames are taken: finish, or take some once more"
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
 
@@ -112,7 +113,7 @@ class Sequencer:
         suspended: Suspend = lambda: "",
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
-        self._watcher = watcher or Unwatched()
+        self._watcher = watcher or CaptureWatcher()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
@@ -129,7 +130,7 @@ class Sequencer:
         self._triggered = False
         self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
-        self._taken = self._run = 0
+        self._taken = self._run = self._more = 0
         # How long the frame before took to hand over: its own line is written by then.
         self._handed: dict[str, list[float]] = {}
         self._may_saturate = _may_saturate(session.frames)
@@ -153,7 +154,7 @@ class Sequencer:
             self._watcher.begin(needed - len(missing), needed)
             refuse_impossible(self._rig, missing)
             self._left_of_shot = self._missing_of_shots()
-            frames = self._choose(self._now_s)
+            frames = self._choose(self._now_s) or self._next()
             if frames:
                 self._retrying("home", self._home)
                 self._compare_with_last_good()
@@ -162,7 +163,7 @@ class Sequencer:
                 taken = {frame.id for frame in frames}
                 for name, fault in self._discard_damaged(taken).items():
                     self._budget.spend(name, DriverError(fault), 1)
-                frames = self._choose(self._now_s) if self._may_go_on() else ()
+                frames = self._next()
             self._writer.flush()
             left = len(session.missing())
             if not left and not session.is_complete:
@@ -170,6 +171,37 @@ class Sequencer:
         return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
+
+    def _next(self) -> tuple[PlannedFrame, ...]:
+        """Return what to take next; none where the run is to end.
+
+        Where it stays when all is taken, the lamp is off until frames are wanted once more.
+        """
+        if not self._may_go_on():
+            return ()
+        self._discard_unwanted()
+        frames = self._choose(self._now_s)
+        if frames or not self._control.stays or self._session.missing():
+            return frames
+        if self._applied.lamp not in (None, "off"):
+            self._rig.attendant.set_lamp("off")
+            self._applied.lamp = "off"
+        return self._next() if self._may_go_on(ALL_TAKEN) else ()
+
+    def _discard_unwanted(self) -> None:
+        """Let frames that somebody wants once more count as not taken."""
+        ids = [name for name in self._control.pop_again() if name in self._session.stored]
+        if not ids:
+            return
+        self._writer.flush()
+        for name in ids:
+            self._session.discard(name, "wanted once more")
+        self._left_of_shot = self._missing_of_shots()
+        # A simulated frame may come out as it was before.
+        self._before = None
+        self._more += len(ids)
+        self._watcher.more(len(self._session.needed) + self._more)
+        self._watcher.tell(f"taken once more: {', '.join(ids)}")
 
     def _missing_of_shots(self) -> dict[int, set[str]]:
         """Return by shot which frames of it are still to be taken."""
@@ -205,6 +237,8 @@ class Sequencer:
     def _home(self) -> None:
         if self._rig.stage.axes:
             self._rig.stage.home()
+        if self._rig.stands_um:
+            self._rig.stage.move_to_um(self._rig.stands_um)
         self._applied = _Applied()
 
     def _take_all(self, frames: tuple[PlannedFrame, ...]) -> bool:
@@ -215,25 +249,36 @@ class Sequencer:
         for frame in frames:
             if not self._may_go_on():
                 return False
+            if self._control.again:
+                return True
             if frame.is_metered_shot and self._decide_exposures():
                 return True
             self._take(frame)
         return True
 
-    def _may_go_on(self) -> bool:
-        """Wait while somebody or a condition wants it; returns False when the run is to end."""
-        reason = self._why_wait()
-        if reason and not self._control.stopping:
+    def _may_go_on(self, otherwise: str = "") -> bool:
+        """Wait while somebody or a condition wants it; returns False when the run is to end.
+
+        otherwise: why to wait while nothing is wanted; "": there is no need to.
+        """
+        control = self._control
+
+        def reason() -> str:
+            wished = control.ending or control.again
+            return self._why_wait() or ("" if wished else otherwise)
+
+        why = reason()
+        if why and not control.ending:
             began_s = self._now_s()
-            self._note("paused", reason=reason, wall=self._wall())
-            self._watcher.paused(reason)
-            while reason and not self._control.stopping:
-                self._control.wait()
-                reason = self._why_wait()
+            self._note("paused", reason=why, wall=self._wall())
+            self._watcher.paused(why)
+            while why and not control.ending:
+                control.wait()
+                why = reason()
             seconds = self._now_s() - began_s
             self._note("resumed", seconds=seconds, wall=self._wall())
             self._watcher.resumed(seconds)
-        return not self._control.stopping
+        return not control.ending
 
     def _why_wait(self) -> str:
         return "somebody asked for it" if self._control.paused else self._suspended()
@@ -253,7 +298,7 @@ class Sequencer:
         if not asked["asked"]:
             return False
         self._left_of_shot = self._missing_of_shots()
-        self._watcher.more(len(session.needed))
+        self._watcher.more(len(session.needed) + self._more)
         return True
 
     def _take(self, planned: PlannedFrame) -> None:

@@ -2,16 +2,16 @@
 
 Everything but the shots comes first, so that Psi of every planned shot is known before one of them
 is chosen: measured, or foretold by the parametric fit. Then shots are taken one by one; after each
-the light field so far is reconstructed and judged (`enough`), and what is decided is journalled
-before it is acted on, so that a resume goes on with it.
+the light field so far is reconstructed and assessed, and what is decided is journalled before it is
+acted on, so that a resume goes on with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from calibration.shadow import shadow_mask
-from emmc_rig.capture.enough import METHOD, Judgement, judged
+from emmc_rig.capture.assessment import METHOD, Assessment, assessed
 from emmc_rig.capture.plan import Plan
 from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
@@ -21,6 +21,7 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session, wall_time
 from reconstruction.methods import reconstruct
+from reconstruction.result import Progress, Reconstruction
 
 PLANNED_BY = "`emmc-rig calibrate --plan` writes a plan that has them"
 SMALLEST = (16, 16)
@@ -106,7 +107,7 @@ class Until:
         assert target_db is not None
         began_s = now_s()
         self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
-        found = self._judged(shots, target_db)
+        found = self._assessed(shots, target_db)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         spared = [] if found.next is not None else sorted(planned - set(shots))
         entry = {
@@ -129,9 +130,26 @@ class Until:
         session.note("decided", **entry)
         self._watcher.tell(decided_words(entry))
 
-    def _judged(self, shots: tuple[int, ...], target_db: float) -> Judgement:
+    def _assessed(self, shots: tuple[int, ...], target_db: float) -> Assessment:
         self._scale = self._scale or session_scale(self._session)
-        taken = scaled_readings(self._session, self._scale, shots)
-        sigma = taken.noise_sigma
-        result = reconstruct(METHOD, taken.psi, taken.readings, sigma, usable=taken.usable)
-        return judged(self._scale.psi, result, shots, sigma, target_db)
+        result, sigma = light_field_so_far(self._session, self._scale, shots)
+        self._watcher.light_field(shots, result)
+        return assessed(self._scale.psi, result, shots, sigma, target_db)
+
+
+def light_field_so_far(
+    session: Session,
+    scale: Scale,
+    shots: Sequence[int],
+    on_step: Callable[[Progress], None] | None = None,
+) -> tuple[Reconstruction, float]:
+    """Return the light field that some shots of a session give by METHOD, and their noise.
+
+    Raises AppError, CalibrationError or ReconstructionError.
+    """
+    taken = scaled_readings(session, scale, shots)
+    sigma = taken.noise_sigma
+    result = reconstruct(
+        METHOD, taken.psi, taken.readings, sigma, usable=taken.usable, on_step=on_step
+    )
+    return result, sigma

@@ -34,9 +34,9 @@ def calibrate(
         str | None,
         typer.Option(
             "--check",
-            help="measure what calibration reaches on the simulated bench: psi, few, bound, plan, "
-            "sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, lamp, ...); "
-            "commas between, or all; exit code 1 where a target is missed",
+            help="measure what calibration reaches on the simulated bench: psi, few, session, "
+            "bound, plan, sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, "
+            "lamp, ...); commas between, or all; exit code 1 where a target is missed",
         ),
     ] = None,
     drift: Annotated[
@@ -74,8 +74,16 @@ def calibrate(
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
+    psnr: Annotated[
+        bool,
+        typer.Option("--psnr", help="with --check effects: what each costs a reconstruction, dB"),
+    ] = False,
     stage: Annotated[
         bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
+    ] = False,
+    sensor: Annotated[
+        bool,
+        typer.Option("--sensor", help="of a session: the sensor's EMVA 1288 figures, sensor.json"),
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
     out: Annotated[
@@ -105,8 +113,10 @@ def calibrate(
     if session is not None:
         if plan or check is not None or stage:
             raise typer.BadParameter("--plan, --check and --stage are for the simulated bench")
-        _calibrate_session(session, route, out)
+        _calibrate_session(session, route, out, sensor)
         return
+    if sensor:
+        raise typer.BadParameter("--sensor is for a session; see --check sensor")
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
     shape = parse_size(size)
@@ -122,6 +132,7 @@ def calibrate(
         map_stage=stage,
         most_frames=frames,
         few=few,
+        psnr=psnr,
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
     if check is not None:
@@ -171,7 +182,7 @@ def _tell_findings(metrics: dict) -> None:
         typer.echo(f"measure again: {line}")
 
 
-def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
+def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -> None:
     import emmc_rig as emmc
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.folders import result_folder
@@ -180,7 +191,7 @@ def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
     captured, place = emmc.Session(path), path / CALIBRATION
     out = out or place
     with result_folder(out, "calibrate", belongs_to=place) as folder, shown_bars() as bars:
-        calibration = emmc.calibrate(captured, route, watcher=bars)
+        calibration = emmc.calibrate(captured, route, sensor=sensor, watcher=bars)
         calibration.write(folder)
     metrics = calibration.metrics
     chosen = metrics["chosen"]
@@ -190,6 +201,10 @@ def _calibrate_session(path: Path, route: str, out: Path | None) -> None:
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
     _tell_findings(metrics)
+    if calibration.sensor is not None:
+        for name, value, deviation, unit in calibration.sensor.rows():
+            spread = "" if deviation is None else f" +- {deviation:.2g}"
+            typer.echo(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
     typer.echo(f"open {out / 'report.html'}")
 
 

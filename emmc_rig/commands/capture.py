@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 
+from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.capture.control import Control
     from emmc_rig.capture.events import Event
-    from emmc_rig.rig.rig_config import ImagedRig
+    from emmc_rig.capture.watcher import CaptureWatcher
 
 OptionalPath = Path | None
 
 
 def capture(
+    context: typer.Context,
     plan: Annotated[
         OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
     ] = None,
@@ -60,6 +65,16 @@ def capture(
     json_lines: Annotated[
         bool, typer.Option("--json", help="print what happens as lines of JSON, and nothing else")
     ] = False,
+    page: Annotated[
+        bool, typer.Option("--page", help="show the running capture on a local page")
+    ] = False,
+    steer: Annotated[
+        bool,
+        typer.Option(
+            "--steer",
+            help="and let the page pause, edit the plan, take frames again; it ends there",
+        ),
+    ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
     ] = None,
@@ -77,7 +92,7 @@ def capture(
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
     from emmc_rig.files.results import parse_psnr, parse_size
     from emmc_rig.model.settings import validated
-    from emmc_rig.rig.rig_config import ImagedRig
+    from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 
     given: dict[str, Any] = {} if rays is None else {"rays": rays}
     if flaws is not None:
@@ -85,7 +100,14 @@ def capture(
     settings = {"scene": scene, "size": parse_size(size), "seed": seed, "real_time": real_time}
     imaged = validated(ImagedRig, settings | given, "the simulated rig", AppError)
     until_db = None if until is None else parse_psnr(until, "--until")
-    _run(plan, rig, imaged, until_db, dry_run, json_lines, out)
+    chosen = None if rig is None else rig_description(rig, imaged)
+    if chosen is None or chosen["kind"] != SIMULATED:
+        where = "on a session's own rig" if chosen is None else "on a rig of real devices"
+        refuse(context, given_names(context) & set(SIMULATED_ONLY), where)
+    if dry_run and (page or steer):
+        refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
+    shown = None if not (page or steer) else "steers" if steer else "shows"
+    _run(plan, chosen, until_db, dry_run, json_lines, out, shown)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -99,36 +121,37 @@ def _write_plan(name: str, path: Path) -> None:
 
 def _run(
     plan: Path,
-    rig: str | None,
-    imaged: ImagedRig,
+    rig: Mapping[str, Any] | None,
     until_db: float | None,
     dry_run: bool,
     json_lines: bool,
     out: Path | None,
+    page: Literal["shows", "steers"] | None,
 ) -> None:
-    from emmc_rig.capture.command import capture_session
+    from emmc_rig.capture.command import asked_folder, capture_session
     from emmc_rig.capture.control import Control
     from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
     from emmc_rig.capture.events import EventWatcher
     from emmc_rig.files.results import shown_bytes, shown_seconds
-    from emmc_rig.rig.rig_config import rig_description
     from emmc_rig.session.decisions import decided_words, ended
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.session import REPORT
 
-    chosen = None if rig is None else rig_description(rig, imaged)
-    console, control = Console(stderr=True, quiet=json_lines), Control()
+    console = Console(stderr=True, quiet=json_lines)
+    control = Control(stays=page == "steers")
     display = CaptureDisplay(console, control)
-    watcher = EventWatcher(_print_line) if json_lines else display
+    watcher: CaptureWatcher = EventWatcher(_print_line) if json_lines else display
 
     def ask(what: str) -> None:
         if not sys.stdin.isatty():
             raise AppError(
                 f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
             )
+        watcher.asked(what)
         with display.aside():
             input(f"please {what}, then press Enter ")
+        watcher.asked("")
 
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
@@ -145,8 +168,12 @@ def _run(
             )
         return not dry_run
 
-    with display.shown():
-        captured = capture_session(plan, chosen, out, until_db, watcher, ask, agreed, control)
+    with ExitStack() as open_things:
+        if page is not None:
+            folder = asked_folder(plan, out)
+            watcher = open_things.enter_context(_page(folder, control, watcher, page, until_db))
+        open_things.enter_context(display.shown())
+        captured = capture_session(plan, rig, out, until_db, watcher, ask, agreed, control)
     if captured is None or json_lines:
         return
     session, outcome = captured
@@ -161,6 +188,32 @@ def _run(
     for reason in exposure_reasons(shot_exposures(session)):
         show_reason(**asdict(reason))
     typer.echo(f"open {session.folder / REPORT}")
+
+
+@contextmanager
+def _page(
+    folder: Path,
+    control: Control,
+    other: CaptureWatcher,
+    does: Literal["shows", "steers"],
+    until_db: float | None,
+) -> Iterator[CaptureWatcher]:
+    """Serve the page of a capture, and say where, until the block ends; yield what it watches by.
+
+    other: is told too.
+    """
+    from emmc_rig.live.server import application, new_token, served
+    from emmc_rig.live.session_page import SessionPage
+
+    page, token = SessionPage(folder, control, other, until_db is None), new_token()
+    to_act = "start `emmc-rig capture` with --steer"
+    with served(application(page, token, does == "shows", to_act=to_act)) as port:
+        typer.echo(f"http://127.0.0.1:{port}/{token}/", err=True)
+        page.start()
+        try:
+            yield page
+        finally:
+            page.close()
 
 
 def _print_line(event: Event) -> None:

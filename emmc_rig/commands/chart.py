@@ -44,6 +44,9 @@ def chart(
     ablation: Annotated[
         bool, typer.Option("--ablation", help="instead: gain and cost of each part of `adaptive`")
     ] = False,
+    constants: Annotated[
+        bool, typer.Option("--constants", help="instead: cost of 2x, 0.5x of each constant of it")
+    ] = False,
     next_shot: Annotated[
         bool, typer.Option("--next-shot", help="instead: how many shots a scene needs, which")
     ] = False,
@@ -76,6 +79,7 @@ def chart(
     shape = parse_size(size)
     instead = {
         "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation,
+        "constants": constants,
         "next-shot": next_shot, "guard": guard, "live": live, "stated": stated,
     }  # fmt: skip
     for name in (name for name, wanted in instead.items() if wanted):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.errors import AppError
 
@@ -24,6 +24,7 @@ EVERYWHERE = ("0.0.0.0", "::")
 
 
 def live(
+    context: typer.Context,
     rig: RigOption = None,
     camera: Annotated[
         str | None, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
@@ -40,11 +41,16 @@ def live(
         str | None,
         typer.Option(
             "--psi",
-            help="show the light field too: a session, a calibration's folder, psi.h5, or `design`",
+            help="show the light field too: a session, a calibration's folder, psi.h5, or `design` "
+            "(what the simulated rig has by default)",
         ),
     ] = None,
     method: Annotated[
         str | None, typer.Option("--method", help="of the light field when nothing moves")
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option("--plan", help="a plan that the page may write what it found into; --rig too"),
     ] = None,
     host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
@@ -54,14 +60,30 @@ def live(
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
     """Show the camera on a local page: levels, focus, mask, jog, light field. Ctrl-C ends."""
-    from emmc_rig.live.server import LOCAL_HOSTS, application, new_token
+    from emmc_rig.live.server import (
+        LOCAL_HOSTS,
+        Server,
+        application,
+        listening_socket,
+        new_token,
+    )
+    from emmc_rig.live.setup_page import SetupPage
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
+    if rig is None:
+        refuse(context, given_names(context) & {"scene", "size"}, "without --rig simulated")
+    if read_only and plan is not None:
+        refuse(context, ("plan",), "with --read-only")
+    if rig == "simulated":
+        psi = psi or DESIGN
     if method is not None and psi is None:
         raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
-    listening = _listen(host, port)
-    with closing(listening), _watch(rig, camera, stage, design, scene, size, psi, method) as watch:
+    listening = listening_socket(host, port)
+    with (
+        closing(listening),
+        _watch(rig, camera, stage, design, scene, size, psi, method, plan) as watch,
+    ):
         token = new_token()
         number = listening.getsockname()[1]
         shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
@@ -79,18 +101,11 @@ def live(
             import webbrowser
 
             webbrowser.open(address)
-        _serve(application(watch, token, read_only, hosts), listening, watch.start)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as fault:
-        why = getattr(fault, "strerror", None) or str(fault)
-        raise AppError(
-            f"cannot serve at {host} port {port} ({why}): choose another --port or --host"
-        ) from fault
+        watch.start()
+        try:
+            Server(application(SetupPage(watch), token, read_only, hosts)).run(sockets=[listening])
+        except KeyboardInterrupt:
+            typer.echo("ended; the stage stands")
 
 
 @contextmanager
@@ -103,13 +118,19 @@ def _watch(
     size: str | None,
     psi: str | None,
     method: str | None,
+    plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
+    from emmc_rig.capture.plan import load_plan
     from emmc_rig.files.cameras import find_camera
+    from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
-    from emmc_rig.rig.hardware import SimulatedRig, open_camera, open_stage
+    from emmc_rig.rig.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
 
     described, scale = find_camera(design), _scale(psi)
+    files = Files(plan, None if rig is None or rig == SIMULATED else Path(rig))
+    if plan is not None:
+        load_plan(plan)
     with ExitStack() as stack:
         if rig is not None:
             from emmc_rig.files.results import parse_size
@@ -127,12 +148,14 @@ def _watch(
             if "aperture_x" in centre_um:
                 centre_um["aperture_x"] += opened.window_um
             field = _light_field(psi, scale, method, described, opened.camera.shape)
-            watch = Watch(opened.camera, opened.stage, look, targets, centre_um, described, field)
+            watch = Watch(
+                opened.camera, opened.stage, look, targets, centre_um, described, field, files
+            )
         else:
             device = stack.enter_context(closing(open_camera(camera or "ptp:")))
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
             field = _light_field(psi, scale, method, described, device.shape)
-            watch = Watch(device, driven, design=described, light_field=field)
+            watch = Watch(device, driven, design=described, light_field=field, files=files)
         stack.callback(watch.close)
         yield watch
 
@@ -177,22 +200,3 @@ def _light_field(
 
 def _nobody(what: str) -> None:
     """Ask for nothing: a page that only shows and jogs needs no lamp changed."""
-
-
-def _serve(app: object, listening: socket.socket, begin: Callable[[], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, which are how it is meant to end."""
-    import uvicorn
-
-    config = uvicorn.Config(
-        app,  # pyright: ignore[reportArgumentType]
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        server_header=False,
-        timeout_graceful_shutdown=1,
-    )
-    begin()
-    try:
-        uvicorn.Server(config).run(sockets=[listening])
-    except KeyboardInterrupt:
-        typer.echo("ended; the stage stands")

@@ -30,7 +30,6 @@ SizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
-MethodOption = Annotated[str, typer.Option("--method", help="see `emmc-rig reconstruct --list`")]
 DictionaryOption = Annotated[
     str | None,
     typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),

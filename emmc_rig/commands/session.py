@@ -26,7 +26,8 @@ def list_sessions(
     since: Annotated[str, typer.Option("--since", help="begun then or later, 2026-11-22")] = "",
     before: Annotated[str, typer.Option("--before", help="begun before, 2026-11-22")] = "",
     verdict: Annotated[
-        str, typer.Option("--verdict", help="of the light field: trust, doubt or do not use")
+        str,
+        typer.Option("--verdict", help="of the light field: trust, cannot tell, doubt, do not use"),
     ] = "",
     psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
     json_lines: Annotated[bool, typer.Option("--json", help="as lines of JSON")] = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -29,6 +29,9 @@ def simulate(
     seed: SeedOption = 0,
     size: SizeOption = None,
     out: OutOption = Path("emmc-frames"),
+    as_zarr: Annotated[
+        bool, typer.Option("--zarr", help="Psi as psi.zarr, in shards, in place of psi.h5")
+    ] = False,
 ) -> None:
     """Make frames of a light field through any camera, without a rig."""
     import emmc_rig as emmc
@@ -37,7 +40,7 @@ def simulate(
 
     described = emmc.camera(camera, shots)
     with result_folder(out, "simulate") as folder:
-        metrics = simulate_into(folder, scene, camera, described, parse_size(size), seed)
+        metrics = simulate_into(folder, scene, camera, described, parse_size(size), seed, as_zarr)
     typer.echo(
         f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "
         f"efficiency {metrics['light_efficiency']:.1%}; in {out}"
@@ -51,16 +54,18 @@ def simulate_into(
     camera: Camera,
     size: tuple[int, int] | None,
     seed: int,
+    as_zarr: bool = False,
 ) -> dict:
     """Write frames.h5, psi.h5 and metrics.json into an existing folder; return the metrics.
 
     frames.h5 holds `frames_dn` (shot, y, x) uint16, `readings`, their standard `deviation`, which
     pixels are `usable`, and `noise_free` readings. Quick, and an inverse crime when the same Psi
     reconstructs them; the demo traces rays instead. sensor_psnr_db compares readings with noise to
-    those without, peak 1, as the paper's Figure 5.
+    those without, peak 1, as the paper's Figure 5. as_zarr: write psi.zarr in place of psi.h5.
     """
     import emmc_rig as emmc
     from emmc_rig.files.frames import FRAMES, PSI
+    from emmc_rig.files.psi import PSI_GROUP, save_shards
     from emmc_rig.files.results import save_frames, write_metrics
     from emmc_rig.model.lightfield import psnr_db
 
@@ -76,7 +81,10 @@ def simulate_into(
         usable=frames.usable,
         noise_free=frames.noise_free,
     )
-    psi.save(folder / PSI)
+    if as_zarr:
+        save_shards(psi, folder / PSI_GROUP)
+    else:
+        psi.save(folder / PSI)
     metrics = {
         "scene": scene_name,
         "scene_provenance": scene.provenance,

@@ -9,7 +9,6 @@ import typer
 
 from emmc_rig.commands.options import (
     DictionaryOption,
-    MethodsOption,
     ScenesOption,
     SeedOption,
     SizeOption,
@@ -27,7 +26,10 @@ def stability(
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this one; may repeat")
     ] = None,
-    method: MethodsOption = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="only this one, or all that are installed; may repeat"),
+    ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
     ] = False,
@@ -61,6 +63,9 @@ def stability(
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="processes that share the trials")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="folder to write (default: emmc-stability, -verdicts, -worst)"),
@@ -97,7 +102,9 @@ def stability(
         switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
         wanted = [name for name, on in switches.items() if on]
         beside = measure_beside(settings, wanted, out, bars)
-        outcome = run_stability(settings, out, bars, beside.sections, beside.metrics)
+        outcome = run_stability(
+            settings, out, bars, beside.sections, beside.metrics, workers=workers
+        )
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"
     shown = [(f"{row.title}, {row.unit}", *row.cells) for row in rows]
@@ -133,9 +140,13 @@ def _verdicts(out: Path, *wanted: Any) -> None:
     with shown_bars() as bars:
         results = detector.run_detector(settings, out, bars)
     show_table(
-        ("fault", "method", "broken: flagged", "good: flagged", "between", "poor"),
+        ("fault", "method", "broken: flagged", "good: flagged", "between", "poor", "cannot tell"),
         [
-            (*names, *(f"{flagged} of {there}" for flagged, there in tally.pairs()))
+            (
+                *names,
+                *(f"{flagged} of {there}" for flagged, there in tally.pairs()),
+                str(tally.untold),
+            )
             for names, tally in detector.tables(results).items()
         ],
     )

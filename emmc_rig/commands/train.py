@@ -9,6 +9,10 @@ import typer
 
 from emmc_rig.commands.options import SeedOption
 
+NETWORK_CAMERAS = (
+    "scenario-ii-cfa", "rgbw-bayer-1shot", "rgbw-bayer-3shots", "rgbw-mono",
+)  # fmt: skip
+
 
 def train(
     out: Annotated[Path, typer.Option("--out", help="the dictionary to write, FILE.h5")],
@@ -37,10 +41,26 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="go on where the same training stopped")
     ] = False,
+    network: Annotated[
+        bool, typer.Option("--network", help="instead: the network of `unrolled`, on random worlds")
+    ] = False,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option("--camera", help="of --network: whose kinds of masks it sees; may repeat"),
+    ] = None,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="of --network, in all")] = 6000,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", min=0, help="of --network: then write it; --resume goes on"),
+    ] = None,
 ) -> None:
-    """Train a dictionary of light-field patches; Ctrl-C leaves a checkpoint for --resume."""
+    """Train a dictionary of light-field patches, or a network; Ctrl-C leaves a checkpoint."""
     from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.results import parse_size
+
+    if network:
+        _train_network(out, camera or list(NETWORK_CAMERAS), views, steps, minutes, seed, resume)
+        return
     from emmc_rig.reconstruct.training import picture_path, train_settings
     from emmc_rig.reconstruct.training import train as run
 
@@ -61,3 +81,32 @@ def train(
         f"{provenance['peak_memory_gib']:.2f} GiB"
     )
     typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
+
+
+def _train_network(
+    out: Path,
+    cameras: list[str],
+    views: str | None,
+    steps: int,
+    minutes: float | None,
+    seed: int,
+    resume: bool,
+) -> None:
+    from emmc_rig.commands.bars import shown_bars
+    from emmc_rig.files.results import parse_size
+    from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
+    from reconstruction.unrolled.weights import Architecture
+
+    architecture = Architecture(views=parse_size(views, "--views", "5x5") or (5, 5))
+    training = NetworkTraining(
+        out, tuple(cameras), architecture, steps, minutes, seed=seed, resume=resume
+    )
+    with shown_bars() as bars:
+        weights, learner = train_network(training, bars)
+    count = sum(array.size for array in weights.arrays.values())
+    last = learner.losses_db[-max(1, learner.steps // 20) :]
+    typer.echo(
+        f"{count} weights after {learner.steps} of {steps} steps: {sum(last) / len(last):.2f} dB "
+        "on the last twentieth of the random worlds"
+    )
+    typer.echo(f"wrote {out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-VERDICT_COLOURS = {"trust": "green", "doubt": "yellow", "do not use": "red"}
+VERDICT_COLOURS = {"trust": "green", "cannot tell": "cyan", "doubt": "yellow", "do not use": "red"}
 
 
 def show_reason(level: str, what: str, remedy: str, figure: float) -> None:

@@ -55,6 +55,16 @@ def create_array(
     ]
 
 
+def opened_group(folder: Path, error: type[Exception], remedy: str) -> Any:
+    """Return a group, not read; raises `error` where there is none, AppError without Zarr."""
+    zarr = _zarr()
+    try:
+        return zarr.open_group(folder, mode="r")
+    except (OSError, KeyError, ValueError, TypeError) as fault:
+        why = f"{shown_path(folder)}: is no Zarr group ({one_line(fault)}); {remedy}"
+        raise error(why) from fault
+
+
 def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
     """Return an array of a group, not read; raises AppError where there is none."""
     zarr = _zarr()

@@ -21,6 +21,7 @@ from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from drivers.raw import RawFrame
 from emmc_rig.model.camera import Camera, draw_plates, psi_layout
 from emmc_rig.model.masks import Sinusoids
+from emmc_rig.pages.frame_view import thinned
 
 Array = NDArray[np.floating]
 
@@ -96,7 +97,7 @@ def grid_direction(plane: Array) -> tuple[float, float]:
 def is_dark(frame: RawFrame) -> bool:
     """Return whether a frame shows nothing but black."""
     black = float(frame.black_level_dn.mean())
-    bright = float(np.percentile(frame.mosaic[::2, ::2], 99)) - black
+    bright = float(np.percentile(thinned(frame.mosaic), 99)) - black
     return bright < DARK_SHARE * max(1.0, frame.white_level_dn - black)
 
 

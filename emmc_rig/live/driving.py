@@ -25,14 +25,15 @@ Step = Callable[[Stage], object]
 class Driving:
     """Carries out moves; every method may be called by any thread.
 
-    publish: is given by name what changed: `axes`, `busy` (what is under way), `stopped` (whether
-    the last move was stopped by hand), `stage` (what went wrong in it).
+    begun: how many moves were. publish: is given by name what changed: `axes`, `busy` (what is
+    under way), `stopped` (whether the last move was stopped by hand), `stage` (what went wrong).
     """
 
     def __init__(self, stage: Stage, publish: Callable[..., None]) -> None:
         self.stage, self._publish = stage, publish
         self._lock = threading.Lock()
         self._busy = ""
+        self.begun = 0
         self._idle = threading.Event()
         self._idle.set()
         self._ending = threading.Event()
@@ -73,12 +74,18 @@ class Driving:
         """Whether a move is under way."""
         return not self._idle.is_set()
 
+    @property
+    def stopped(self) -> bool:
+        """Whether the move under way, or the last one, was stopped by hand."""
+        return self._stopped_by_hand
+
     def ask(self, what: str, *steps: Step) -> None:
         """Begin a move of one step or several; raises AppError while another one is under way."""
         with self._lock:
             if self._busy:
                 raise AppError(f"the stage is busy ({self._busy}): wait, or stop it")
             self._busy = what
+            self.begun += 1
             self._stopped_by_hand = False
             self._idle.clear()
         self._publish(busy=what, stopped=False, stage="")
@@ -123,7 +130,7 @@ class Driving:
                 for step in steps:
                     if not self._stopped_by_hand:
                         step(self.stage)
-            except (DriverError, ValueError) as fault:
+            except (AppError, DriverError, ValueError) as fault:
                 trouble = str(fault)
             stopped = self._stopped_by_hand
             with self._lock:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -21,10 +20,10 @@ from calibration.bracket import fuse
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
+from emmc_rig.live.field_pictures import Pictures, drawn
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.frame_view import srgb_codes
 from emmc_rig.session.readings import Scale
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD
@@ -45,30 +44,12 @@ CHANGED = 4.0
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
 BLOCK_PX = 16
 ANOTHER_BRIGHTNESS = 1.2
-LONGEST_SHEET_PX = 4096
-SURE_PX = 0.15
-"""Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
-WINDOW_PX = 7
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
 
 
 class _ChangedError(Exception):
     """The scene is another one than that being reconstructed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pictures:
-    """What the page draws from: all views side by side, and the centre view's disparity.
-
-    sheet: (V y, U x, BGR). disparity: (y, x) in pixels of the sheet per view step, NaN where the
-    views do not tell.
-    """
-
-    number: int
-    views: tuple[int, int]
-    sheet: NDArray[np.uint8]
-    disparity: NDArray[np.float32]
 
 
 class LiveLightField:
@@ -86,6 +67,10 @@ class LiveLightField:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._scale, self._method, self._solve, self._clock = scale, method, solve, clock
+        white = scale.white_dn_per_s
+        usable = (white > 0) & scale.good
+        self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
+        self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
         self._since_s = clock()
         self.preview: Preview | None = None
@@ -166,7 +151,9 @@ class LiveLightField:
 
     def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
         """Return DN per second above the dark, (y, x)."""
-        return (frame.mosaic - self._scale.dark.mean_dn) / np.float32(_exposure_s(frame))
+        rate = frame.mosaic - np.asarray(self._scale.dark.mean_dn, np.float32)
+        rate /= np.float32(_exposure_s(frame))
+        return rate
 
     def _of_shots(self) -> tuple[list[int], ImagingMatrix]:
         shots = sorted(self._held)
@@ -176,11 +163,12 @@ class LiveLightField:
     def _go_on(self) -> None:
         """Move the preview on by the frames held."""
         shots = sorted(self._held)
-        white = self._scale.white_dn_per_s[shots]
-        seen = (white > 0) & self._scale.good
+        # 0 where a pixel is not to be used, so that nothing is chosen among the readings.
+        share = self._reading_per_rate[shots]
         readings = np.stack([self._rate(self._held[shot]) for shot in shots])
-        readings = np.where(seen, readings / np.where(seen, white, 1), 0).astype(np.float32)
-        level = float(readings[seen].mean())
+        readings *= share
+        seen = share > 0
+        level = float(readings.mean() / max(seen.mean(), 1e-12))
         if level <= 0:
             raise ReconstructionError("the picture is dark: no light field to see")
         factor = max(self._level / level, level / max(self._level, 1e-12))
@@ -224,18 +212,7 @@ class LiveLightField:
 
     def _draw(self, light_field: Array, disparity: Array | None) -> None:
         self._numbers += 1
-        views_v, views_u, high, wide, _ = light_field.shape
-        shrink = max(1, int(np.ceil(max(views_v * high, views_u * wide) / LONGEST_SHEET_PX)))
-        size = wide // shrink, high // shrink
-        tiles = [[_fitted(light_field[v, u], size) for u in range(views_u)] for v in range(views_v)]
-        linear = np.concatenate([np.concatenate(row, axis=1) for row in tiles], axis=0)
-        if disparity is None:
-            small = np.stack([np.stack(row) for row in tiles])
-            found = disparity_of(small)
-        else:
-            found = _fitted(np.asarray(disparity), size) / np.float32(shrink)
-        sheet = np.ascontiguousarray(srgb_codes(linear)[..., ::-1])
-        self._pictures = Pictures(self._numbers, (views_v, views_u), sheet, found)
+        self._pictures = drawn(light_field, disparity, self._numbers)
 
     def _report(self, why: str) -> dict[str, Any]:
         """Return what the page says: what is shown, how far a reconstruction is, the verdict."""
@@ -249,23 +226,11 @@ class LiveLightField:
             why = run.fault
         elif run is not None:
             stage = f"preview; {self._method} at work, step {run.step}"
-        shown = None
-        if pictures is not None:
-            known = pictures.disparity[np.isfinite(pictures.disparity)]
-            rows, columns = pictures.sheet.shape[:2]
-            shown = {
-                "number": pictures.number,
-                "views": list(pictures.views),
-                "size": [rows // pictures.views[0], columns // pictures.views[1]],
-                "disparities": [float(d) for d in np.percentile(known, (5, 95))]
-                if known.size
-                else None,
-            }
         return {
             "stage": stage,
             "why": why,
             "shots": [len(self._held), self.psi.shots],
-            "pictures": shown,
+            "pictures": None if pictures is None else pictures.facts(),
             "verdict": verdict,
         }
 
@@ -313,39 +278,3 @@ def _exposure_s(frame: RawFrame) -> float:
     if not frame.exposure_s:
         raise AppError("the camera does not say how long its frames were exposed")
     return float(frame.exposure_s)
-
-
-def _fitted(view: Array, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return a picture (y, x[, c]) at size (x, y)."""
-    if view.shape[1::-1] == size:
-        return np.asarray(view, np.float32)
-    whole = np.ascontiguousarray(view, np.float32)
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def disparity_of(light_field: Array) -> NDArray[np.float32]:
-    """Return the disparity of small views, (y, x), pixels per view step; NaN where not decided.
-
-    light_field: (v, u, y, x, c). Where views are shifted by less than a pixel, brightness stays
-    along lines of slope d: L_u = -d L_x and L_v = -d L_y, solved by least squares over a window
-    and all views (Bolles, Baker and Marimont 1987; as Lucas and Kanade 1981 for flow).
-    """
-    grey = light_field.mean(axis=-1, dtype=np.float32)
-    by_v, by_u, by_y, by_x = (
-        np.gradient(grey, axis=axis) if grey.shape[axis] > 1 else np.zeros_like(grey)
-        for axis in range(4)
-    )
-
-    def gathered(values: Array) -> Array:
-        return cv2.blur(values.sum(axis=(0, 1)), (WINDOW_PX, WINDOW_PX))
-
-    power = gathered(by_x**2 + by_y**2)
-    product = gathered(by_u * by_x + by_v * by_y)
-    change = gathered(by_u**2 + by_v**2)
-    safe = np.maximum(power, 1e-12)
-    found = -product / safe
-    left = np.maximum(change - product**2 / safe, 0)
-    # Views that differ by interpolation are no independent witnesses: one window of pixels counts.
-    deviation = np.sqrt(left / safe / WINDOW_PX)
-    sure = (deviation < SURE_PX) & (power > 1e-4 * float(power.max() + 1e-12))
-    return np.where(sure, found, np.nan).astype(np.float32)

@@ -1,59 +1,12 @@
 "use strict";
-// One state, drawn whenever the server tells a newer one; a picture is asked for after each frame.
-const $ = (id) => document.getElementById(id);
+// The page to set up by: a picture is asked for after each frame.
 const COLOURS = { red: "#ff6b6b", green: "#63c98c", blue: "#6d9bf2", grey: "#d0d4d9" };
 const PARTS = [1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64];
 const WIDTHS = [400, 800, 1200, 1600]; // few sizes, so that pages share what is encoded
 const THIRD_STOP = 2 ** (1 / 3);
 const ACTIONS = { centre: "centre the mask", autoexpose: "expose automatically" };
-const view = { show: "colour", x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
-let state = { version: 0 };
+const view = { x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
 let loading = false, wanted = false, times = [];
-
-async function ask(path, options) {
-  const answer = await fetch(path, { cache: "no-store", ...options });
-  if (!answer.ok) throw new Error((await answer.text()).trim());
-  return answer;
-}
-
-async function act(name, values = {}) {
-  try {
-    await ask("do/" + name, {
-      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(values),
-      priority: name === "stop" ? "high" : "auto",
-    });
-    complain("");
-  } catch (fault) { complain(fault.message); }
-}
-
-let complaint = "";
-function complain(text) { complaint = text; drawTrouble(); }
-
-// What is announced is written only when it changes: a screen reader reads it again otherwise.
-function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
-
-function drawTrouble() {
-  const lines = [complaint, ...Object.values(state.trouble || {})].filter(Boolean);
-  $("trouble").hidden = lines.length === 0;
-  write("trouble", lines.join("; "));
-}
-
-async function follow() {
-  for (;;) {
-    try {
-      const told = await (await ask("state?after=" + state.version)).json();
-      $("lost").hidden = true;
-      const fresh = told.frame !== state.frame;
-      state = told;
-      draw();
-      if (fresh) show();
-      showField();
-    } catch (fault) {
-      $("lost").hidden = false;
-      await new Promise((done) => setTimeout(done, 1000));
-    }
-  }
-}
 
 async function show() {
   if (onField()) return;
@@ -63,7 +16,7 @@ async function show() {
   const wide = Math.max(box.width, box.height) * (window.devicePixelRatio || 1);
   const px = WIDTHS.find((one) => one >= wide) || WIDTHS.at(-1);
   const query = new URLSearchParams({
-    kind: view.show, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
+    kind: shownKind, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
   });
   try {
     const blob = await (await ask("picture.jpg?" + query)).blob();
@@ -78,17 +31,15 @@ async function show() {
 
 function draw() {
   const { figures, settings } = state;
-  drawTrouble();
   drawHint();
   write("camera", `${settings.camera}, ${settings.shape[0]}x${settings.shape[1]} ${settings.cfa}`);
-  $("read-only").hidden = !state.read_only;
   for (const one of document.querySelectorAll(".acts")) one.disabled = state.read_only;
   write("frame", state.frame ? `frame ${state.frame}` : "waiting for the first frame");
   drawSetting("exposure", 1e3 * settings.exposure_s, settings.exposure_limits_s.map((s) => 1e3 * s), "ms");
   drawSetting("gain", settings.gain, settings.gain_limits, "");
   drawTargets();
   drawAxes();
-  drawField();
+  drawSteps();
   write("zoom", `${Math.round(1 / PARTS[view.level])}x`);
   drawMask();
   if (!figures) return;
@@ -110,11 +61,6 @@ function draw() {
   write("take", state.reference ? "forget the reference" : "measure shifts from here");
 }
 
-function percent(value, deviation) {
-  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(Math.max(100 * deviation, 1e-3)))));
-  return `${(100 * value).toFixed(digits)} \u00b1 ${(100 * deviation).toFixed(digits)} %`;
-}
-
 function drawMask() {
   const place = state.mask?.place;
   write("rotation", place ? `${place.rotation_deg.toFixed(3)} \u00b1 ${place.rotation_deviation_deg.toFixed(3)}\u00b0` : "not seen");
@@ -132,6 +78,56 @@ function drawHint() {
   $("hint-do").hidden = !hint?.action;
   write("hint-do", ACTIONS[hint?.action] || "");
   $("hint-do").disabled = state.read_only || state.busy !== "";
+}
+
+// Steps are made once and then written to: a button that has the focus keeps it.
+const LABELS = { autoexpose: "expose", centre: "centre", autofocus: "focus", preview: "save ..." };
+function drawSteps() {
+  const parent = $("steps");
+  if (parent.children.length !== state.steps.length)
+    fill(parent, state.steps.map((step, i) => {
+      const row = document.createElement("li");
+      row.append(cell("b", step.name), cell("span", ""), button("", () => doStep(i)));
+      return row;
+    }));
+  state.steps.forEach((step, i) => {
+    const [, words, press] = parent.children[i].children;
+    const look = step.look && state.targets.includes(step.look);
+    const label = look ? "look at the " + step.look : LABELS[step.action] || "";
+    if (words.textContent !== step.text) words.textContent = step.text;
+    if (press.textContent !== label) press.textContent = label;
+    press.hidden = !label;
+    press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
+    parent.children[i].classList.toggle("done", step.done);
+  });
+}
+
+function doStep(i) {
+  const step = state.steps[i];
+  if (step.action === "preview") openSave();
+  else if (step.action === "autofocus") act("autofocus", { span_um: 1000 });
+  else if (step.action) act(step.action);
+  else if (step.look) act("look", { target: step.look });
+}
+
+function openSave() {
+  $("save-form").hidden = false;
+  fill($("takes"), state.takes.map((name) => {
+    const label = document.createElement("label"), box = document.createElement("input");
+    Object.assign(box, { type: "checkbox", checked: true, value: name });
+    box.addEventListener("change", previewSave);
+    label.append(box, " " + name);
+    return label;
+  }));
+  previewSave();
+}
+
+async function previewSave() {
+  const what = [...$("takes").querySelectorAll("input:checked")].map((one) => one.value);
+  const answer = await act("preview", { what });
+  write("saved", "");
+  write("diff", answer ? answer.diff || "nothing to change" : "");
+  $("save").disabled = !answer?.diff;
 }
 
 function drawSetting(id, value, limits, unit) {
@@ -179,29 +175,6 @@ function drawLevels(figures) {
   }));
 }
 
-function cell(kind, text, style = "") {
-  const made = document.createElement(kind);
-  made.textContent = text;
-  if (style) made.className = style;
-  return made;
-}
-
-function heading(text) {
-  const made = cell("th", text);
-  made.scope = "row";
-  return made;
-}
-
-function fill(parent, children) { parent.replaceChildren(...children); }
-
-function button(text, call, label, off = false) {
-  const made = cell("button", text);
-  made.disabled = off;
-  if (label) { made.title = label; made.setAttribute("aria-label", label); }
-  made.addEventListener("click", call);
-  return made;
-}
-
 let drawnTargets = "";
 function drawTargets() {
   const key = JSON.stringify([state.targets, state.read_only]);
@@ -246,130 +219,6 @@ function jog(axis, sign) {
   act("jog", { axis, distance_um: typeof step === "number" ? sign * step : step });
 }
 
-function number(field) {
-  const value = Number(field.value.replace(",", "."));
-  return field.value.trim() === "" || Number.isNaN(value) ? field.value : value;
-}
-
-// The light field: all views in one picture; viewpoint and focus are worked out here.
-const field = { number: 0, sheet: null, depth: null, u: 0.5, v: 0.5, disparity: 0, loading: false };
-function onField() { return ["views", "focus", "depth"].includes(view.show); }
-
-async function showField() {
-  const shown = state.light_field?.pictures;
-  if (!shown || !onField() || field.loading || shown.number === field.number) return;
-  field.loading = true;
-  try {
-    const [sheet, depth] = await Promise.all(["views.jpg", "disparity.png"].map(async (name) =>
-      createImageBitmap(await (await ask(name)).blob())));
-    Object.assign(field, { sheet, depth, number: shown.number, shown });
-    paintField();
-  } catch (fault) { /* the next state tells why */ }
-  field.loading = false;
-}
-
-function drawField() {
-  const told = state.light_field;
-  for (const one of ["views", "focus", "depth"])
-    document.querySelector(`[data-show=${one}]`).hidden = !told;
-  if (!told) return;
-  const parts = [told.stage];
-  if (told.shots[1] > 1) parts.push(`${told.shots[0]} of ${told.shots[1]} shots`);
-  if (told.pictures && !told.verdict) parts.push(`${told.latency_s.toFixed(2)} s after its frame`);
-  if (told.why) parts.push(told.why);
-  parts.push(told.verdict ? told.verdict.words : "no verdict yet");
-  write("field-stage", parts.join("; "));
-  $("field-stage").classList.toggle("bad", told.verdict?.level === "do not use");
-  $("field-stage").classList.toggle("good", told.verdict?.level === "trust");
-}
-
-function paintField() {
-  const canvas = $("field"), { sheet, shown } = field;
-  if (!sheet || !onField()) return;
-  const box = canvas.getBoundingClientRect(), dots = window.devicePixelRatio || 1;
-  canvas.width = Math.max(1, Math.round(box.width * dots));
-  canvas.height = Math.max(1, Math.round(box.height * dots));
-  const pen = canvas.getContext("2d");
-  const [rows, columns] = shown.views, [high, wide] = shown.size;
-  const scale = Math.min(canvas.width / wide, canvas.height / high);
-  const left = (canvas.width - wide * scale) / 2, top = (canvas.height - high * scale) / 2;
-  pen.save();
-  pen.beginPath();
-  pen.rect(left, top, wide * scale, high * scale);
-  pen.clip();
-  const put = (v, u, x = 0, y = 0) => pen.drawImage(sheet, u * wide, v * high, wide, high,
-    left + x * scale, top + y * scale, wide * scale, high * scale);
-  const middle = [Math.floor(rows / 2), Math.floor(columns / 2)];
-  if (view.show === "depth") {
-    put(...middle);
-    pen.fillStyle = "#000a";
-    pen.fillRect(left, top, wide * scale, high * scale);
-    pen.drawImage(field.depth, left, top, wide * scale, high * scale);
-  } else if (view.show === "focus") {
-    let count = 0;
-    for (let v = 0; v < rows; v++)
-      for (let u = 0; u < columns; u++) {
-        pen.globalAlpha = 1 / ++count;
-        put(v, u, -field.disparity * (u - middle[1]), -field.disparity * (v - middle[0]));
-      }
-  } else {
-    const v = field.v * (rows - 1), u = field.u * (columns - 1);
-    const v0 = Math.min(Math.floor(v), Math.max(0, rows - 2)), u0 = Math.min(Math.floor(u), Math.max(0, columns - 2));
-    let sum = 0;
-    for (const [i, j, weight] of [[0, 0, (1 - v + v0) * (1 - u + u0)], [0, 1, (1 - v + v0) * (u - u0)],
-      [1, 0, (v - v0) * (1 - u + u0)], [1, 1, (v - v0) * (u - u0)]]) {
-      if (weight <= 0) continue;
-      sum += weight;
-      pen.globalAlpha = weight / sum;
-      put(v0 + i, u0 + j);
-    }
-  }
-  pen.restore();
-  const range = shown.disparities;
-  write("focused", view.show === "focus" ? `focus at ${field.disparity.toFixed(2)} px per view`
-    : view.show === "depth" ? (range ? `${range[0].toFixed(2)} (dark) to ${range[1].toFixed(2)} (bright) px per view` : "no disparity is decided")
-    : `view ${(field.v * (rows - 1) + 1).toFixed(1)}, ${(field.u * (columns - 1) + 1).toFixed(1)}`);
-  canvas.setAttribute("aria-label", `light field, ${$("focused").textContent}`);
-  canvas.dataset.number = field.number;
-}
-
-function refocus(steps) {
-  const range = field.shown?.disparities;
-  const step = range ? Math.max((range[1] - range[0]) / 20, 0.01) : 0.02;
-  field.disparity += steps * step;
-  choose("focus");
-}
-
-function look(v, u) {
-  field.v = Math.max(0, Math.min(1, v));
-  field.u = Math.max(0, Math.min(1, u));
-  if (view.show === "focus") choose("views"); else paintField();
-}
-
-$("field").addEventListener("pointermove", (event) => {
-  if (view.show !== "views" && !event.buttons) return;
-  const box = $("field").getBoundingClientRect();
-  look((event.clientY - box.top) / box.height, (event.clientX - box.left) / box.width);
-});
-$("field").addEventListener("wheel", (event) => { event.preventDefault(); refocus(event.deltaY < 0 ? 1 : -1); }, { passive: false });
-$("field").addEventListener("keydown", (event) => {
-  const [rows, columns] = field.shown?.views || [1, 1];
-  const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
-  if (by) look(field.v + by[0] / Math.max(1, rows - 1), field.u + by[1] / Math.max(1, columns - 1));
-  else if (event.key === "+" || event.key === "-") refocus(event.key === "+" ? 1 : -1);
-  else return;
-  event.preventDefault();
-});
-
-function choose(what) {
-  view.show = what;
-  for (const one of document.querySelectorAll("[data-show]"))
-    one.setAttribute("aria-pressed", one.dataset.show === what);
-  for (const one of document.querySelectorAll(".of-frame")) one.hidden = onField();
-  for (const one of document.querySelectorAll(".of-field")) one.hidden = !onField();
-  if (onField()) { paintField(); showField(); } else show();
-}
-
 function zoom(by, x = view.x, y = view.y) {
   view.level = Math.max(0, Math.min(PARTS.length - 1, view.level + by));
   const half = PARTS[view.level] / 2;
@@ -389,8 +238,6 @@ function place(event) {
   return [view.x + part * across, view.y + part * down];
 }
 
-for (const one of document.querySelectorAll("[data-show]"))
-  one.addEventListener("click", () => choose(one.dataset.show));
 for (const name of ["marked", "bright"])
   $(name).addEventListener("change", () => { view[name] = $(name).checked; show(); });
 $("closer").addEventListener("click", () => zoom(1));
@@ -438,6 +285,13 @@ $("hint-do").addEventListener("click", () => act(state.hint.action));
 for (const name of ["home", "centre", "stop", "autoexpose", "refocus"])
   $(name).addEventListener("click", () => act(name));
 
+$("save-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  $("save").disabled = true;
+  const answer = await act("save");
+  if (answer) { write("saved", "wrote " + answer.written.join(", ")); write("diff", ""); }
+});
+
 // Escape stops from anywhere; moves are by key only while the stage's panel has the focus.
 document.addEventListener("keydown", (event) => {
   if (event.key === "Escape") { act("stop"); event.preventDefault(); return; }
@@ -454,5 +308,5 @@ document.addEventListener("keydown", (event) => {
   } else return;
   event.preventDefault();
 });
-window.addEventListener("resize", () => { show(); paintField(); });
-follow();
+window.addEventListener("resize", show);
+follow((before) => { draw(); if (state.frame !== before.frame) show(); });

@@ -6,7 +6,7 @@ shown is the mean of its tiles, so that nothing needs to be demosaiced.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal, get_args
 
@@ -26,6 +26,9 @@ SMALLEST_PART = 1 / 256
 BRIGHTEST = 0.999
 SATURATED_BGR = (60, 60, 255)
 CLIPPED_BGR = (255, 90, 60)
+SATURATED, CLIPPED = np.array(SATURATED_BGR, np.uint8), np.array(CLIPPED_BGR, np.uint8)
+BRIGHTNESS_PX = 200
+"""Longest side of the picture by which a larger one is brightened."""
 QUALITY = 88
 CODES = 1 << 14
 """Steps of linear light in the table of sRGB codes: the darkest code is four of them wide."""
@@ -78,9 +81,17 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     span = max(1.0, frame.white_level_dn - black)
     step = -(-max(mosaic.shape) // (2 * view.longest_px))
     if step > 1 or max(mosaic.shape) >= 2 * view.longest_px:
-        means, marks = _averaged(mosaic, step, frame.white_level_dn)
-        seen = means @ _mixing(frame.cfa if view.kind == "colour" else "")
-        return _shown(seen, black, span, view, (marks & 1) > 0, marks > 1)
+        mixing = _mixing(frame.cfa if view.kind == "colour" else "")
+        if view.bright:
+            few = replace(view, longest_px=BRIGHTNESS_PX, bright=False)
+            codes = picture(frame, few).max(axis=2)
+            # The least linear light of the brightest code there is, so that it becomes white.
+            brightest = np.searchsorted(_srgb_table(), np.quantile(codes, BRIGHTEST)) / CODES
+            span *= max(1 / span, float(brightest))
+        white = frame.white_level_dn if view.marked else 1 << 16
+        gain = (CODES - 1) / (step * step * span)
+        offset = -black * (CODES - 1) / span
+        return _averaged(mosaic, step, white, mixing, gain, offset, _srgb_table(), view.marked)
     code = FROM_BAYER.get(frame.cfa) if view.kind == "colour" else None
     if code is not None and min(mosaic.shape) >= 4:
         seen = cv2.cvtColor(np.ascontiguousarray(mosaic), code)
@@ -131,36 +142,43 @@ def _mixing(cfa: str) -> NDArray[np.float32]:
     return mixing / mixing.sum(axis=0)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _averaged(mosaic, step, white):
-    """Return the means of step x step tiles, (y, x, 4 places in a tile), and marks (y, x).
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _averaged(mosaic, step, white, mixing, gain, offset, table, marked):
+    """Return the picture (y, x, BGR) of a mosaic averaged over step x step tiles.
 
-    Marks: 1 where any of the pixels reaches white, 2 where any is 0, or both.
+    mixing: see `_mixing`. gain, offset: from the sum of a tile's pixels of one place, mixed, to an
+    entry of table. marked: SATURATED_BGR where any of the pixels reaches white, CLIPPED_BGR where
+    any is 0: one saturated pixel in a large frame is seen.
     """
     rows, columns = mosaic.shape[0] // (2 * step), mosaic.shape[1] // (2 * step)
-    means = np.empty((rows, columns, 4), np.float32)
-    marks = np.zeros((rows, columns), np.uint8)
-    share = np.float32(1.0 / (step * step))
+    shown = np.empty((rows, columns, 3), np.uint8)
+    last = len(table) - 1
     for row in prange(rows):
-        sums = np.empty((columns, 4), np.uint32)
-        sums[:] = 0
+        sums = np.zeros((columns, 4), np.uint32)
+        most, least = np.zeros(columns, np.uint16), np.full(columns, 1, np.uint16)
         for part in range(2 * step):
             line = mosaic[2 * step * row + part]
             first = 2 * (part % 2)
             for column in range(columns):
                 at = 2 * step * column
                 for pair in range(step):
-                    for second in range(2):
-                        value = line[at + 2 * pair + second]
-                        sums[column, first + second] += value
-                        if value >= white:
-                            marks[row, column] |= 1
-                        if value == 0:
-                            marks[row, column] |= 2
+                    one, other = line[at + 2 * pair], line[at + 2 * pair + 1]
+                    sums[column, first] += one
+                    sums[column, first + 1] += other
+                    most[column] = max(most[column], one, other)
+                    least[column] = min(least[column], one, other)
         for column in range(columns):
-            for place in range(4):
-                means[row, column, place] = sums[column, place] * share
-    return means, marks
+            for c in range(3):
+                seen = 0.0
+                for place in range(4):
+                    seen += mixing[place, c] * sums[column, place]
+                code = int(seen * gain + offset)
+                shown[row, column, c] = table[min(max(code, 0), last)]
+            if marked and least[column] == 0:
+                shown[row, column] = CLIPPED
+            elif marked and most[column] >= white:
+                shown[row, column] = SATURATED
+    return shown
 
 
 def encoded(shown: NDArray[np.uint8]) -> bytes:

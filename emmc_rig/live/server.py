@@ -1,10 +1,10 @@
-"""The set-up page over HTTP: a secret in its address, nothing done by GET, nothing of others.
+"""A page over HTTP: a secret in its address, nothing done by GET, nothing of others.
 
 Every path begins with a random token, and the host must be one of this computer's names for
 itself, so that no other page in the browser can reach it (cross-site requests, DNS rebinding).
 
-Requests that wait for news hold no thread, and are answered a few at a time: what stops the stage
-has a thread of its own and finds the loop free between them, however many look on.
+States are pushed (server-sent events): each is encoded once and written to all who look, the
+newest only. A request that must not wait has a thread of its own.
 """
 
 from __future__ import annotations
@@ -12,41 +12,38 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
-from collections.abc import Awaitable, Callable, Hashable, Mapping
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from threading import Thread
+from typing import Any, Protocol
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from emmc_rig.errors import AppError
-from emmc_rig.live.picture import KINDS, View, disparity_png, encoded, picture
-from emmc_rig.live.watch import Watch
+from emmc_rig.errors import ERRORS, AppError
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 PATIENCE_S = 10.0
 LARGEST = 1e12
 """No position, exposure or number of pixels comes near it."""
-LONGEST_BODY = 4096
-PAUSE_S, PAUSE_EACH_S = 0.04, 0.002
-"""At least between two rounds of answers to those who wait for news, and more for each of them."""
+LONGEST_BODY = 1 << 17
+PAUSE_S = 0.04
+"""At least between two states that are pushed."""
 AT_ONCE = 4
-"""Answers between which the loop looks for other requests."""
+"""Clients written to between which the loop looks for other requests."""
 MOST_VIEWS = 16
 """Whose last picture is kept; those asked for least recently go first."""
-PAGE = {
-    "": ("page.html", "text/html"),
-    "page.css": ("page.css", "text/css"),
-    "page.js": ("page.js", "text/javascript"),
-}
+TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
@@ -57,6 +54,63 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is encoded once for all who ask: key and number name it, make returns its bytes."""
+
+    key: Hashable
+    number: int
+    make: Callable[[], bytes]
+    media_type: str = "image/jpeg"
+
+
+Query = Mapping[str, str]
+Pictured = Callable[[Query], Picture | None]
+Action = Callable[..., Mapping[str, Any] | None]
+"""Both raise AppError with one line."""
+
+
+class Page(Protocol):
+    """What is served; every member may be used by any thread."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files of the package `emmc_rig.live`; the first is the page itself."""
+        ...
+
+    @property
+    def pictures(self) -> Mapping[str, Pictured]:
+        """By name; each takes a query, and returns None while there is none."""
+        ...
+
+    @property
+    def actions(self) -> Mapping[str, Action]:
+        """By name, what POST does; a mapping returned is part of the answer."""
+        ...
+
+    @property
+    def urgent(self) -> frozenset[str]:
+        """The actions that wait for no other."""
+        ...
+
+    @property
+    def version(self) -> int:
+        """Grows with every change of the state."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Return the state, plain data with its `version`."""
+        ...
+
+    def looked(self) -> None:
+        """Take note that somebody looks."""
+        ...
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Let `listener` be called after every change, by whichever thread made it."""
+        ...
 
 
 def new_token() -> str:
@@ -73,39 +127,42 @@ class _RefusedError(Exception):
 
 
 class _News:
-    """Wakes requests that wait for a newer state; used in the server's loop alone."""
+    """Wakes those who wait for a newer state; used in the server's loop alone."""
 
-    def __init__(self, watch: Watch) -> None:
-        self._watch = watch
+    def __init__(self, page: Page) -> None:
+        self._page = page
         self._loop: asyncio.AbstractEventLoop | None = None
         self._waiting: list[asyncio.Future[None]] = []
         self._woken: list[asyncio.Future[None]] = []
-        self._round_planned = False
+        self._round_planned = self.closed = False
         self._encoded: tuple[int, bytes] = (-1, b"")
-        watch.listen(self._heard)
+        page.listen(self._heard)
 
-    async def newer(self, after: int, patience_s: float) -> None:
+    def close(self) -> None:
+        """Let nobody wait any longer."""
+        self.closed = True
+        self._begin_round()
+
+    async def newer(self, after: int) -> None:
         """Return when the state is newer than `after`, or patience ends."""
         self._loop = asyncio.get_running_loop()
-        if after <= 0:
+        if after <= 0 or self.closed:
             return
         future = self._loop.create_future()
         self._waiting.append(future)
-        if self._watch.version > after:
+        if self._page.version > after:
             self._plan_round()
         with suppress(TimeoutError):
-            await asyncio.wait_for(future, patience_s)
+            await asyncio.wait_for(future, PATIENCE_S)
 
-    def state(self, **more: Any) -> bytes:
-        """Return the state as JSON, encoded once for all who ask."""
-        version = self._watch.version
-        if self._encoded[0] != version:
-            state = self._watch.state()
+    def state(self, **more: Any) -> tuple[int, bytes]:
+        """Return version and state as JSON, encoded once for all who ask."""
+        self._page.looked()
+        if self._encoded[0] != self._page.version:
+            state = self._page.state()
             data = json.dumps({**state, **more}, allow_nan=False, separators=(",", ":"))
             self._encoded = (state["version"], data.encode())
-        else:
-            self._watch.newest()
-        return self._encoded[1]
+        return self._encoded
 
     def _heard(self) -> None:
         """Plan a round; called by whichever thread changed the state."""
@@ -117,7 +174,7 @@ class _News:
     def _plan_round(self) -> None:
         if self._loop is not None and not self._round_planned:
             self._round_planned = True
-            self._loop.call_later(PAUSE_S + PAUSE_EACH_S * len(self._waiting), self._begin_round)
+            self._loop.call_later(PAUSE_S, self._begin_round)
 
     def _begin_round(self) -> None:
         self._round_planned = False
@@ -141,12 +198,13 @@ class _Encoder:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="live pictures")
         self._made: dict[Hashable, tuple[int, asyncio.Future[bytes]]] = {}
 
-    async def of(self, what: Hashable, number: int, make: Callable[[], bytes]) -> bytes:
-        """Return the picture called `what` of a frame as new as `number` or being encoded now."""
-        known, future = self._made.pop(what, (-1, None))
-        if future is None or (future.done() and known != number) or _failed(future):
-            known, future = number, asyncio.get_running_loop().run_in_executor(self._thread, make)
-        self._made[what] = known, future
+    async def of(self, wanted: Picture) -> bytes:
+        """Return a picture as new as it is named, or being encoded now."""
+        known, future = self._made.pop(wanted.key, (-1, None))
+        if future is None or (future.done() and known != wanted.number) or _failed(future):
+            known = wanted.number
+            future = asyncio.get_running_loop().run_in_executor(self._thread, wanted.make)
+        self._made[wanted.key] = known, future
         while len(self._made) > MOST_VIEWS:
             del self._made[next(iter(self._made))]
         return await asyncio.shield(future)
@@ -157,12 +215,18 @@ def _failed(future: asyncio.Future[bytes]) -> bool:
 
 
 def application(
-    watch: Watch, token: str, read_only: bool = False, hosts: tuple[str, ...] = LOCAL_HOSTS
+    page: Page,
+    token: str,
+    read_only: bool = False,
+    hosts: tuple[str, ...] = LOCAL_HOSTS,
+    to_act: str = "start `emmc-rig live` without --read-only",
 ) -> Starlette:
-    """Return the ASGI application; hosts: names under which it may be asked for ("*": any)."""
-    actions = _actions(watch)
-    news, encoder = _News(watch), _Encoder()
-    stopping = ThreadPoolExecutor(1, thread_name_prefix="live stop request")
+    """Return the ASGI application; hosts: names under which it may be asked for ("*": any).
+
+    to_act: what somebody has to do who wants to act on a page that is read-only.
+    """
+    news, encoder = _News(page), _Encoder()
+    at_once = ThreadPoolExecutor(1, thread_name_prefix="live urgent request")
 
     def guarded(
         answer: Callable[[Request], Awaitable[Response]],
@@ -171,144 +235,136 @@ def application(
             try:
                 given = request.path_params.get("token", "")
                 if not secrets.compare_digest(given.encode(), token.encode()):
-                    raise _RefusedError(
-                        403, "wrong token: open the address that `emmc-rig live` printed"
-                    )
+                    raise _RefusedError(403, "wrong token: open the address that emmc-rig printed")
                 response = await answer(request)
             except _RefusedError as refusal:
                 response = PlainTextResponse(f"{refusal}\n", refusal.status)
-            except AppError as fault:
+            except ERRORS as fault:
                 response = PlainTextResponse(f"{fault}\n", 400)
             response.headers.update(HEADERS)
             return response
 
         return endpoint
 
-    async def page(request: Request) -> Response:
-        name = request.path_params.get("name", "")
-        if name not in PAGE:
+    async def shown(request: Request) -> Response:
+        name = request.path_params.get("name", "") or page.files[0]
+        if name in page.pictures:
+            wanted = page.pictures[name](request.query_params)
+            if wanted is None:
+                raise _RefusedError(503, "nothing to show yet")
+            return Response(await encoder.of(wanted), media_type=wanted.media_type)
+        if name not in page.files:
             raise _RefusedError(404, f"no page {name!r}")
-        file, kind = PAGE[name]
-        text = files("emmc_rig.live").joinpath(file).read_text(encoding="utf-8")
-        return Response(text, media_type=kind)
+        text = files("emmc_rig.live").joinpath(name).read_text(encoding="utf-8")
+        return Response(text, media_type=TYPES[name[name.rindex(".") :]])
 
     async def state(request: Request) -> Response:
-        after = _number(request.query_params, "after", 0, int)
-        await news.newer(after, PATIENCE_S)
-        return Response(news.state(read_only=read_only), media_type="application/json")
+        await news.newer(number_of(request.query_params, "after", 0, int))
+        return Response(news.state(read_only=read_only)[1], media_type="application/json")
 
-    async def shown(request: Request) -> Response:
-        view = _view(request.query_params)
-        newest = watch.newest()
-        if newest is None:
-            raise _RefusedError(503, "no frame yet")
+    async def events(request: Request) -> Response:
+        async def states() -> AsyncIterator[bytes]:
+            version, data = news.state(read_only=read_only)
+            while not news.closed:
+                yield b"data: " + data + b"\n\n"
+                await news.newer(version)
+                version, data = news.state(read_only=read_only)
 
-        def make() -> bytes:
-            frame = watch.frame()
-            assert frame is not None
-            return encoded(picture(frame, view))
-
-        data = await encoder.of(view, newest.number, make)
-        return Response(data, media_type="image/jpeg")
-
-    async def views(request: Request) -> Response:
-        pictures = None if watch.light_field is None else watch.light_field.pictures()
-        if pictures is None:
-            raise _RefusedError(503, "no light field yet")
-        data = await encoder.of("views", pictures.number, lambda: encoded(pictures.sheet))
-        return Response(data, media_type="image/jpeg")
-
-    async def disparity(request: Request) -> Response:
-        pictures = None if watch.light_field is None else watch.light_field.pictures()
-        if pictures is None:
-            raise _RefusedError(503, "no light field yet")
-        data = await encoder.of(
-            "disparity", pictures.number, lambda: disparity_png(pictures.disparity)
-        )
-        return Response(data, media_type="image/png")
+        return StreamingResponse(states(), media_type="text/event-stream")
 
     async def act(request: Request) -> Response:
         if request.method != "POST":
             raise _RefusedError(405, "nothing is done by GET: send POST")
         if read_only:
-            raise _RefusedError(403, "read-only: start `emmc-rig live` without --read-only to act")
+            raise _RefusedError(403, f"read-only: {to_act} to act")
         origin = request.headers.get("origin")
         if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
             raise _RefusedError(403, f"not from this page but from {origin}")
         name = request.path_params["action"]
-        if name not in actions:
-            raise _RefusedError(404, f"no action {name!r}: {', '.join(actions)}")
+        if name not in page.actions:
+            raise _RefusedError(404, f"no action {name!r}: {', '.join(page.actions)}")
         values = await _body(request)
+
+        def call() -> Mapping[str, Any]:
+            return page.actions[name](**values) or {}
+
         try:
-            if name == "stop":
-                await asyncio.get_running_loop().run_in_executor(
-                    stopping, lambda: actions[name](**values)
-                )
+            if name in page.urgent:
+                done = await asyncio.get_running_loop().run_in_executor(at_once, call)
             else:
-                await run_in_threadpool(lambda: actions[name](**values))
+                done = await run_in_threadpool(call)
         except TypeError as fault:
             raise _RefusedError(400, f"{name}: these are not its values ({fault})") from fault
-        return JSONResponse({"done": name})
+        return JSONResponse({"done": name, **done})
 
     async def stranger(request: Request) -> Response:
         raise _RefusedError(403, "wrong token")
 
-    return Starlette(
+    made = Starlette(
         routes=[
             Route("/{token}/state", guarded(state), methods=["GET"]),
-            Route("/{token}/picture.jpg", guarded(shown), methods=["GET"]),
-            Route("/{token}/views.jpg", guarded(views), methods=["GET"]),
-            Route("/{token}/disparity.png", guarded(disparity), methods=["GET"]),
+            Route("/{token}/events", guarded(events), methods=["GET"]),
             Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
-            Route("/{token}/", guarded(page), methods=["GET"]),
-            Route("/{token}/{name}", guarded(page), methods=["GET"]),
+            Route("/{token}/", guarded(shown), methods=["GET"]),
+            Route("/{token}/{name}", guarded(shown), methods=["GET"]),
             Route("/{rest:path}", guarded(stranger), methods=["GET", "POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
     )
+    made.state.close = news.close
+    return made
 
 
-def _actions(watch: Watch) -> Mapping[str, Callable[..., None]]:
-    def exposure(seconds: float) -> None:
-        watch.set_exposure_s(_finite(seconds))
-
-    def gain(factor: float) -> None:
-        watch.set_gain(_finite(factor))
-
-    def jog(axis: str, distance_um: float) -> None:
-        watch.jog(str(axis), _finite(distance_um))
-
-    def go(axis: str, place_um: float) -> None:
-        watch.go(str(axis), _finite(place_um))
-
-    def home() -> None:
-        watch.home()
-
-    def centre() -> None:
-        watch.centre()
-
-    def stop() -> None:
-        watch.stop()
-
-    def look(target: str) -> None:
-        watch.look_at(target)
-
-    def reference(taken: bool) -> None:
-        watch.take_reference(taken)
-
-    def autoexpose() -> None:
-        watch.auto_expose()
-
-    def refocus() -> None:
-        watch.forget_focus()
-
-    known = (
-        exposure, gain, autoexpose, jog, go, home, centre, stop, look, reference, refocus,
-    )  # fmt: skip
-    return {action.__name__: action for action in known}
+def listening_socket(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
+    """Return a socket to serve at; raises AppError where that is not possible."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as fault:
+        why = getattr(fault, "strerror", None) or str(fault)
+        raise AppError(
+            f"cannot serve at {host} port {port} ({why}): choose another --port or --host"
+        ) from fault
 
 
-def _finite(value: object) -> float:
+class Server(uvicorn.Server):
+    """Serves an application: `run(sockets=[...])`, until `should_exit`."""
+
+    def __init__(self, app: Starlette) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                access_log=False,
+                lifespan="off",
+                server_header=False,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        self._close = app.state.close
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End what is pushed, then what else is under way."""
+        self._close()
+        await super().shutdown(sockets)
+
+
+@contextmanager
+def served(app: Starlette) -> Iterator[int]:
+    """Serve on this computer in a thread of its own until the block ends; yield the port."""
+    with listening_socket() as listening:
+        server = Server(app)
+        thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="live server")
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join(PATIENCE_S)
+
+
+def finite(value: object) -> float:
+    """Return a number that somebody sent; raises AppError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise AppError(f"{value!r} is not a number")
     if not abs(value) < LARGEST:
@@ -334,28 +390,12 @@ async def _body(request: Request) -> dict[str, Any]:
     return values
 
 
-def _number(query: Mapping[str, str], name: str, default: float, kind: type = float) -> Any:
+def number_of(query: Mapping[str, str], name: str, default: float, kind: type = float) -> Any:
+    """Return a number of a query; raises AppError for anything else."""
     try:
         value = kind(query.get(name, default))
         if not abs(value) < LARGEST:
             raise OverflowError
         return value
     except (ValueError, OverflowError) as fault:
-        raise _RefusedError(400, f"{name}={query[name]}: a number is wanted") from fault
-
-
-def _view(query: Mapping[str, str]) -> View:
-    kind = query.get("kind", "colour")
-    if kind not in KINDS:
-        raise _RefusedError(400, f"kind={kind}: choose one of {', '.join(KINDS)}")
-    whole = View()
-    return replace(
-        whole,
-        kind=kind,
-        x=_number(query, "x", whole.x),
-        y=_number(query, "y", whole.y),
-        part=_number(query, "part", whole.part),
-        longest_px=_number(query, "px", whole.longest_px, int),
-        marked=query.get("marked", "1") != "0",
-        bright=query.get("bright", "0") != "0",
-    )
+        raise AppError(f"{name}={query[name]}: a number is wanted") from fault

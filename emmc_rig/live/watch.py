@@ -24,12 +24,16 @@ from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge, is_dark
+from emmc_rig.live.autofocus import focused
 from emmc_rig.live.driving import Driving
-from emmc_rig.live.focus import FocusMeter
+from emmc_rig.live.focus import FocusMeter, Sharpness, sharpness
 from emmc_rig.live.light_field import LiveLightField
+from emmc_rig.live.save import Files, Found
+from emmc_rig.live.steps import AWAY_UM, NO_FOCUS, WANTED_LEVELS, steps
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
 from emmc_rig.pages.frame_view import frame_figures, histogram, thinned
+from emmc_rig.rig.hardware import FOCUS
 from emmc_rig.rig.registration import registered
 
 IDLE_S = 10.0
@@ -40,28 +44,30 @@ FASTEST_S = 0.04
 POLL_S = 0.2
 PATIENCE_S = 10.0
 """For the threads to end. A move under way is stopped first."""
-LEVEL_PIXELS = 1 << 20
+LEVEL_PIXELS = 1 << 18
 """Of a frame, evenly spread, for its histogram; saturated ones are counted in all."""
 SHIFT_PX = 1024
 LEAST_LIKENESS = 0.3
 """Of a frame and the reference, below which their shift is not shown."""
 SEEK_S = 10.0
 """Between two searches for a mask that is not seen while nothing changes: each takes seconds."""
-AWAY_UM = 5.0
-"""From where an axis centres the mask or opens the aperture, it is not there."""
 AT_SHOT_UM = 2.0
 """From where a shot has the mask, it still stands there."""
-WANTED_LEVEL, LEVELS = 0.8, (0.7, 0.9)
+WANTED_LEVEL = 0.8
 EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A frame with its number, and when it came (monotonic clock)."""
+    """A frame with its number, and when it came (monotonic clock).
+
+    still: no axis moved since the frame before was asked for: one may be on its way meanwhile.
+    """
 
     number: int
     frame: RawFrame
     at_s: float
+    still: bool
 
 
 class Watch:
@@ -70,7 +76,8 @@ class Watch:
     stage: None where there is none. look: changes what a simulated bench shows, None otherwise;
     targets: what it takes. centre_um: where each axis centres the mask and opens the aperture.
     design: the camera whose mask is in, for what needs to know it. light_field: reconstructs what
-    the camera sees. Raises nothing of the devices: their errors become `state`'s "trouble".
+    the camera sees. files: that what is found may be written into. Raises nothing of the devices:
+    their errors become `state`'s "trouble".
     """
 
     def __init__(
@@ -82,11 +89,14 @@ class Watch:
         centre_um: Mapping[str, float] | None = None,
         design: Design | None = None,
         light_field: LiveLightField | None = None,
+        files: Files | None = None,
     ) -> None:
         self._camera, self._look, self.targets = camera, look, targets
         self._centre_um = dict(centre_um or {})
         self._design = design
         self.light_field = light_field
+        self._files = files or Files()
+        self._found = Found()
         self._news = threading.Condition()
         self._listeners: list[Callable[[], None]] = []
         self._shown: Shown | None = None
@@ -111,6 +121,8 @@ class Watch:
             "centre_um": self._centre_um,
             "light_field": None,
             "hint": None,
+            "steps": [],
+            "takes": self._files.takes,
         }
         self._asked_s = time.monotonic()
         self._ending = threading.Event()
@@ -237,6 +249,53 @@ class Watch:
 
         self._move("centring", home, lambda stage: stage.move_to_um(self._centre_um))
 
+    def autofocus(self, span_um: float) -> None:
+        """Bring the focus axis to where the picture is sharpest, within so far from here.
+
+        Raises AppError where there is no such axis.
+        """
+        if self._driving is None or FOCUS not in self._driving.stage.axes:
+            raise AppError(NO_FOCUS)
+        driving = self._driving
+
+        def focus(stage: Stage) -> None:
+            if not stage.is_homed(FOCUS):
+                stage.home([FOCUS])
+            found = focused(stage, FOCUS, span_um, self._sharpness, lambda: driving.stopped)
+            if found is not None:
+                self._found = replace(self._found, focus=found)
+
+        self._move("focusing", focus)
+
+    def _sharpness(self) -> Sharpness | None:
+        """Return the sharpness of two frames that are exposed from now on."""
+        newest = self.newest()
+        number = 0 if newest is None else newest.number
+        frames = []
+        # The next one may have been exposed while the axis moved.
+        for skipped in (1, 0):
+            shown = self._after(number + skipped)
+            if shown is None:
+                return None
+            frames.append(shown.frame)
+            number = shown.number
+        return sharpness(frames[1], frames[0])
+
+    def preview(self, what: list[str]) -> dict[str, str]:
+        """Return what saving some of exposure, centre, mask and focus would change, as a diff."""
+        exposure_s = self._state["settings"]["exposure_s"]
+        zero_um = None
+        place = self._found.mask
+        if place is not None and place.offset_um is not None:
+            axes = zip(("mask_x", "mask_y"), place.offset_um, strict=True)
+            zero_um = {a: self._centre_um[a] - um for a, um in axes if a in self._centre_um}
+        self._found = replace(self._found, exposure_s=exposure_s, zero_um=zero_um)
+        return {"diff": self._files.preview(self._found, what)}
+
+    def save(self) -> dict[str, list[str]]:
+        """Write what was previewed; raises AppError."""
+        return {"written": self._files.save()}
+
     def stop(self) -> None:
         """Stop all axes now, in the middle of a move too."""
         if self._driving is not None:
@@ -267,6 +326,7 @@ class Watch:
                 else:
                     self._state[name] = value
             self._state["hint"] = self._hint()
+            self._state["steps"] = self._steps()
             self._state["version"] += 1
             self._news.notify_all()
         for listener in self._listeners:
@@ -293,12 +353,27 @@ class Watch:
             return {"text": "The picture is dark: light the lamp, open the aperture.", "action": ""}
         if figures["saturated"] > 0.001:
             return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
-        if level < LEVELS[0] / 4:
+        if level < WANTED_LEVELS[0] / 4:
             return {
                 "text": f"The brightest reading is {100 * level:.1f} % of white.",
                 "action": "autoexpose",
             }
         return None
+
+    def _steps(self) -> list[dict[str, Any]]:
+        """Return the steps from an unpacked box to a plan: see `emmc_rig.live.steps`."""
+        figures, mask = self._state["figures"], self._state["mask"]
+        places = (
+            {}
+            if self._driving is None
+            else {axis: self._driving.position_um(axis) for axis in self._driving.stage.axes}
+        )
+        off_um = {
+            axis: None if at is None else at - self._centre_um[axis]
+            for axis, at in places.items()
+            if axis in self._centre_um
+        }
+        return steps(figures, mask, off_um, FOCUS in places, self._found, self._files.takes)
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera
@@ -313,7 +388,7 @@ class Watch:
         }
 
     def _take(self) -> None:
-        stream = None
+        stream, stood = None, False
         while not self._ending.is_set():
             started_s = time.monotonic()
             with self._news:
@@ -328,10 +403,13 @@ class Watch:
                     continue
                 if stream is None and hasattr(self._camera, "stream"):
                     stream = self._camera.stream()  # pyright: ignore[reportAttributeAccessIssue]
+                moved = self._moved()
                 frame = next(stream) if stream is not None else self._camera.snap()
+                stands = moved is not None and moved == self._moved()
                 with self._news:
                     number = self._shown.number + 1 if self._shown is not None else 1
-                    self._shown = Shown(number, frame, time.monotonic())
+                    self._shown = Shown(number, frame, time.monotonic(), stood and stands)
+                stood = stands
                 self._publish(frame=number, camera="")
                 self._ending.wait(max(0.0, FASTEST_S - (time.monotonic() - started_s)))
             except (DriverError, StopIteration, ValueError) as fault:
@@ -341,6 +419,12 @@ class Watch:
         if stream is not None:
             with suppress(DriverError):
                 stream.close()
+
+    def _moved(self) -> int | None:
+        """Return how many moves were begun; None while one is under way."""
+        if self._driving is None:
+            return 0
+        return None if self._driving.moves else self._driving.begun
 
     def _carry_out_wishes(self) -> None:
         done = False
@@ -408,7 +492,7 @@ class Watch:
         exposure_s = settings["exposure_s"]
         if frame.exposure_s and abs(frame.exposure_s / exposure_s - 1) > 0.05:
             return
-        low, high = LEVELS
+        low, high = WANTED_LEVELS
         self._exposing -= 1
         if low <= level <= high and not saturated:
             self._exposing = 0
@@ -425,9 +509,7 @@ class Watch:
 
     def _show_mask(self, newest: Shown) -> None:
         assert self._design is not None
-        if time.monotonic() < self._seek_at_s or (
-            self._driving is not None and self._driving.moves
-        ):
+        if time.monotonic() < self._seek_at_s or not newest.still:
             self._ending.wait(POLL_S)
             return
         if is_dark(newest.frame):
@@ -438,6 +520,7 @@ class Watch:
                 self._gauge = MaskGauge(self._design, newest.frame.mosaic.shape)
             place = self._gauge.measure(newest.frame, self._mask_stands_um())
             mask = {"place": asdict(place), "why": ""}
+            self._found = replace(self._found, mask=place)
         except (CalibrationError, CameraError) as fault:
             mask = {"place": None, "why": str(fault)}
             self._seek_at_s = time.monotonic() + SEEK_S
@@ -457,7 +540,7 @@ class Watch:
 
     def _show_light_field(self, newest: Shown) -> None:
         assert self.light_field is not None
-        if self._driving is not None and self._driving.moves:
+        if not newest.still:
             self._ending.wait(POLL_S)
             return
         try:

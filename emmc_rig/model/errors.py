@@ -1,5 +1,15 @@
 """Errors of the camera model: each message says what is wrong and what to do, in one line."""
 
+import difflib
+from collections.abc import Iterable
+
+
+def nearest_of(name: str, known: Iterable[str]) -> str:
+    """Return a hint for a name that is not known: the nearest one, if any is near, and all."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    return (f"did you mean '{near[0]}'? " if near else "") + f"known are {', '.join(known)}"
+
 
 class ModelError(Exception):
     """Root of the model's errors; shown to the user as one line."""

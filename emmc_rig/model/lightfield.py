@@ -26,6 +26,8 @@ _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Luminance and two chrominances (opponent colour, RGB), orthonormal."""
 
 
 def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:

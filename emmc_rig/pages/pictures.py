@@ -57,7 +57,7 @@ class Piece:
         return picture[self.y : self.y + self.side, self.x : self.x + self.side]
 
 
-def telling_lines(truth: Array) -> tuple[int, int]:
+def epipolar_lines(truth: Array) -> tuple[int, int]:
     """Return the row and the column (y, x) along which the outer views differ most.
 
     Epipolar images through them show slopes. They lie in the middle three fifths of the picture.
@@ -73,7 +73,7 @@ def telling_lines(truth: Array) -> tuple[int, int]:
     return found[0], found[1]
 
 
-def telling_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
+def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
     """Return the squares of a picture (y, x, c) with most edges and colour, away from each other.
 
     They lie inside the border, which has no neighbours in other views.

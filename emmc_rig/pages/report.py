@@ -378,7 +378,7 @@ def _verdict_head(content: ReportContent) -> Head | None:
         level,
         "; ".join(why) or "frames, Psi and light field agree",
         [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
-        {"trust": "good", "doubt": "watch"}.get(level, "bad"),
+        {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad"),
     )
 
 

@@ -23,7 +23,7 @@ from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
 from emmc_rig.pages.display import DisplayCurve, finite, round_up, three_colours
 from emmc_rig.pages.drawing import FAINT, INK, save_publication
-from emmc_rig.pages.pictures import Piece, telling_lines, telling_pieces
+from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 from emmc_rig.version import __version__
 
 Array = NDArray[np.floating]
@@ -99,7 +99,7 @@ def draw_results(
     view = _view(reference, settings.view)
     pieces = _pieces(reference[view], settings)
     curve = DisplayCurve.fitted_to(reference)
-    line, _ = telling_lines(reference)
+    line, _ = epipolar_lines(reference)
     names = _names(columns)
     measured = {} if truth is None else {
         name: {"psnr_db": psnr_db(one.light_field, truth), "ssim": ssim(one.light_field, truth)}
@@ -246,7 +246,7 @@ def _pieces(picture: Array, settings: FigureSettings) -> list[Piece]:
         (min(max(y - side // 2, 0), height - side), min(max(x - side // 2, 0), width - side))
         for y, x in settings.at
     ]
-    return [Piece(y, x, side) for y, x in corners] or telling_pieces(picture, side, 2)
+    return [Piece(y, x, side) for y, x in corners] or detailed_pieces(picture, side, 2)
 
 
 def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None) -> list[_Map]:

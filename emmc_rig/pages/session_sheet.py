@@ -14,11 +14,12 @@ from pathlib import Path
 import cv2
 
 from drivers.errors import DriverError
+from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.frame_view import preview, thinned, white_balance
+from emmc_rig.pages.frame_view import AS_READ, Balance, preview, thinned, white_balance
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -202,39 +203,40 @@ def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
     return [frames[i * len(frames) // max(most, 1)] for i in range(most)]
 
 
-def _balance(session: Session) -> tuple[float, float, float]:
+def _balance(session: Session) -> Balance:
     """Return the white balance of the first whiteboard under white light; none without one."""
     for planned in session.needed:
         entry = session.stored.get(planned.id)
         if entry and planned.kind in BOARDS and planned.bench.lamp == "white":
             with suppress(AppError, DriverError):
                 return white_balance(decode_frame(session.read(planned.id), entry))
-    return 1.0, 1.0, 1.0
+    return AS_READ
 
 
-def _picture(
-    session: Session, planned: PlannedFrame, balance: tuple[float, float, float]
-) -> dict[str, object]:
+def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[str, object]:
     """Return what the page shows of a frame: its picture, or why there is none."""
     entry = session.stored.get(planned.id)
     if entry is None:
         return {"id": planned.id, "why": "not captured"}
     try:
-        return {**entry, "why": "", "picture": _jpeg(session, planned, entry, balance)}
+        picture = stored_jpeg(session, planned.id, balance)
+        return {**entry, "why": "", "picture": data_address(picture, ".jpg")}
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
 
-def _jpeg(
-    session: Session, planned: PlannedFrame, entry: Entry, balance: tuple[float, float, float]
-) -> str:
-    frame = decode_frame(session.read(planned.id), entry)
+def stored_jpeg(session: Session, name: str, balance: Balance = AS_READ) -> bytes:
+    """Return a small picture of a stored frame; raises AppError or a `DriverError`."""
+    return small_jpeg(decode_frame(session.read(name), session.stored[name]), balance)
+
+
+def small_jpeg(frame: RawFrame, balance: Balance = AS_READ) -> bytes:
+    """Return a small picture of a frame, of whole colour tiles evenly spread over it."""
     picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)), balance)
     scale = LONGEST_PX / max(picture.shape[:2])
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    return data_address(data.tobytes(), ".jpg")
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def _timeline(session: Session) -> str:

@@ -15,7 +15,7 @@ LARGEST_PX = 256
 
 
 def save_thumbnail(path: Path, light_field: NDArray, lines: tuple[int, int]) -> None:
-    """Write the centre view over an epipolar image; lines: see `telling_lines`. Raises OSError."""
+    """Write the centre view over an epipolar image; lines: see `epipolar_lines`. Raises OSError."""
     done, data = cv2.imencode(".webp", composed(light_field, lines), [cv2.IMWRITE_WEBP_QUALITY, 90])
     assert done
     with whole_file(path) as partial:

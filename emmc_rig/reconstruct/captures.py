@@ -12,7 +12,7 @@ from numba import get_num_threads
 
 from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.folders import KEPT, is_session, result_folder
-from emmc_rig.files.frames import PSI
+from emmc_rig.files.psi import open_psi, psi_beside
 from emmc_rig.reconstruct.memory import (
     BASE_BYTES,
     Ceiling,
@@ -25,7 +25,6 @@ from emmc_rig.reconstruct.solve import reconstruct_folder
 from emmc_rig.session.session import RECONSTRUCTION
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Progress
-from reconstruction.tiles import SavedPsi
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def ceiling_for(memory: int, requests: Sequence[Request]) -> tuple[Ceiling, int,
                 f"{request.folder}: --memory needs Psi before the workers start; run `emmc-rig "
                 "calibrate` and give --psi"
             )
-        psi = SavedPsi(request.psi or request.folder / PSI)
+        psi = open_psi(request.psi or psi_beside(request.folder))
         settings = request.settings or MethodSettings()
         need = max(need, task_bytes(psi, assumed_grid(psi, settings)))
         own = max(own, own_bytes(psi, settings, request.as_zarr, request.truth is not None))

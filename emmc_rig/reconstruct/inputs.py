@@ -9,6 +9,7 @@ import numpy as np
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.frames import PSI, read_frames
+from emmc_rig.files.psi import open_psi, psi_beside
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix
@@ -36,8 +37,8 @@ def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[Imag
     folder = Path(folder)
     if is_session(folder):
         measured, frames = session_frames(folder)
-        return measured if psi is None else ImagingMatrix.load(Path(psi)), frames
-    return ImagingMatrix.load(Path(psi or folder / PSI)), read_frames(folder)
+        return measured if psi is None else open_psi(Path(psi)).load(), frames
+    return open_psi(Path(psi or psi_beside(folder))).load(), read_frames(folder)
 
 
 def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frames, Path]:
@@ -46,7 +47,7 @@ def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frame
         measured, frames = session_frames(folder)
         measured.save(out / PSI)
         return frames, psi_path or out / PSI
-    return read_frames(folder), psi_path or folder / PSI
+    return read_frames(folder), psi_path or psi_beside(folder)
 
 
 def load_settings(path: Path | None) -> MethodSettings:

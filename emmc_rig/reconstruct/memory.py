@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from emmc_rig.errors import AppError, WrongUsageError
+from emmc_rig.files.psi import SavedPsi
 from reconstruction.methods import MethodSettings
-from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid, SavedPsi
+from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 
 UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
 BASE_BYTES = 480 * 2**20

@@ -17,22 +17,23 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import is_session, kept_folder
+from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.reconstruct.block_tasks import Capture, fingerprint_of, run_capture
 from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
 from emmc_rig.reconstruct.pool import Pool, opened_pool
 from emmc_rig.reconstruct.result import Result, compared, figures
-from emmc_rig.reconstruct.tiles import Capture, fingerprint_of, run_capture
 from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
-from reconstruction.tiles import SavedPsi, check_frames, reconstruct_in_blocks
+from reconstruction.tiles import check_frames, reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
@@ -167,10 +168,10 @@ def reconstruct_folder(
     settings = settings or MethodSettings()
     frames, psi_path = stored_frames(folder, out, psi_path)
     session = Session(folder) if is_session(folder) else None
-    saved = SavedPsi(psi_path)
+    saved = open_psi(psi_path)
     one_block = is_one_block(saved.size, settings)
     if one_block and pool is None and not as_zarr:
-        psi = ImagingMatrix.load(psi_path)
+        psi = saved.load()
         result = reconstruct(
             psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
         )
@@ -197,7 +198,7 @@ def reconstruct_folder(
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
         whole = replace(solved, light_field=light_field, maps=arrays)
-        result = Result(whole, verdict, ImagingMatrix.load(psi_path), frames)
+        result = Result(whole, verdict, saved.load(), frames)
         return _written(result, {"chosen": chosen, **blocks.metrics()}, out, session, truth)
     if session is not None:
         verdict = verdict_with_exposure(verdict, session)

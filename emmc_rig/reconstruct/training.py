@@ -188,7 +188,8 @@ def train(
         DictionaryError: what the learner says of patches, settings and checkpoint.
     """
     out, kept = settings.out, checkpoint_path(settings.out)
-    _check_out(out)
+    check_new_file(out, "a dictionary's")
+    refuse_new_file(picture_path(out))
     if kept.exists() and not settings.resume:
         raise AppError(
             f"{kept}: an earlier training stopped there; give --resume to go on, or delete it"
@@ -293,17 +294,16 @@ def draw_atoms(dictionary: Dictionary) -> NDArray[np.uint8]:
     return np.rint(sheet * 255).astype(np.uint8)
 
 
-def _check_out(out: Path) -> None:
-    """Raise AppError when the dictionary could not be written there, before hours of training."""
+def check_new_file(out: Path, whose: str) -> None:
+    """Raise AppError when a file could not be written there, before hours of training."""
     if out.suffix.lower() not in (".h5", ".hdf5"):
-        raise AppError(f"--out {out}: a dictionary's file ends in .h5")
+        raise AppError(f"--out {out}: {whose} file ends in .h5")
     refuse_inside_session(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror})") from fault
-    for path in (out, picture_path(out)):
-        refuse_new_file(path)
+    refuse_new_file(out)
 
 
 def _dictionary(

@@ -78,6 +78,8 @@ STAGE_AXES = {
     "aperture_x": (2, 1),
     "aperture_y": (2, 2),
 }
+FOCUS, FOCUS_ADDRESS = "focus", (3, 1)
+"""The axis that moves the lens along the optical axis, where a stage has one."""
 MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
 SIMULATED = "simulated"
@@ -121,7 +123,8 @@ class Rig:
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
     about_to_expose: called with a frame's name before its exposure. trigger: the line by which
     the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
-    of that square window, to put its edges between views; None: not known.
+    of that square window, to put its edges between views; None: not known. stands_um: where axes
+    that no plan moves stand in a capture, as the focus.
     """
 
     stage: Stage
@@ -134,6 +137,7 @@ class Rig:
     about_to_expose: Callable[[str], None] = _unheard
     trigger: Trigger | None = None
     window_side_um: float | None = None
+    stands_um: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -176,6 +180,8 @@ def simulated_rig(
     rays_per_view: int = RAYS_PER_VIEW,
     trigger: SimulatedTrigger | None = None,
     flaws: Flaws = NO_FLAWS,
+    focus_um: float | None = None,
+    stands_um: Mapping[str, float] | None = None,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
@@ -183,8 +189,9 @@ def simulated_rig(
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
     pixel; few are quick, and grainy beside a good sensor's noise. trigger: the stage's arrival
-    begins the exposures of a USB3 Vision camera. flaws: what is wrong with it. Raises AppError for
-    a size that the camera's RAW files cannot hold.
+    begins the exposures of a USB3 Vision camera. flaws: what is wrong with it. focus_um: where a
+    fifth axis, `focus`, has the scene sharp; None: there is none. stands_um: see `Rig`. Raises
+    AppError for a size that the camera's RAW files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -195,19 +202,19 @@ def simulated_rig(
         )
     clock = clock or ManualClock()
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
-    travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um}
-    chain = ZaberChain(
-        clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in STAGE_AXES.values()}
-    )
+    travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um, 3: MASK_TRAVEL_UM}
+    axes = STAGE_AXES if focus_um is None else STAGE_AXES | {FOCUS: FOCUS_ADDRESS}
+    chain = ZaberChain(clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in axes.values()})
     zero_um = {
         name: (MASK_TRAVEL_UM / 2 if device == 1 else aperture_um)
         for name, (device, _) in STAGE_AXES.items()
     }
 
     def positions_um() -> dict[str, float]:
+        sharp_um = {} if focus_um is None else {FOCUS: focus_um}
         return {
-            name: chain.position_um(*address) - zero_um[name]
-            for name, address in STAGE_AXES.items()
+            name: chain.position_um(*address) - (zero_um | sharp_um)[name]
+            for name, address in axes.items()
         }
 
     window_um = 2 * aperture_um
@@ -229,7 +236,7 @@ def simulated_rig(
     )
     stage = ZaberStage(
         chain.transport(),
-        STAGE_AXES,
+        axes,
         microstep_um=AxisSpec().microstep_um,
         clock=clock,
         settings=StageSettings(tolerance_um=POSITION_TOLERANCE_UM),
@@ -269,6 +276,7 @@ def simulated_rig(
         announced,
         trigger,
         window_side_um(camera.views, camera.lens.aperture_cell_um),
+        stands_um or {},
         chain=chain,
         still=simulator,
     )

@@ -16,16 +16,45 @@ from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
-from emmc_rig.rig.hardware import NO_FLAWS, Rig, open_camera, open_stage, simulated_rig
+from emmc_rig.rig.hardware import NO_FLAWS, STAGE_AXES, Rig, open_camera, open_stage, simulated_rig
 from emmc_rig.rig.trigger import SimulatedTrigger, Trigger, check_trigger
 from simulators.bench import RAYS_PER_VIEW
 from simulators.effects import EFFECTS, TOGETHER, flawed
 
 SIMULATED = "simulated"
+LATER = ("trigger", "focus_um", "stands_um", "mask")
 Ask = Callable[[str], None]
 
 
-class RealRig(Settings):
+class Mounting(Settings):
+    """How `emmc-rig live` found the mask to sit: its rotation, and its scale over the design's."""
+
+    rotation_deg: float
+    rotation_deviation_deg: float = Field(ge=0)
+    scale: float = Field(gt=0)
+    scale_deviation: float = Field(ge=0)
+
+
+class AnyRig(Settings):
+    """What a rig's file may say of every rig.
+
+    stands_um: by axis, where those stand that no plan moves, as `focus`. mask: how it was found to
+    sit, which sessions keep.
+    """
+
+    stands_um: dict[str, float] = Field(default_factory=dict)
+    mask: Mounting | None = None
+
+    @field_validator("stands_um")
+    @classmethod
+    def _not_the_plans(cls, stands_um: dict[str, float]) -> dict[str, float]:
+        for axis in stands_um:
+            if axis in STAGE_AXES:
+                raise ValueError(f"{axis} is moved by plans: give its zero_um instead")
+        return stands_um
+
+
+class RealRig(AnyRig):
     """Real devices.
 
     stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
@@ -46,19 +75,20 @@ class RealRig(Settings):
     trigger: Trigger | None = None
 
 
-class WiredRig(Settings):
-    """A YAML file for the simulated rig with a line from the stage to its camera."""
+class WiredRig(AnyRig):
+    """A YAML file for the simulated rig: with a line from the stage to its camera, a focus axis."""
 
     kind: Literal["simulated"]
-    trigger: SimulatedTrigger
+    trigger: SimulatedTrigger | None = None
+    focus_um: float | None = Field(default=None, gt=0)
 
 
-class ImagedRig(Settings):
+class ImagedRig(AnyRig):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
     rays: per view and pixel; calibration to a per cent needs 1024 or more. trigger: the line from
     its stage to its camera, which it has not by default. flaws: what is wrong with it, by the names
-    of `simulators.effects`.
+    of `simulators.effects`. focus_um: where its focus axis, if it has one, has the scene sharp.
     """
 
     scene: str
@@ -68,6 +98,7 @@ class ImagedRig(Settings):
     rays: int = Field(default=RAYS_PER_VIEW, ge=16)
     trigger: SimulatedTrigger | None = None
     flaws: tuple[str, ...] = ()
+    focus_um: float | None = Field(default=None, gt=0)
 
     @field_validator("flaws")
     @classmethod
@@ -138,7 +169,8 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
         wired = validated(WiredRig, read, spec, AppError)
-        return _described(SIMULATED, imaged.model_copy(update={"trigger": wired.trigger}))
+        told = {name: getattr(wired, name) for name in LATER}
+        return _described(SIMULATED, imaged.model_copy(update=told))
     config = validated(RealRig, read, spec, AppError)
     described = _described("real", config)
     beside = Path(spec).parent / config.stage
@@ -148,10 +180,11 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
 
 
 def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
-    """Return a rig as plain data; one without a trigger reads as before there were any."""
+    """Return a rig as plain data; without what came later it reads as before there was any."""
     described = config.model_dump(mode="json")
-    if config.trigger is None:
-        del described["trigger"]
+    for name in LATER:
+        if name in described and not described[name]:
+            del described[name]
     return {"kind": kind, **described}
 
 
@@ -226,7 +259,10 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             imaged.rays,
             imaged.trigger,
             flawed(NO_FLAWS, imaged.flaws),
+            imaged.focus_um,
+            imaged.stands_um,
         )
+        _check_axes(imaged, rig)
         if imaged.trigger is not None:
             check_trigger(imaged.trigger, rig.stage, rig.camera)
         yield rig
@@ -235,7 +271,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
     with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:
         if real.trigger is not None:
             check_trigger(real.trigger, stage, device)
-        yield Rig(
+        rig = Rig(
             stage,
             device,
             AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
@@ -244,4 +280,15 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             reopen_camera=lambda: open_camera(real.camera),
             trigger=real.trigger,
             window_side_um=real.window_side_um,
+            stands_um=real.stands_um,
         )
+        _check_axes(real, rig)
+        yield rig
+
+
+def _check_axes(config: AnyRig, rig: Rig) -> None:
+    """Raise AppError for an axis that the stage has not."""
+    for axis in config.stands_um:
+        if axis not in rig.stage.axes:
+            known = ", ".join(rig.stage.axes) or "none"
+            raise AppError(f"stands_um.{axis}: the stage has no such axis, only {known}")

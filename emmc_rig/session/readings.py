@@ -17,6 +17,7 @@ from calibration.bracket import LinearFrame, fuse
 from calibration.frames import MeanFrame, SensorGain, average, before_and_after
 from calibration.levels import Check, check_of
 from calibration.routes import Outcome, calibrate
+from calibration.sensor import Pair
 from calibration.whiteboard import Calibration, Whiteboards, measure_psi
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
@@ -185,6 +186,43 @@ def _board_darks(session: Session) -> tuple[MeanFrame, ...]:
         earlier = found.get(exposure_s)
         found[exposure_s] = mean if earlier is None else before_and_after(earlier, mean)
     return tuple(found.values())
+
+
+def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
+    """Return pairs of darks, and of white references without masks, of every exposure that has two.
+
+    Raises AppError where that is fewer than two dark and four lit exposures.
+    """
+    darks, flats = (_by_exposure(session, frames) for frames in (_darks(session), _flats(session)))
+    if len(darks) < 2 or len(flats) < 4:
+        raise AppError(
+            f"{session.folder}: --sensor takes two darks at each of two exposures at least, and "
+            f"two references at each of four (it has {len(darks)} and {len(flats)}): "
+            "`emmc-rig calibrate --plan` writes a plan that has, unless response is left out"
+        )
+
+    def pairs(groups: Mapping[float, list[PlannedFrame]]) -> Iterator[Pair]:
+        for exposure_s, frames in groups.items():
+            first, second = (frame.mosaic for frame, _ in decoded(session, frames[:2]))
+            yield Pair(exposure_s, first, second)
+
+    return list(pairs(darks)), pairs(flats)
+
+
+def _flats(session: Session) -> list[PlannedFrame]:
+    """Return the white references of the first shot, and those seen again without masks."""
+    again = (f for f in session.frames if f.kind == "check" and not f.bench.masks_in)
+    return [*_references(session).get((0, "white"), ()), *again]
+
+
+def _by_exposure(
+    session: Session, frames: Iterable[PlannedFrame]
+) -> dict[float, list[PlannedFrame]]:
+    """Return the frames of every exposure that has two at least, shortest first."""
+    groups: dict[float, list[PlannedFrame]] = defaultdict(list)
+    for frame in frames:
+        groups[_exposure_s(session, frame)].append(frame)
+    return {exposure_s: some for exposure_s, some in sorted(groups.items()) if len(some) > 1}
 
 
 def mean_dark(session: Session) -> MeanFrame:

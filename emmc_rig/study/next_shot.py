@@ -21,10 +21,10 @@ from calibration.shadow import shadow_mask
 from emmc_rig.calibrate.bench import WhiteboardBench
 from emmc_rig.calibrate.board_plan import capture_plan, parametric_plan, plan_light
 from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.capture.assessment import METHOD, Assessment, assessed
 from emmc_rig.capture.command import Wish, run_capture
-from emmc_rig.capture.enough import METHOD, Judgement, judged
 from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
@@ -125,7 +125,7 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
     described = rig_description(SIMULATED, rig)
     wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
     with held(folder):
-        taken = run_capture(wish, Unwatched(), _nobody)
+        taken = run_capture(wish, CaptureWatcher(), _nobody)
     assert taken is not None
     session, outcome = taken
     if not outcome.complete:
@@ -153,13 +153,13 @@ def rows_of(
     on_row: Callable[[str], None],
 ) -> SceneRows:
     """Return what a session's shots give, chosen and in order, up to `most` of them."""
-    known: dict[tuple[int, ...], tuple[ShotRow, Judgement]] = {}
+    known: dict[tuple[int, ...], tuple[ShotRow, Assessment]] = {}
 
-    def row(shots: tuple[int, ...]) -> tuple[ShotRow, Judgement]:
+    def row(shots: tuple[int, ...]) -> tuple[ShotRow, Assessment]:
         if shots not in known:
             result, sigma = after(session, scale, shots)
             target_db = math.inf if len(shots) < most else 0.0
-            found = judged(scale.psi, result, shots, sigma, target_db)
+            found = assessed(scale.psi, result, shots, sigma, target_db)
             gain = None if found.next is None else found.expected_db[found.next] - found.stated_db
             achieved_db = psnr_db(result.light_field, truth)
             known[shots] = ShotRow(shots, found.stated_db, achieved_db, gain), found

@@ -15,7 +15,7 @@ import platform
 import re
 from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -23,7 +23,9 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.settings import Settings
-from emmc_rig.progress import Watcher
+from emmc_rig.pages.page import number
+from emmc_rig.progress import Silent, Watcher
+from emmc_rig.reconstruct.pool import Pool
 from emmc_rig.version import __version__
 
 P = TypeVar("P", bound=Hashable)
@@ -190,7 +192,11 @@ class Sweep(Generic[P]):
 
     def words(self, point: P, result: dict) -> str:
         """Return a measured point in words."""
-        return self.label(point)
+        if "failed" in result:
+            return f"{self.label(point)}: {result['failed']}"
+        if "psnr_db" not in result:
+            return self.label(point)
+        return f"{number(result['psnr_db'], '.2f')} dB, {self.label(point)}"
 
     def label(self, point: P) -> str:
         """Return a point in words."""
@@ -215,11 +221,12 @@ class Sweep(Generic[P]):
             if "failed" in result
         ]
 
-    def run(self, points: Iterable[P], watcher: Watcher) -> dict[P, dict]:
+    def run(self, points: Iterable[P], watcher: Watcher, pool: Pool | None = None) -> dict[P, dict]:
         """Measure the points that the folder does not hold; return the results in their order.
 
-        Raises SweepStopped at Ctrl-C, AppError when the folder cannot be written, and what the
-        study does for wrong input; what is measured is kept in each case.
+        pool: workers that share the groups of points, where figures do not depend on how busy the
+        machine is. Raises SweepStopped at Ctrl-C, AppError when the folder cannot be written, and
+        what the study does for wrong input; what is measured is kept in each case.
         """
         points = list(dict.fromkeys(points))
         self.results, self.left_out = {}, {}
@@ -237,7 +244,10 @@ class Sweep(Generic[P]):
             groups: dict[Hashable, list[P]] = {}
             for point in missing:
                 groups.setdefault(self.group(point), []).append(point)
-            for group in groups.values():
+            left = list(groups.values())
+            if pool is not None:
+                left = self._measure_shared(left, journal, watcher, pool)
+            for group in left:
                 self._measure(group, journal, watcher)
         self.results = {point: self.results[point] for point in points if point in self.results}
         return self.results
@@ -265,16 +275,53 @@ class Sweep(Generic[P]):
         with closing(self.measured(missing, watcher)) as results:
             try:
                 for point, result in zip(missing, results, strict=True):
-                    result = plain(result)
-                    if result.get("keep", True):
-                        journal.add(self.digest(point), self.all_inputs(point), result)
-                    self.results[point] = result
-                    watcher.step(self.words(point, result))
+                    self._keep(point, plain(result), journal, watcher)
             except NotApplicableError as why:
-                for point in missing:
-                    if point not in self.results:
-                        self.left_out[point] = str(why)
-                        watcher.step(f"left out: {self.label(point)}")
+                self._leave_out(missing, str(why), watcher)
+
+    def _measure_shared(
+        self, groups: Iterable[Sequence[P]], journal: Journal, watcher: Watcher, pool: Pool
+    ) -> list[list[P]]:
+        """Measure groups by workers; return points that have the inputs of others, by group."""
+        # A copy, since this one changes while it is sent.
+        blank = replace(self)
+        blank._digests = dict(self._digests)
+        first: dict[str, P] = {}
+        tasks, same = [], []
+        for group in groups:
+            own = [point for point in group if first.setdefault(self.digest(point), point) == point]
+            tasks += [(blank, own)] if own else []
+            same.append([point for point in group if point not in own])
+        for (_, group), (results, why) in pool.run(_measured_group, tasks):
+            for point, result in zip(group, results, strict=False):
+                self._keep(point, result, journal, watcher)
+            if why is not None:
+                self._leave_out(group, why, watcher)
+        return [group for group in same if group]
+
+    def _keep(self, point: P, result: dict, journal: Journal, watcher: Watcher) -> None:
+        if result.get("keep", True):
+            journal.add(self.digest(point), self.all_inputs(point), result)
+        self.results[point] = result
+        watcher.step(self.words(point, result))
+
+    def _leave_out(self, group: Sequence[P], why: str, watcher: Watcher) -> None:
+        for point in group:
+            if point not in self.results:
+                self.left_out[point] = why
+                watcher.step(f"left out: {self.label(point)}")
+
+
+def _measured_group(task: tuple[Sweep, Sequence]) -> tuple[list[dict], str | None]:
+    """Measure a group in a worker; return its results, and why the rest of it cannot be."""
+    sweep, group = task
+    results: list[dict] = []
+    try:
+        with closing(sweep.measured(group, Silent())) as found:
+            results.extend(map(plain, found))
+    except NotApplicableError as why:
+        return results, str(why)
+    return results, None
 
 
 def plain(result: Mapping[str, object]) -> dict:

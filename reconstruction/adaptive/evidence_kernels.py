@@ -1,9 +1,10 @@
 """Kernels of the patches' evidence: covariances of readings, their factors, log-likelihoods.
 
 LANES patches are worked on side by side: arrays end with (..., lane), and the innermost loops run
-along it. Sums are taken four terms at a time, which halves what is read and written, and of rows
-and columns in blocks; what is worked on together lies a constant apart in one flat array, else
-checks for overlap keep the compiler from vectors.
+along it. Sums are taken four terms at a time, and of rows and columns in tiles: a value read serves
+several, and tiles lie one after the other, so that no power of two lies between their rows. What is
+worked on together lies a constant apart in flat arrays, else checks for overlap keep the compiler
+from vectors.
 """
 
 from __future__ import annotations
@@ -63,21 +64,21 @@ def _gather(
 
 
 @njit(cache=True, fastmath=True)
-def _meet(here, there, lanes, meetings):
+def _meet(here, there, meetings):
     """Add to meetings (wave, lane) the spectrum of how two pixels' rays are correlated.
 
     here, there: their own spectra (wave, lane), cosine and sine by turns. All flat.
     """
     for k in range(0, meetings.size, 2 * LANES):
         a, b, total = here[k : k + 2 * LANES], there[k : k + 2 * LANES], meetings[k : k + 2 * LANES]
-        for lane in range(lanes):
+        for lane in range(LANES):
             even, odd = a[lane], a[LANES + lane]
             total[lane] += even * b[lane] + odd * b[LANES + lane]
             total[LANES + lane] += odd * b[lane] - even * b[LANES + lane]
 
 
 @njit(cache=True, fastmath=True)
-def _mixed(table, terms, lanes, out):
+def _mixed(table, terms, out):
     """Set out (row, lane) to table (row, term) times terms (term, lane), the latter two flat.
 
     TERMS rows and terms at a time: a value read serves as many sums.
@@ -93,7 +94,7 @@ def _mixed(table, terms, lanes, out):
             e, f, g, i = second[k], second[k + 1], second[k + 2], second[k + 3]
             t, u, v, w = third[k], third[k + 1], third[k + 2], third[k + 3]
             x, y, z, o = fourth[k], fourth[k + 1], fourth[k + 2], fourth[k + 3]
-            for lane in range(lanes):
+            for lane in range(LANES):
                 a, b = part[lane], part[LANES + lane]
                 c, d = part[2 * LANES + lane], part[3 * LANES + lane]
                 total[lane] += p * a + q * b + r * c + s * d
@@ -103,107 +104,133 @@ def _mixed(table, terms, lanes, out):
 
 
 @njit(cache=True, fastmath=True)
-def _less_products(columns, i, j, m, lanes, matrix):
-    """Take the products of TERMS columns off rows i, i + 1 of matrix, at columns j, j + 1.
-
-    columns: (m + 2, TERMS, lane), matrix: (m + 2, m, lane), both flat.
-    """
-    width = TERMS * LANES
-    left, right = columns[i * width : (i + 2) * width], columns[j * width : (j + 2) * width]
-    at = (i * m + j) * LANES
-    upper = matrix[at : at + 2 * LANES]
-    lower = matrix[at + m * LANES : at + (m + 2) * LANES]
-    for lane in range(lanes):
-        a, b = left[lane], left[LANES + lane]
-        c, d = left[2 * LANES + lane], left[3 * LANES + lane]
-        p, q = left[4 * LANES + lane], left[5 * LANES + lane]
-        r, s = left[6 * LANES + lane], left[7 * LANES + lane]
-        e, f = right[lane], right[LANES + lane]
-        g, h = right[2 * LANES + lane], right[3 * LANES + lane]
-        t, u = right[4 * LANES + lane], right[5 * LANES + lane]
-        v, w = right[6 * LANES + lane], right[7 * LANES + lane]
-        upper[lane] -= a * e + b * f + c * g + d * h
-        upper[LANES + lane] -= a * t + b * u + c * v + d * w
-        lower[lane] -= p * e + q * f + r * g + s * h
-        lower[LANES + lane] -= p * t + q * u + r * v + s * w
+def _less_products(left, right, tile):
+    """Take the product of a tile and another's transpose off a third, all (row, column, lane)."""
+    for lane in range(LANES):
+        for i in range(TERMS):
+            at = i * TERMS * LANES + lane
+            a, b, c, d = left[at], left[at + LANES], left[at + 2 * LANES], left[at + 3 * LANES]
+            for j in range(TERMS):
+                by = j * TERMS * LANES + lane
+                tile[at + j * LANES] -= (
+                    a * right[by]
+                    + b * right[by + LANES]
+                    + c * right[by + 2 * LANES]
+                    + d * right[by + 3 * LANES]
+                )
 
 
 @njit(cache=True, fastmath=True)
-def _log_likelihood(matrix, measured, freedom, columns, product, square, out):
-    """Set out (lane,) to the log-likelihoods of matrix (m + 2, m, lane), destroyed.
+def _solved(diagonal, inverses, tile):
+    """Divide a tile by the transpose of a diagonal one's factor; inverses: of its pivots."""
+    for i in range(TERMS):
+        for j in range(TERMS):
+            at = (i * TERMS + j) * LANES
+            for k in range(j):
+                to, by = (i * TERMS + k) * LANES, (j * TERMS + k) * LANES
+                for lane in range(LANES):
+                    tile[at + lane] -= tile[to + lane] * diagonal[by + lane]
+            for lane in range(LANES):
+                tile[at + lane] *= inverses[j * LANES + lane]
 
-    Lower triangles of scale matrices, the data as row m, of multivariate t distributions with
-    `freedom` degrees and measured (lane,) readings; constants are left out. m is a multiple of
-    TERMS. columns: (m + 2, TERMS, lane), product, square: (lane,), to work in.
+
+@njit(cache=True, fastmath=True)
+def _factored(tile, inverses, product):
+    """Put the Cholesky factor of a diagonal tile in its place; set product to that of its pivots.
+
+    inverses: of the factor's diagonal, set.
     """
-    m, lanes = matrix.shape[1:]
-    flat_columns, flat = columns.reshape(-1), matrix.reshape(-1)
-    for lane in range(lanes):
-        out[lane] = 0
-        square[lane] = 0
-    for first in range(0, m, TERMS):
-        for lane in range(lanes):
-            product[lane] = 1
-        for k in range(first, first + TERMS):
-            here = k - first
-            for i in range(k, m + 1):
-                row, line = matrix[i, k], columns[i, here]
-                for lane in range(lanes):
-                    line[lane] = row[lane]
-                for before in range(here):
-                    a, b = columns[i, before], columns[k, before]
-                    for lane in range(lanes):
-                        line[lane] -= a[lane] * b[lane]
-            pivot = columns[k, here]
-            for lane in range(lanes):
-                pivot[lane] = max(pivot[lane], np.float32(1e-12))
-                product[lane] *= pivot[lane]
-                pivot[lane] = np.float32(1.0) / np.sqrt(pivot[lane])
-            for i in range(k + 1, m + 1):
-                line = columns[i, here]
-                for lane in range(lanes):
-                    line[lane] *= pivot[lane]
-            for lane in range(lanes):
-                square[lane] += columns[m, here, lane] ** 2
-        for lane in range(lanes):
+    product[:] = 1
+    for j in range(TERMS):
+        for i in range(j, TERMS):
+            at = (i * TERMS + j) * LANES
+            for k in range(j):
+                to, by = (i * TERMS + k) * LANES, (j * TERMS + k) * LANES
+                for lane in range(LANES):
+                    tile[at + lane] -= tile[to + lane] * tile[by + lane]
+            for lane in range(LANES):
+                if i == j:
+                    pivot = max(tile[at + lane], np.float32(1e-12))
+                    product[lane] *= pivot
+                    inverses[j * LANES + lane] = np.float32(1.0) / np.sqrt(pivot)
+                else:
+                    tile[at + lane] *= inverses[j * LANES + lane]
+
+
+@njit(cache=True, fastmath=True)
+def _log_likelihood(tiles, data, measured, freedom, inverses, product, square, out):
+    """Set out (lane,) to the log-likelihoods of data (reading, lane), all flat.
+
+    tiles: (tile, row, column, lane), the lower triangle of scale matrices of multivariate t
+    distributions, with `freedom` degrees and measured (lane,) readings, in tiles of TERMS x TERMS,
+    row by row; constants are left out. Tiles and data are destroyed. inverses: as data, product,
+    square: (lane,), to work in.
+    """
+    size, strip = TERMS * TERMS * LANES, TERMS * LANES
+    out[:] = 0
+    for i in range(inverses.size // strip):
+        first = i * (i + 1) // 2
+        for j in range(i + 1):
+            other = j * (j + 1) // 2
+            tile = tiles[(first + j) * size : (first + j + 1) * size]
+            for k in range(j):
+                left = tiles[(first + k) * size : (first + k + 1) * size]
+                right = tiles[(other + k) * size : (other + k + 1) * size]
+                _less_products(left, right, tile)
+            if j < i:
+                diagonal = tiles[(other + j) * size : (other + j + 1) * size]
+                _solved(diagonal, inverses[j * strip : (j + 1) * strip], tile)
+            else:
+                _factored(tile, inverses[i * strip : (i + 1) * strip], product)
+        for lane in range(LANES):
             out[lane] -= 0.5 * log(product[lane])
-        # Row m + 1 is not used: rows are taken in pairs.
-        for i in range(first + TERMS, m + 1, 2):
-            for j in range(first + TERMS, min(i + 1, m), 2):
-                _less_products(flat_columns, i, j, m, lanes, flat)
-    for lane in range(lanes):
+    square[:] = 0
+    for i in range(inverses.size // LANES):
+        block, row = i // TERMS, i % TERMS
+        own = data[i * LANES : (i + 1) * LANES]
+        for k in range(i):
+            at = block * (block + 1) // 2 + k // TERMS
+            at = ((at * TERMS + row) * TERMS + k % TERMS) * LANES
+            for lane in range(LANES):
+                own[lane] -= tiles[at + lane] * data[k * LANES + lane]
+        for lane in range(LANES):
+            own[lane] *= inverses[i * LANES + lane]
+            square[lane] += own[lane] ** 2
+    for lane in range(LANES):
         out[lane] -= 0.5 * (freedom + measured[lane]) * log(1 + square[lane] / freedom)
 
 
 @njit(cache=True, fastmath=True)
-def _fill(sums, known, seen, strength, chroma, matrix):
-    """Set matrix (m + 2, m, lane) to the readings' covariance and, as last row, their values.
+def _fill(sums, known, seen, strength, chroma, tiles, data):
+    """Set tiles, see `_log_likelihood`, to the readings' covariance, and data to their values.
 
     sums: (part, pair, lane). strength, chroma: (lane,). seen: (reading, lane), or no reading where
     three colours are stored.
     """
-    m, lanes = matrix.shape[1:]
     third = np.float32(1.0 / 3.0)
     first = 0
-    for i in range(m):
+    for i in range(known.shape[1]):
+        block = i // TERMS
         for j in range(i + 1):
-            row = matrix[i, j]
+            at = block * (block + 1) // 2 + j // TERMS
+            at = ((at * TERMS + i % TERMS) * TERMS + j % TERMS) * LANES
+            row = tiles[at : at + LANES]
             grey = sums[0, first]
             if sums.shape[0] == 1:
                 a, b = seen[i], seen[j]
-                for lane in range(lanes):
+                for lane in range(LANES):
                     same = np.float32(1.0) if a[lane] == b[lane] else np.float32(0.0)
                     row[lane] = (
                         strength[lane] * grey[lane] * (third + chroma[lane] * (same - third))
                     )
             else:
                 tint = sums[1, first]
-                for lane in range(lanes):
+                for lane in range(LANES):
                     row[lane] = strength[lane] * (grey[lane] + chroma[lane] * tint[lane])
             first += 1
-        for lane in range(lanes):
-            matrix[i, i, lane] += known[1, i, lane]
-            matrix[m, i, lane] = known[0, i, lane]
+        for lane in range(LANES):
+            row[lane] += known[1, i, lane]
+            data[i * LANES + lane] = known[0, i, lane]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -227,7 +254,7 @@ def evidence(
     out,
     chosen,
 ):
-    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane, length).
+    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane,).
 
     A hypothesis is a length of the texture, and a disparity: all disparities of the first, ...
     data, ridge: (shot, pixel_y, pixel_x), readings less those of the mean, their variances.
@@ -236,7 +263,8 @@ def evidence(
     apart. tables: (offset, hypothesis, wave), the texture's correlation, padded with zeros to a
     multiple of TERMS hypotheses. amplitudes, chromas: (kind,), variance of luminance,
     times scales (lane,), and of a chrominance over that of luminance. probes: indices of
-    the disparities at which every kind is compared; out is that of the best of them, `chosen`.
+    the disparities at which every kind is compared, at the first length; out is that of the best of
+    them, `chosen`.
     """
     stored = weights.shape[4]
     readings = places.shape[0]
@@ -267,7 +295,7 @@ def evidence(
     spectra = np.empty((parts, readings, spectrum * lanes), np.float32)
     for part in range(parts):
         for i in range(readings):
-            _mixed(waves, rays[part, i].reshape(-1), lanes, spectra[part, i])
+            _mixed(waves, rays[part, i].reshape(-1), spectra[part, i])
     sums = np.zeros((hypotheses, groups, m * (m + 1) // 2, lanes), np.float32)
     meetings = np.empty(spectrum * lanes, np.float32)
     row = np.empty((rows, lanes), np.float32)
@@ -278,39 +306,36 @@ def evidence(
             for part in range(parts):
                 if part < 2:
                     meetings[:] = 0
-                _meet(spectra[part, i], spectra[part, j], lanes, meetings)
+                _meet(spectra[part, i], spectra[part, j], meetings)
                 if part != 1:
-                    _mixed(tables[offsets[i, j]], meetings, lanes, flat_row)
+                    _mixed(tables[offsets[i, j]], meetings, flat_row)
                     for h in range(hypotheses):
                         sums[h, min(part, 1), first] = row[h]
             first += 1
-    matrix = np.zeros((m + 2, m, lanes), np.float32)
-    columns = np.zeros((m + 2, TERMS, lanes), np.float32)
+    blocks = m // TERMS
+    tiles = np.zeros(blocks * (blocks + 1) // 2 * TERMS * TERMS * LANES, np.float32)
+    values, inverses = np.empty(m * LANES, np.float32), np.empty(m * LANES, np.float32)
     product, square = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
     likelihood = np.empty(lanes, np.float32)
     best = np.empty(lanes, np.float32)
     strength, chroma = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    lengths = chosen.shape[1]
-    each = hypotheses // lengths
-    for length in range(lengths):
-        best[:] = -np.inf
-        for e in range(amplitudes.size):
-            for lane in range(lanes):
-                strength[lane] = amplitudes[e] * scales[lane]
-                chroma[lane] = chromas[e]
-            for h in probes:
-                _fill(sums[length * each + h], known, seen, strength, chroma, matrix)
-                _log_likelihood(matrix, measured, freedom, columns, product, square, likelihood)
-                for lane in range(lanes):
-                    if likelihood[lane] > best[lane]:
-                        best[lane] = likelihood[lane]
-                        chosen[lane, length] = e
+    best[:] = -np.inf
+    for e in range(amplitudes.size):
         for lane in range(lanes):
-            kind = chosen[lane, length]
-            strength[lane] = amplitudes[kind] * scales[lane]
-            chroma[lane] = chromas[kind]
-        for h in range(length * each, (length + 1) * each):
-            _fill(sums[h], known, seen, strength, chroma, matrix)
-            _log_likelihood(matrix, measured, freedom, columns, product, square, likelihood)
+            strength[lane] = amplitudes[e] * scales[lane]
+            chroma[lane] = chromas[e]
+        for h in probes:
+            _fill(sums[h], known, seen, strength, chroma, tiles, values)
+            _log_likelihood(tiles, values, measured, freedom, inverses, product, square, likelihood)
             for lane in range(lanes):
-                out[lane, h] = likelihood[lane]
+                if likelihood[lane] > best[lane]:
+                    best[lane] = likelihood[lane]
+                    chosen[lane] = e
+    for lane in range(lanes):
+        strength[lane] = amplitudes[chosen[lane]] * scales[lane]
+        chroma[lane] = chromas[chosen[lane]]
+    for h in range(hypotheses):
+        _fill(sums[h], known, seen, strength, chroma, tiles, values)
+        _log_likelihood(tiles, values, measured, freedom, inverses, product, square, likelihood)
+        for lane in range(lanes):
+            out[lane, h] = likelihood[lane]

@@ -23,7 +23,7 @@ Array = NDArray[np.floating]
 class Fits:
     """The models, total variation last if it is one of them. light_fields: (v, u, y, x, c) of each;
     residuals: frames less what each predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces
-    and texture, at the survey's brightness."""
+    and texture, at the survey's scale."""
 
     light_fields: list[Array]
     residuals: list[Array]
@@ -73,9 +73,11 @@ def fitted_models(
             on_step=lambda step, done=done: on_step(done + step),
             again=again if fit < len(settings.misfits) - 1 else None,
         )
-        seen = scale * scene.surfaces.light_field(scene.texture)
-        light_fields.append(np.broadcast_to(np.clip(seen, 0, 1), given.psi.light_field_shape))
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
+        scene.surfaces.release()
+        seen = scene.surfaces.light_field(scale * scene.texture)
+        np.clip(seen, 0, 1, out=seen)
+        light_fields.append(np.broadcast_to(seen, given.psi.light_field_shape))
     assert scene is not None
     if settings.free:
         light_fields.append(survey.plain)

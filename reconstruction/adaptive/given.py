@@ -1,4 +1,4 @@
-"""What the adaptive method works on: Psi and frames, checked, at the brightness of its settings."""
+"""What the adaptive method works on: Psi and frames, checked, at the scale of its settings."""
 
 from __future__ import annotations
 

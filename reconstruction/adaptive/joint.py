@@ -39,12 +39,12 @@ class TextureSettings(Settings):
     chroma: float = Field(default=1.4, gt=0, description="that of chrominance over luminance")
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
-    fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
+    fit_steps: int = Field(default=4, ge=1, description="of conjugate gradients in each step")
     sweeps: tuple[int, ...] = Field(
-        default=(5, 10), description="steps that search the disparity again first"
+        default=(8,), description="steps that search the disparity again first"
     )
     refine_steps: int = Field(
-        default=8, ge=0, description="last steps that sharpen the disparity first"
+        default=8, ge=0, description="last steps, of which every second sharpens the disparity"
     )
     slope_px: float = Field(default=0.3, gt=0, description="see `refine`")
     room_px: float = Field(
@@ -124,7 +124,8 @@ def solve(
             )
             padded = searched
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-        if step >= max(2, settings.steps - settings.refine_steps):
+        left = settings.steps - 1 - step
+        if step >= 2 and left < settings.refine_steps and left % 2 == 0:
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
             residual = frames - surfaces.forward(now)
             padded = refined(

@@ -44,11 +44,11 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e
     evidence: (row, column, L) log-likelihoods. pairs: (L, L), see `compatibility`. floor: the
     probability that a patch's evidence is worth nothing (its texture is none on a plane).
     """
-    own = evidence - evidence.max(axis=-1, keepdims=True)
-    own = _normalised(np.exp(own.astype(np.float64)))
-    own = (1 - floor) * own + floor / own.shape[-1]
+    own = np.exp((evidence - evidence.max(axis=-1, keepdims=True)).astype(np.float32))
+    own = np.float32(1 - floor) * _normalised(own) + np.float32(floor / own.shape[-1])
+    pairs = pairs.astype(np.float32)
     rows, columns, labels = own.shape
-    messages = np.ones((4, rows, columns, labels))
+    messages = np.ones((4, rows, columns, labels), dtype=np.float32)
     for _ in range(rounds):
         for into, axis, reverse in ((0, 1, False), (1, 1, True), (2, 0, False), (3, 0, True)):
             length = own.shape[axis]
@@ -62,5 +62,6 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e
                 for other in range(4):
                     if other != back:
                         belief *= messages[other][here]
-                messages[into][there] = _normalised(_normalised(belief) @ pairs)
-    return _normalised(own * messages.prod(axis=0)).astype(np.float32)
+                # Of mean 1: the product of four must not be too small for float32.
+                messages[into][there] = labels * _normalised(_normalised(belief) @ pairs)
+    return _normalised(own * messages.prod(axis=0))

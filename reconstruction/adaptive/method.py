@@ -102,7 +102,7 @@ def reconstruct_adaptive(
     warnings = _warnings(survey, mean, misfit, settings)
     report(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
-    decided, explained = _decided(survey.volume), _explained(survey, fits)
+    decided, explained = _decided(survey.volume), _explained(survey, fits, settings)
     return Reconstruction(
         method="adaptive",
         light_field=light_field,
@@ -156,7 +156,7 @@ def _free(mean: Mean) -> NDArray[np.bool_]:
     return mean.shares[-1] > MOSTLY
 
 
-def _explained(survey: Survey, fits: Fits) -> float | None:
+def _explained(survey: Survey, fits: Fits, settings: AdaptiveSettings) -> float | None:
     """Return the share of the smooth picture's residual that the last fit explains, in variance.
 
     Of the held-out readings, without their noise. None where the smooth picture explains them as
@@ -165,7 +165,7 @@ def _explained(survey: Survey, fits: Fits) -> float | None:
     held = survey.held
     if not held.any():
         return None
-    residual = survey.bright.frames - fits.scene.surfaces.forward(fits.scene.texture)
+    residual = fits.residuals[len(settings.misfits) - 1] / np.float32(survey.scale)
     allowed = float(np.mean(survey.bright.noise[held]))
     before = float(np.mean(np.square(survey.unexplained[held]))) - allowed
     if before <= 3 * allowed:

@@ -65,9 +65,11 @@ def _around(values: Array) -> NDArray[np.float64]:
 def mean_light_field(light_fields: Sequence[Array], shares: Array, binning: int) -> Array:
     """Return the mean of light fields (v, u, y, x, c), shares: see `shares_of`."""
     samples = _samples(shares, binning)[..., None]
-    total = light_fields[0] * samples[0]
-    for share, one in zip(samples[1:], light_fields[1:], strict=True):
-        total += share * one
+    total = np.empty_like(light_fields[0])
+    for v, u in np.ndindex(total.shape[:2]):
+        total[v, u] = sum(
+            share * one[v, u] for share, one in zip(samples, light_fields, strict=True)
+        )
     return total
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.search import DECISIVE, Volume
-from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
 UNLIKELY = 20.0
@@ -73,12 +73,12 @@ def one_plane(volume: Volume, pixels: tuple[int, int]) -> Plane | None:
 
     def losses(plane: Array) -> Array:
         wanted = plane[0] + plane[1] * rows + plane[2] * columns
-        last = unlikely.shape[1] - 1
-        at = np.clip((wanted - labels[0]) / step + 1, 0, last)
-        below = np.minimum(at.astype(np.int64), last - 1)
-        share = at - below
-        each = np.arange(len(rows))
-        return (1 - share) * unlikely[each, below] + share * unlikely[each, below + 1]
+        at = np.clip((wanted - labels[0]) / step + 1, 0, unlikely.shape[1] - 1)
+        # A parabola through the three labels nearest: a straight line is least at a label.
+        middle = np.clip(np.rint(at).astype(np.int64), 1, unlikely.shape[1] - 2)
+        each, off = np.arange(len(rows)), at - middle
+        below, here, above = (unlikely[each, middle + way] for way in (-1, 0, 1))
+        return here + off / 2 * (above - below) + off**2 / 2 * (above - 2 * here + below)
 
     chosen = labels[lost.argmin(axis=-1)]
     begin = _fitted(chosen, rows, columns)

@@ -164,6 +164,10 @@ class Surfaces:
     def _layout(self) -> Layout | None:
         return laid_out(self.psi, self.disparity, self.margin, self.texture_shape)
 
+    def release(self) -> None:
+        """Give back the memory of the rays' layout; a later product lays them out again."""
+        self.__dict__.pop("_layout", None)
+
     def _rays(self, first: int, last: int) -> tuple[Any, ...]:
         psi = self.psi
         seen = psi.weights, psi.colour_map, self.disparity

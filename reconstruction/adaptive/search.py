@@ -33,8 +33,6 @@ POSSIBLE = 0.02
 """Probability above which a disparity is looked at again."""
 TILE = 16
 """Patches a side."""
-OWN_SHARE = 0.5
-"""Of a patch's evidence: patches overlap, and would count the same readings again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,9 +206,9 @@ def fine(
             deciding[here] = _deciding(values)
     used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
     evidence, labels = evidence[..., used], labels[used]
-    chances = posteriors(
-        evidence * OWN_SHARE, compatibility(labels, slope_px * patches.stride, jump)
-    )
+    # Where patches overlap they count the same readings again.
+    own = np.float32((patches.stride / side) ** 2)
+    chances = posteriors(evidence * own, compatibility(labels, slope_px * patches.stride, jump))
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
     return Volume(labels, centres, chances, evidence, kind, deciding, rough.at_end)
 

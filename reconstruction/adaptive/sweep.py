@@ -50,40 +50,54 @@ LEAST_BELIEF = 1e-5
 def _see(weights, colour, texture, disparity, margin, binning, first, last, frames):
     """Add to pixel rows of frames (shot, pixel_y, pixel_x) what they see of a plane.
 
-    texture: (c, y, x), padded by a margin that no ray leaves.
+    texture: (c, y, x), padded by a margin that no ray leaves. Rows are interpolated once for all
+    views beside each other, and only in the colours that a row of the sensor has.
     """
     shots, views_v, views_u, _, stored, columns = weights.shape
     colours, _, wide = texture.shape
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    line, seen = np.empty(wide, np.float32), np.empty((colours, columns), np.float32)
-    for v in range(views_v):
-        down = -disparity * (v - views_v // 2)
-        cubic(np.float32(down - floor(down)), wy)
-        for u in range(views_u):
-            right = -disparity * (u - views_u // 2)
-            cubic(np.float32(right - floor(right)), wx)
-            left = margin + floor(right) - 1
-            for y in range(first * binning, last * binning):
-                top = y + margin + floor(down) - 1
+    line, seen = np.empty((colours, wide), np.float32), np.empty(columns, np.float32)
+    has = np.empty((shots, colours), np.bool_)
+    none = np.float32(0)
+    for y in range(first * binning, last * binning):
+        for s in range(shots):
+            for c in range(colours):
+                has[s, c] = stored > 1 or np.any(colour[s, y] == c)
+        for v in range(views_v):
+            down = -disparity * (v - views_v // 2)
+            cubic(np.float32(down - floor(down)), wy)
+            top = y + margin + floor(down) - 1
+            for c in range(colours):
+                a, b = texture[c, top], texture[c, top + 1]
+                d, e = texture[c, top + 2], texture[c, top + 3]
+                for x in range(wide):
+                    line[c, x] = wy[0] * a[x] + wy[1] * b[x] + wy[2] * d[x] + wy[3] * e[x]
+            for u in range(views_u):
+                right = -disparity * (u - views_u // 2)
+                cubic(np.float32(right - floor(right)), wx)
+                left = margin + floor(right) - 1
                 for c in range(colours):
-                    a, b = texture[c, top], texture[c, top + 1]
-                    d, e = texture[c, top + 2], texture[c, top + 3]
-                    for x in range(left, left + columns + TAPS - 1):
-                        line[x] = wy[0] * a[x] + wy[1] * b[x] + wy[2] * d[x] + wy[3] * e[x]
+                    if not has[:, c].any():
+                        continue
+                    taps = line[c, left : left + columns + TAPS - 1]
                     for x in range(columns):
-                        at = left + x
-                        seen[c, x] = (
-                            wx[0] * line[at]
-                            + wx[1] * line[at + 1]
-                            + wx[2] * line[at + 2]
-                            + wx[3] * line[at + 3]
+                        seen[x] = (
+                            wx[0] * taps[x]
+                            + wx[1] * taps[x + 1]
+                            + wx[2] * taps[x + 2]
+                            + wx[3] * taps[x + 3]
                         )
-                for s in range(shots):
-                    for k in range(stored):
-                        for x in range(columns):
-                            c = min(colour[s, y, x] if stored == 1 else k, colours - 1)
-                            w = weights[s, v, u, y, k, x]
-                            frames[s, y // binning, x // binning] += w * seen[c, x]
+                    for s in range(shots):
+                        if not has[s, c]:
+                            continue
+                        row, filters = frames[s, y // binning], colour[s, y]
+                        for k in range(stored):
+                            if stored > 1 and min(k, colours - 1) != c:
+                                continue
+                            w = weights[s, v, u, y, k]
+                            for x in range(columns):
+                                open = stored > 1 or filters[x] == c
+                                row[x // binning] += (w[x] if open else none) * seen[x]
 
 
 def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: int) -> Array:

@@ -62,12 +62,12 @@ def held_out(
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-def _parts(scene: Scene, brightness: float, noise_variance: float, spread: Array) -> Array:
+def _parts(scene: Scene, scale: float, noise_variance: float, spread: Array) -> Array:
     """Return N, B and E of every sample, (3, v, u, y, x)."""
     let_in = np.square(scene.texture - scene.clean).mean(axis=0)
     steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
     smooth = np.stack([cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, steep)])
-    seen = np.maximum(scene.surfaces.light_field(smooth), 0) * np.float32(brightness**2)
+    seen = np.maximum(scene.surfaces.light_field(smooth), 0) * np.float32(scale**2)
     parts = np.empty((3, *spread.shape), dtype=np.float32)
     parts[0] = np.float32(LET_IN) * seen[..., 0] + np.float32(LEFT_IN * noise_variance)
     parts[1] = seen[..., 1]
@@ -116,7 +116,7 @@ class Deviation:
 
 def deviation(
     scene: Scene,
-    brightness: float,
+    scale: float,
     spread: Array,
     residual: Array,
     noise: Array,
@@ -124,7 +124,7 @@ def deviation(
 ) -> Deviation | None:
     """Return the standard deviation of a mean of models; None with too few readings held out.
 
-    scene: the last fit, of a light field over `brightness`. spread: variance (v, u, y, x) between
+    scene: the last fit, of a light field over `scale`. spread: variance (v, u, y, x) between
     the models. residual: of the mean; noise: variance of the readings; held: those kept from the
     fits, all (shot, pixel_y, pixel_x).
     """
@@ -132,7 +132,7 @@ def deviation(
         return None
     allowed = noise[held].astype(np.float64)
     square = np.square(residual[held], dtype=np.float64)
-    parts = _parts(scene, brightness, float(np.median(allowed)), spread)
+    parts = _parts(scene, scale, float(np.median(allowed)), spread)
     of_readings = _of_readings(scene, parts, held)
 
     def predicted(logs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ distribution names by an entry point of the group `emmc_rig.methods`.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import pkgutil
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, create_model
 
+from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.settings import AdaptiveSettings
@@ -85,13 +85,16 @@ else:
     MethodSettings = create_model("MethodSettings", __base__=ShippedSettings, **_own)
 
 
+def installed_methods() -> tuple[str, ...]:
+    """Return the names of the methods that can run here: all, but for extras not installed."""
+    return tuple(name for name, method in METHODS.items() if method.installed)
+
+
 def find_method(name: str) -> Method:
     """Return a method by name; raises ReconstructionError naming the nearest."""
     if name in METHODS:
         return METHODS[name]
-    near = difflib.get_close_matches(name, METHODS, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    raise ReconstructionError(f"no method '{name}': {hint}known are {', '.join(METHODS)}")
+    raise ReconstructionError(f"no method '{name}': {nearest_of(name, METHODS)}")
 
 
 def reconstruct(

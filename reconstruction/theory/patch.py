@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
-from reconstruction.problem import OPPONENT
 
 Array = NDArray[np.floating]
 SIDE = 8

@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.bounds import bhattacharyya
 
 Array = NDArray[np.floating]

@@ -14,8 +14,10 @@ from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
 
-Level = Literal["trust", "doubt", "do not use"]
-LEVELS: tuple[Level, ...] = ("trust", "doubt", "do not use")
+Level = Literal["trust", "cannot tell", "doubt", "do not use"]
+LEVELS: tuple[Level, ...] = ("trust", "cannot tell", "doubt", "do not use")
+"""Graver ones later. `cannot tell`: nothing speaks against the light field, but a Psi that is wrong
+would not show in these readings."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,9 @@ class Limits:
 
     def level(self, figure: float) -> Level:
         """Return the verdict that a figure alone leads to; larger is worse."""
-        return LEVELS[(figure > self.doubt) + (figure > self.refuse)]
+        if figure > self.refuse:
+            return "do not use"
+        return "doubt" if figure > self.doubt else "trust"
 
     def times(self, factor: float) -> Limits:
         """Return the limits scaled."""
@@ -118,7 +122,7 @@ def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     found = [
         reason
-        for rule in (_shots, _masks, _pixels, _noise, _search, _misfit, _fit)
+        for rule in (_shots, _coding, _masks, _pixels, _noise, _search, _misfit, _fit)
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
@@ -201,6 +205,33 @@ def _strength(e: Evidence) -> tuple[float, float] | None:
 def _masks_fit(e: Evidence) -> bool:
     weakest = _strength(e)
     return weakest is not None and weakest[0] > 1 - STRENGTH_LOST.refuse
+
+
+def _coding(e: Evidence) -> Iterator[Reason]:
+    """Whether the readings show the masks so well that others, or moved ones, would be noticed.
+
+    A loss of strength counts beyond two deviations, and is measured to within two more: where these
+    four exceed the limit of doubt, twice that limit may pass unnoticed.
+    """
+    remedy = "measure Psi with whiteboards beside this capture, or use masks that show in a shot"
+    weakest = _strength(e)
+    if weakest is None:
+        yield Reason(
+            f"the masks change neighbouring readings by {e.relief:.1%}: whether Psi is the "
+            "camera's cannot be tested",
+            e.relief,
+            remedy,
+            "cannot tell",
+        )
+        return
+    deviation = max(one for one in e.strength_errors if one is not None)
+    if 4 * deviation > STRENGTH_LOST.doubt * _patience(e, 0.85):
+        yield Reason(
+            f"the masks' strength is known to {deviation:.1%} only: a Psi that is wrong may pass",
+            deviation,
+            remedy,
+            "cannot tell",
+        )
 
 
 def _patience(e: Evidence, power: float) -> float:

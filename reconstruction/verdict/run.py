@@ -52,21 +52,6 @@ def reconstruct_judged(
     return result, verdict_from(gathered(psi, read, typical, result))
 
 
-def verdict_of(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    result: Reconstruction,
-    screening: bool = True,
-) -> Verdict:
-    """Return whether to trust what was found, in tiles say, without the readings `kept`."""
-    read, _ = _as_fitted(psi, frames, noise_sigma, usable, screening)
-    read = dataclasses.replace(read, kept=kept & read.usable)
-    return verdict_from(gathered(psi, read, noise_sigma, result))
-
-
 def _as_fitted(
     psi: ImagingMatrix,
     frames: Array,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import http.client
 import json
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -22,20 +21,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import uvicorn
 from numpy.typing import NDArray
 
-from drivers.camera import CameraIdentity
+from drivers.clock import SYSTEM_CLOCK
 from drivers.raw import RawFrame
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.scale import designed_scale
-from emmc_rig.live.server import application, new_token
+from emmc_rig.live.server import application, new_token, served
+from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
+from simulators.still import PreparedCamera, StillStage
 
 CLIENTS, STOPS = 100, 20
 LARGE_PX = (4000, 6000)
@@ -49,7 +49,7 @@ FOLLOWED = 12
 
 @dataclass(frozen=True)
 class StopTiming(Figures):
-    """From sending `stop` to the stage being told, of several, in ms."""
+    """From sending `stop` to the stage receiving it, of several, in ms."""
 
     clients: int
     median_ms: float
@@ -101,67 +101,35 @@ def raw_frame(
     )
 
 
-class MemoryCamera:
-    """A camera that has one frame in memory, and counts."""
-
-    identity = CameraIdentity(model="memory")
-    exposure_limits_s, gain_limits = (0.01, 0.01), (1.0, 1.0)
-    exposure_s, gain = 0.01, 1.0
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        mosaic = np.random.default_rng(0).integers(256, 4000, shape).astype(np.uint16)
-        self.shape, self.cfa = shape, "rggb"
-        self._frame = raw_frame(mosaic, "rggb", 256, 4095, 0.01)
-
-    def set_exposure_s(self, exposure_s: float) -> None:
-        """Do nothing: there is one exposure."""
-
-    def set_gain(self, gain: float) -> None:
-        """Do nothing: there is one gain."""
-
-    def snap(self) -> RawFrame:
-        """Return the frame."""
-        return self._frame
-
-    def close(self) -> None:
-        """Do nothing."""
+def memory_camera(shape: tuple[int, int]) -> PreparedCamera:
+    """Return a camera that has one frame in memory."""
+    mosaic = np.random.default_rng(0).integers(256, 4000, shape).astype(np.uint16)
+    frame = raw_frame(mosaic, "rggb", 256, 4095, 0.01)
+    return PreparedCamera(lambda exposure_s: frame, shape, "rggb")
 
 
-class StoppingStage:
-    """A stage of one axis that does nothing but note when it was told to stop."""
-
-    axes = ("mask_x",)
+class StoppingStage(StillStage):
+    """A stage of one axis that notes when it receives a stop."""
 
     def __init__(self) -> None:
-        self.told_s: list[float] = []
+        super().__init__(("mask_x",), SYSTEM_CLOCK)
+        self.home()
+        self.stopped_s: list[float] = []
 
     def stop(self, axes: object = None) -> None:
         """Note the time."""
-        self.told_s.append(time.monotonic())
-
-    def position_um(self, axis: str) -> float:
-        """Return a place."""
-        return 0.0
-
-    def limits_um(self, axis: str) -> tuple[float, float]:
-        """Return a travel."""
-        return 0.0, 1.0
+        self.stopped_s.append(time.monotonic())
 
 
 @contextmanager
 def _served(watch: Watch) -> Iterator[tuple[int, str]]:
     """Serve a page; yield its port and the path that begins with its token."""
-    token, listening = new_token(), socket.create_server(("127.0.0.1", 0))
-    config = uvicorn.Config(application(watch, token), log_level="warning", lifespan="off")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    token = new_token()
     watch.start()
-    thread.start()
     try:
-        yield listening.getsockname()[1], f"/{token}"
+        with served(application(SetupPage(watch), token)) as port:
+            yield port, f"/{token}"
     finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)
         watch.close()
 
 
@@ -171,42 +139,42 @@ def _client(call: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
 
 
-def _poll(port: int, path: str, clients: int) -> None:
-    """Ask for the state again and again, as so many pages do, until ended; say when all do."""
+def _look(port: int, path: str, clients: int) -> None:
+    """Follow the state as so many pages do, until ended; say when all do."""
     begun = threading.Barrier(clients + 1)
 
     def one() -> None:
-        link, version = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S), 0
-        while True:
-            link.request("GET", f"{path}/state?after={version}")
-            if version == 0:
-                begun.wait()
-            version = json.loads(link.getresponse().read())["version"]
+        link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        link.request("GET", f"{path}/events")
+        answer = link.getresponse()
+        begun.wait()
+        while answer.readline():
+            pass
 
     threads = [threading.Thread(target=one, daemon=True) for _ in range(clients)]
     for thread in threads:
         thread.start()
     begun.wait()
-    print("all ask", flush=True)
+    print("all look", flush=True)
     for thread in threads:
         thread.join()
 
 
 def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
-    """Return how soon the stage is told to stop while so many pages follow a running camera."""
-    stage, camera = StoppingStage(), MemoryCamera((480, 640))
-    watch = Watch(camera, stage)  # pyright: ignore[reportArgumentType]
-    with _served(watch) as (port, path), _client(f"_poll({port}, {path!r}, {clients})") as crowd:
+    """Return how soon the stage receives a stop while so many pages follow a running camera."""
+    stage = StoppingStage()
+    watch = Watch(memory_camera((480, 640)), stage)
+    with _served(watch) as (port, path), _client(f"_look({port}, {path!r}, {clients})") as crowd:
         assert crowd.stdout is not None
         crowd.stdout.readline()
         delays_s = []
         for _ in range(stops):
             link = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-            before, sent_s = len(stage.told_s), time.monotonic()
+            before, sent_s = len(stage.stopped_s), time.monotonic()
             link.request("POST", f"{path}/do/stop", "{}", {"Content-Type": "application/json"})
             link.getresponse().read()
             link.close()
-            delays_s.append(stage.told_s[before] - sent_s)
+            delays_s.append(stage.stopped_s[before] - sent_s)
             time.sleep(0.1)
         crowd.kill()
     ms = [1e3 * one for one in delays_s]
@@ -216,19 +184,18 @@ def stop_timing(clients: int = CLIENTS, stops: int = STOPS) -> StopTiming:
 def _fetch(port: int, path: str, seconds: float) -> None:
     """Follow the page for some seconds as its script does; print pictures per second, bytes."""
     links = [http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S) for _ in range(2)]
-
-    def ask(link: http.client.HTTPConnection, what: str) -> bytes:
-        link.request("GET", f"{path}/{what}")
-        return link.getresponse().read()
-
-    version, frame, pictures, size, started_s = 0, 0, 0, 0, 0.0
+    links[0].request("GET", f"{path}/events")
+    events = links[0].getresponse()
+    frame, pictures, size, started_s = 0, 0, 0, 0.0
     begin_s = time.monotonic() + WARM_UP_S
     while time.monotonic() < begin_s + seconds:
-        state = json.loads(ask(links[0], f"state?after={version}"))
-        version = state["version"]
+        line = events.readline()
+        state = json.loads(line.removeprefix(b"data: ")) if line.strip() else {"frame": frame}
         if state["frame"] == frame:
             continue
-        frame, data = state["frame"], ask(links[1], "picture.jpg?px=1600")
+        frame = state["frame"]
+        links[1].request("GET", f"{path}/picture.jpg?px=1600")
+        data = links[1].getresponse().read()
         if time.monotonic() >= begin_s:
             started_s = started_s or time.monotonic()
             pictures, size = pictures + 1, len(data)
@@ -237,7 +204,7 @@ def _fetch(port: int, path: str, seconds: float) -> None:
 
 def shown_timing(shape: tuple[int, int] = LARGE_PX, seconds: float = WATCHED_S) -> ShownTiming:
     """Return how many pictures a second of a large camera reach one page, with all its figures."""
-    with _served(Watch(MemoryCamera(shape))) as (port, path):
+    with _served(Watch(memory_camera(shape))) as (port, path):
         before_s, began_s = time.process_time(), time.monotonic()
         with _client(f"_fetch({port}, {path!r}, {seconds})") as client:
             answer, _ = client.communicate(timeout=PATIENCE_S + seconds)

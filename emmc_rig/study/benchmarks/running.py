@@ -69,6 +69,7 @@ BENCHMARKS = {
     "guard": Benchmark("guard", CFA),
     "stated": Benchmark("stated", CFA),
     "ablation": Benchmark("ablation", journal="ablation.jsonl"),
+    "constants": Benchmark("constants", journal="constants.jsonl"),
     "next-shot": Benchmark("next_shot", journal="next_shots.jsonl"),
 }
 

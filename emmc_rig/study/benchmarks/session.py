@@ -25,7 +25,7 @@ from drivers.raw import RawFrame, decode_raw
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import Unwatched
+from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.pages.timeline import overlap, run_entries
@@ -137,7 +137,7 @@ def _overhead(
     )
 
 
-class _Steps(Unwatched):
+class _Steps(CaptureWatcher):
     """Clocks the loop from the first frame to the last, and the handing over in it."""
 
     def __init__(self, device: _Timed) -> None:

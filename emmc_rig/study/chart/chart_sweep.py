@@ -276,6 +276,5 @@ class ChartSweep(Sweep[Point]):
 
     def words(self, point: Point, result: dict) -> str:
         """Return a measured point in words."""
-        if "failed" in result:
-            return f"{point.label}: {result['failed']}"
-        return f"{result['psnr_db']:.2f} dB in {result['seconds']:.2f} s, {point.label}"
+        took = f" (in {result['seconds']:.2f} s)" if "seconds" in result else ""
+        return super().words(point, result) + took

@@ -29,11 +29,11 @@ from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.study.chart.captures import read_frames, read_truth
 from emmc_rig.study.chart.peers import PEERS
-from emmc_rig.study.chart.scores import scored
+from emmc_rig.study.scores import scored
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct
@@ -178,7 +178,7 @@ def _window(psi: ImagingMatrix, frames: Frames) -> tuple[ImagingMatrix, Frames]:
 
 def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
     """Write what a point shows, and the truth's beside the captures, unless it is there."""
-    lines = telling_lines(truth)
+    lines = epipolar_lines(truth)
     truth_path = path.with_name(f"{path.stem.partition('-')[0]}-truth.webp")
     for light_field, where in ((estimate, path), (truth, truth_path)):
         if not where.exists() or where == path:

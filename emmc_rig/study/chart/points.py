@@ -6,7 +6,6 @@ are; VARIATIONS adds settings for those it knows.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,10 +13,11 @@ from typing import Any
 from pydantic import Field
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
 from emmc_rig.study.chart.captures import Capture
 from emmc_rig.study.chart.peers import PEERS
-from reconstruction.methods import METHODS, MethodSettings
+from reconstruction.methods import METHODS, MethodSettings, installed_methods
 from simulators.scenes import SCENES
 
 FAST_SCENES = ("near-planar", "deep-occlusions", "wide-disparity")
@@ -143,16 +143,14 @@ def check_methods(names: Sequence[str]) -> None:
     known = [*METHODS, *PEERS]
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise AppError(f"--method {name}: {hint}known are {', '.join(known)}")
+            raise AppError(f"--method {name}: {nearest_of(name, known)}")
 
 
 def configurations(settings: ChartSettings) -> list[Configuration]:
     """Return the methods with their settings, quick ones first, other libraries' last."""
     check_methods(settings.methods)
     found = []
-    for method in METHODS:
+    for method in METHODS if settings.methods else installed_methods():
         if settings.fast and method in SLOW_METHODS and method not in settings.methods:
             continue
         for level, changed in VARIATIONS.get(method, {DEFAULT: {}}).items():
@@ -191,7 +189,7 @@ _FIXED = {
     "dict-admm": ("fast", {"sparse": _QUICK_PATCHES}),
 }
 """Settings whose work does not depend on how soon they converge, where there are such."""
-_NOT_SWEPT = (*SLOW_METHODS, "tv-dict")
+_NOT_SWEPT = (*SLOW_METHODS, "tv-dict", "unrolled")
 _NOT_SWEPT_FAST = ("dict-admm", "adaptive-fast")
 
 
@@ -216,7 +214,7 @@ def scalings(settings: ChartSettings, cores: int) -> list[Scaling]:
         "cores": [(k, middle, k) for k in _core_counts(cores)],
     }
     found = []
-    for method in METHODS:
+    for method in installed_methods():
         if method in _NOT_SWEPT or (settings.fast and method in _NOT_SWEPT_FAST):
             continue
         if settings.methods and method not in settings.methods:

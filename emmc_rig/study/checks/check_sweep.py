@@ -25,12 +25,14 @@ from emmc_rig.study.checks.scenes import (
     check_frames,
     scenes,
 )
+from emmc_rig.study.checks.session import check_session
 from emmc_rig.study.checks.statistics import check_bound, check_plan
 from emmc_rig.study.sweep import Results, Sweep, machine, sweep_folder
 
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "psi": check_psi,
     "few": check_few,
+    "session": check_session,
     "bound": check_bound,
     "plan": check_plan,
     "sensor": check_sensor,

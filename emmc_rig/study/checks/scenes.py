@@ -71,9 +71,10 @@ class _Captured:
     exposures_s: Array
 
 
-def _captured(
+def captured_scene(
     spec: str, camera: Camera, truth: BenchTruth, seed: int, size: tuple[int, int] = SCENE_SIZE
 ) -> _Captured:
+    """Return a scene captured on a bench; spec: a built-in scene or a folder."""
     fine = fine_scene(spec, 1, 2, size=size, views=camera.views)
     bench = WhiteboardBench(camera, size, truth, seed, fine.samples)
     frames, exposures_s = bench.capture_scene()
@@ -118,7 +119,7 @@ def check_cost(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     rows: list[Row] = []
     detail: dict[str, object] = {"frames": few.exposures}
     for spec in scenes():
-        captured = _captured(spec, settings.camera, settings.truth, settings.seed + 1)
+        captured = captured_scene(spec, settings.camera, settings.truth, settings.seed + 1)
         calibration = outcome.calibrations["mixed"]
         with_exact = _psnr(exact, calibration, captured)
         costs = {
@@ -146,7 +147,7 @@ def check_frames(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     free_boards = bench.capture(free_settings(camera, ("white",), 1))
     free = calibrate(camera, design, ("free",), held_out, pinholes=free_boards).calibration
     spec = scenes()[0]
-    captured = _captured(spec, camera, settings.truth, settings.seed + 1)
+    captured = captured_scene(spec, camera, settings.truth, settings.seed + 1)
     reached = _psnr(free.psi, free, captured)
     detail: dict[str, object] = {"free": {"psnr_db": reached, "frames": free_boards.exposures}}
     rows = [
@@ -240,7 +241,7 @@ def check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         gained = lost = 0.0
         exact = WhiteboardBench(camera, SCENE_SIZE, truth).exact_psi(design)
         for spec in scenes()[:DRIFT_SCENES]:
-            captured = _captured(spec, camera, truth, settings.seed + 2)
+            captured = captured_scene(spec, camera, truth, settings.seed + 2)
             found = _drift_of(calibration, shadow, captured, design)
             oracle = drifted(shadow.placement, np.array(drift))
             matrices = {
@@ -291,7 +292,7 @@ def check_alarms(settings: CalibrateSettings) -> tuple[list[Row], dict]:
     known = [*scenes(), *(name for name in BUILT_IN if name not in scenes())]
     for run in range(ALARM_RUNS):
         spec = known[run % len(known)]
-        captured = _captured(spec, camera, settings.truth, settings.seed + 10 + run)
+        captured = captured_scene(spec, camera, settings.truth, settings.seed + 10 + run)
         drift = _drift_of(calibration, shadow, captured, design)
         found.append((Path(spec).name, drift.drifted, drift.displacement_px, drift.chi2))
     alarms = sum(one[1] for one in found)

@@ -167,10 +167,7 @@ def curves(results: Mapping[Point, dict]) -> list[Curve]:
 
 
 def _curve(
-    name: str,
-    scenes: Sequence[str],
-    kind: tuple[str, str, bool],
-    results: Mapping[Point, dict],
+    name: str, scenes: Sequence[str], kind: tuple[str, str, bool], results: Mapping[Point, dict]
 ) -> Curve | None:
     """Return one curve; of several scenes those that have every strength that any has."""
     by_scene = {

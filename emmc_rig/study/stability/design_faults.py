@@ -26,19 +26,19 @@ def _with_mask(setup: Setup, **changed: float) -> Trial:
 
 
 def mask_cell(setup: Setup, px: float) -> Trial:
-    """The mask's cells are so many samples wide."""
+    """The width of the mask's cells."""
     return _with_mask(setup, cell_um=px * setup.camera.sensor.sample_pitch_um)
 
 
 def mask_distance(setup: Setup, px: float) -> Trial:
-    """The mask stands where its shadow moves by so many samples from view to view."""
+    """How far the mask's shadow moves from view to view, by its distance from the sensor."""
     camera = setup.camera
     ratio = px * camera.sensor.sample_pitch_um / camera.lens.aperture_cell_um
     return _with_mask(setup, distance_mm=ratio * camera.lens.distance_mm)
 
 
 def shots(setup: Setup, count: float) -> Trial:
-    """The camera takes so many shots in the same total time."""
+    """The number of shots in the same total time."""
     try:
         camera = setup.camera.with_shots(round(count))
     except CameraError as fault:
@@ -47,7 +47,7 @@ def shots(setup: Setup, count: float) -> Trial:
 
 
 def views(setup: Setup, count: float) -> Trial:
-    """So many views a side are wanted, through the same aperture; of a measured scene, fewer."""
+    """The number of views, through the same aperture; of a measured scene, fewer."""
     side, camera = round(count), setup.camera
     if not setup.is_built_in and side > max(camera.views):
         raise NotApplicableError(f"built-in scenes only: {side} x {side} views were not measured")

@@ -25,11 +25,11 @@ from emmc_rig.model.errors import ModelError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
+from emmc_rig.study.stability.fault_sweep import named_methods
 from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
 from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
 from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Fault, Trial
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import find_method
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
@@ -70,12 +70,10 @@ def detector_settings(
     """
     for name in faults or ():
         find_fault(name)
-    for name in methods or ():
-        find_method(name)
     given = {
         "cameras": (camera,) if camera else (),
         "faults": tuple(faults or ()),
-        "methods": tuple(methods or ()),
+        "methods": named_methods(methods, fast) if methods else (),
         "size": size,
     }
     chosen = {key: value for key, value in given.items() if value}
@@ -158,13 +156,14 @@ class CaseResult:
 
     @property
     def wrong(self) -> bool:
-        """Whether it is broken and trusted, or good and not."""
-        return self.kind in ("broken", "good") and self.flagged != (self.kind == "broken")
+        """Whether it is broken and trusted, or good and flagged."""
+        trusted = self.verdict.level == "trust"
+        return (self.kind == "broken" and trusted) or (self.kind == "good" and self.flagged)
 
     @property
     def flagged(self) -> bool:
-        """Whether the verdict is not trust."""
-        return self.verdict.level != "trust"
+        """Whether the verdict speaks against it."""
+        return self.verdict.level in ("doubt", "do not use")
 
 
 @dataclass
@@ -240,7 +239,10 @@ def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
 
 @dataclass(frozen=True)
 class Tally:
-    """How many results were of each kind, and how many of those were flagged."""
+    """How many results were of each kind, and how many of those were flagged.
+
+    untold: of all kinds, how many could not be told.
+    """
 
     broken: int = 0
     broken_flagged: int = 0
@@ -250,6 +252,7 @@ class Tally:
     good_flagged: int = 0
     poor: int = 0
     poor_flagged: int = 0
+    untold: int = 0
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return, of broken, good, between and poor, how many were flagged, and how many are."""
@@ -273,6 +276,7 @@ def tallied(results: Iterable[CaseResult]) -> Tally:
     for one in results:
         counts[one.kind] += 1
         counts[f"{one.kind}_flagged"] += one.flagged
+        counts["untold"] += one.verdict.level == "cannot tell"
     return Tally(**counts)
 
 

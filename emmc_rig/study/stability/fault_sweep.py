@@ -18,11 +18,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
-from emmc_rig.pages.page import number
-from emmc_rig.pages.pictures import telling_lines
+from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import angular_snr_db
+from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
 from emmc_rig.study.sweep import (
     Results,
@@ -33,13 +32,15 @@ from emmc_rig.study.sweep import (
     machine,
 )
 from emmc_rig.study.trial import Fault, Setup, Trial
-from reconstruction.methods import METHODS, MethodSettings, find_method
+from reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
 from reconstruction.sparse import SparseSettings
 
 SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 FAST_METHODS = ("tv", "dict-omp", "adaptive-fast")
 SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
 FAST_SCENES = ("deep-occlusions",)
+ALL = "all"
+"""Instead of a method's name: every one that is installed."""
 CAMERA = "rgbw-bayer-3shots"
 SIZE, ZOOM = (96, 128), 2
 FAST_SIZE, FAST_ZOOM = (64, 80), 3
@@ -115,11 +116,21 @@ def chosen_faults(settings: StabilitySettings) -> list[Fault]:
     return [find_fault(name) for name in settings.faults] or list(FAULTS.values())
 
 
-def chosen_methods(settings: StabilitySettings) -> tuple[str, ...]:
-    """Return the methods; raises ReconstructionError naming the nearest for one not known."""
-    for name in settings.methods:
+def named_methods(names: Sequence[str], fast: bool) -> tuple[str, ...]:
+    """Return methods by name, those usually compared where none is given, every one for ALL.
+
+    Raises ReconstructionError naming the nearest for one not known.
+    """
+    if ALL in names:
+        return installed_methods()
+    for name in names:
         find_method(name)
-    return settings.methods or (FAST_METHODS if settings.fast else SWEPT_METHODS)
+    return tuple(names) or (FAST_METHODS if fast else SWEPT_METHODS)
+
+
+def chosen_methods(settings: StabilitySettings) -> tuple[str, ...]:
+    """Return the methods of a sweep; raises what `named_methods` does."""
+    return named_methods(settings.methods, settings.fast)
 
 
 def strengths(fault: Fault, settings: StabilitySettings) -> tuple[float, ...]:
@@ -217,7 +228,7 @@ class StabilitySweep(Sweep[Point]):
         truth = self.truth_picture(one)
         truth.parent.mkdir(exist_ok=True)
         if not truth.is_file():
-            save_thumbnail(truth, made.truth, telling_lines(made.truth))
+            save_thumbnail(truth, made.truth, epipolar_lines(made.truth))
         for point in points:
             yield self._measured(point, made)
 
@@ -236,7 +247,7 @@ class StabilitySweep(Sweep[Point]):
         estimate = result.light_field
         if not np.isfinite(estimate).all():
             return {"failed": "the estimate is not finite", "view_db": view_db}
-        save_thumbnail(self.picture(point), estimate, telling_lines(made.truth))
+        save_thumbnail(self.picture(point), estimate, epipolar_lines(made.truth))
         return {
             "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,
@@ -248,12 +259,6 @@ class StabilitySweep(Sweep[Point]):
             "advice": result.advice,
             "screening": "; ".join(result.screening),
         }
-
-    def words(self, point: Point, result: dict) -> str:
-        """Return a measured point in words."""
-        if "failed" in result:
-            return f"{point.label}: {result['failed']}"
-        return f"{number(result['psnr_db'], '.2f')} dB, {point.label}"
 
 
 def _settings(point: Point, binning: int = 1) -> MethodSettings:

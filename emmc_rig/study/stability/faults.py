@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
-
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.errors import CameraError
+from emmc_rig.model.errors import CameraError, nearest_of
 from emmc_rig.study.stability import (
     design_faults,
     mask_faults,
@@ -25,9 +23,7 @@ def find_fault(name: str) -> Fault:
     """Return a fault by name; raises AppError naming the nearest."""
     if name in FAULTS:
         return FAULTS[name]
-    near = difflib.get_close_matches(name, FAULTS, n=1, cutoff=0.4)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    raise AppError(f"--fault {name}: {hint}known are {', '.join(FAULTS)}")
+    raise AppError(f"--fault {name}: {nearest_of(name, FAULTS)}")
 
 
 def trial(

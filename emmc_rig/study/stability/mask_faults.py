@@ -60,16 +60,13 @@ def _misplaced(setup: Setup, **changed: float) -> Trial:
 
 
 def _diagonal(px: float, setup: Setup) -> dict[str, float]:
-    """Return a shift by so many samples, at 30 degrees to the rows."""
+    """Return a shift in samples, at 30 degrees to the rows."""
     um = px * setup.camera.sensor.sample_pitch_um
-    return {
-        "offset_x_um": um * math.cos(math.pi / 6),
-        "offset_y_um": -um * math.sin(math.pi / 6),
-    }
+    return {"offset_x_um": um * math.cos(math.pi / 6), "offset_y_um": -um * math.sin(math.pi / 6)}
 
 
 def shift(setup: Setup, px: float) -> Trial:
-    """The mask sits so many samples off, in a slanted direction."""
+    """The mask is shifted, at 30 degrees to the rows."""
     return _misplaced(setup, **_diagonal(px, setup))
 
 
@@ -79,12 +76,12 @@ def rotation(setup: Setup, degrees: float) -> Trial:
 
 
 def scale(setup: Setup, percent: float) -> Trial:
-    """The mask's cells are so many percent too large."""
+    """The mask's cells are too large."""
     return _misplaced(setup, scale=percent / 100)
 
 
 def distance(setup: Setup, percent: float) -> Trial:
-    """The mask stands so many percent further from the sensor."""
+    """The mask stands further from the sensor than designed."""
     return _misplaced(setup, distance_share=percent / 100)
 
 
@@ -94,15 +91,11 @@ def edge_blur(setup: Setup, px: float) -> Trial:
 
 
 def vignetting(setup: Setup, percent: float) -> Trial:
-    """The outermost ray loses so many percent, the others less, by a power of the cos^4 law."""
+    """The outermost ray loses a share of light, the others less, by a power of the cos^4 law."""
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     lens = setup.camera.lens
-    lengths = (
-        lens.distance_mm * 1e3,
-        setup.camera.sensor.sample_pitch_um,
-        lens.aperture_cell_um,
-    )
+    lengths = (lens.distance_mm * 1e3, setup.camera.sensor.sample_pitch_um, lens.aperture_cell_um)
     natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, setup.camera.views, lengths)
     power = math.log(1 - percent / 100) / math.log(float(natural.min()))
     passed = (natural**power).astype(psi.weights.dtype)

@@ -26,7 +26,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.drawing import COLOURS, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.fault_sweep import StabilitySettings
+from emmc_rig.study.stability.fault_sweep import StabilitySettings, chosen_methods
 from emmc_rig.study.stability.faults import find_fault
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
 from emmc_rig.study.trial import Trial
@@ -43,8 +43,6 @@ ERRORS = (
 UNMOVED = ("mask-shift", 0.0)
 QUICK_ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 25.0))
 QUICK_DRIFT = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)
-METHODS_JUDGED = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
-QUICK_METHODS = ("tv", "dict-omp", "adaptive-fast")
 LEAST_DB = 0.2
 """Loss below which a recovered share would be that of noise."""
 
@@ -185,18 +183,13 @@ def drift_settings(fast: bool) -> DriftSettings:
     return QUICK_DRIFT if fast else DriftSettings()
 
 
-def measure_mismatch(
-    settings: StabilitySettings,
-    folder: Path,
-    watcher: Watcher,
-    methods: Sequence[str] = (),
-) -> list[Mismatch]:
+def measure_mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher) -> list[Mismatch]:
     """Return every row, those that the folder does not hold measured and kept there.
 
-    methods: none takes those of the protocol. Raises what scenes and cameras do for wrong input,
-    NotApplicableError for cameras without a mask that can sit otherwise.
+    Raises what scenes, cameras and methods do for wrong input, NotApplicableError for cameras
+    without a mask that can sit otherwise.
     """
-    methods = methods or (QUICK_METHODS if settings.fast else METHODS_JUDGED)
+    methods = chosen_methods(settings)
     errors = QUICK_ERRORS if settings.fast else ERRORS
     sweep = MismatchSweep(settings, folder)
     sweep.run(

@@ -31,7 +31,7 @@ from emmc_rig.study.stability.rounding import (
     step_sizes,
 )
 from emmc_rig.study.trial import Trial
-from reconstruction.methods import METHODS
+from reconstruction.methods import installed_methods
 from reconstruction.result import Reconstruction
 
 OPAQUE = 0.02
@@ -206,12 +206,14 @@ def identical(one: Reconstruction, other: Reconstruction) -> bool:
 
 
 def measure_numerics(
-    watcher: Watcher, fast: bool = False, every: Sequence[str] = tuple(METHODS)
+    watcher: Watcher, fast: bool = False, every: Sequence[str] | None = None
 ) -> Numerics:
     """Return every check, on small captures of a built-in scene.
 
-    every: methods run twice; fast: of those, the slow ones are not run under every condition.
+    every: methods run twice (default: all that are installed); fast: of those, the slow ones are
+    not run under every condition.
     """
+    every = installed_methods() if every is None else every
     methods = [name for name in every if not (fast and name in SLOW)]
     scales = QUICK_SCALES if fast else SCALES
     watcher.begin("numerical stability", 4 + len(CONDITIONS) + len(scales))

@@ -12,7 +12,7 @@ from simulators.scenes import SCENES
 
 
 def disparity_range(setup: Setup, px: float) -> Trial:
-    """The scene's disparities span so many samples per view step."""
+    """The scene's disparities span a wider range."""
     setup.need_built_in()
     known = setup.scene_seen().disparity_px
     assert known is not None
@@ -22,7 +22,7 @@ def disparity_range(setup: Setup, px: float) -> Trial:
 
 
 def occlusion(setup: Setup, percent: float) -> Trial:
-    """Leaves nearer than everything hide so many percent of every view."""
+    """Leaves nearer than everything hide a share of every view."""
     setup.need_built_in()
     nearest = SCENES[setup.scene].disparity_px[1]
     rng = np.random.default_rng([setup.seed, 7])
@@ -33,7 +33,7 @@ def occlusion(setup: Setup, percent: float) -> Trial:
 
 
 def specularity(setup: Setup, percent: float) -> Trial:
-    """Every surface mirrors a lively room, which makes so many percent of its light."""
+    """Every surface mirrors a textured room, which makes a share of its light."""
     setup.need_built_in()
     rng = np.random.default_rng([setup.seed, 8])
     changed = setup.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
@@ -41,7 +41,7 @@ def specularity(setup: Setup, percent: float) -> Trial:
 
 
 def contrast(setup: Setup, percent: float) -> Trial:
-    """The scene has so many percent of its contrast; its PSNR is that of the stretched picture."""
+    """The scene has a share of its contrast; the PSNR is that of the stretched picture."""
     seen, share = setup.scene_seen(), percent / 100
     mean = seen.light_field.mean(axis=(0, 1, 2, 3), keepdims=True, dtype=np.float64)
     faded = np.asarray(mean + share * (seen.light_field - mean), dtype=np.float32)

@@ -51,7 +51,7 @@ def _with_room(setup: Setup, electrons: float) -> Setup:
 
 
 def read_noise(setup: Setup, electrons: float) -> Trial:
-    """Read noise of so many electrons, at least the camera's own."""
+    """Read noise, at least the camera's own."""
     own = setup.camera.sensor.noise
     electrons = max(electrons, own.read_noise_electrons)
     # The black level lies clear of the noise, as on any sensor: clipped noise would be a bias.
@@ -63,7 +63,7 @@ def read_noise(setup: Setup, electrons: float) -> Trial:
 
 
 def saturation(setup: Setup, percent: float) -> Trial:
-    """The white level lies so low that so many percent of the readings reach it."""
+    """The white level lies so low that a share of the readings reaches it."""
     camera, noise = setup.camera, setup.camera.sensor.noise
     truth = setup.scene_seen().light_field
     size = (truth.shape[2], truth.shape[3])
@@ -83,7 +83,7 @@ def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
 
 
 def bad_pixels(setup: Setup, percent: float) -> Trial:
-    """So many percent of the pixels are dead or hot, half of each, and not marked as unusable."""
+    """A share of the pixels is dead or hot, half of each, and not marked as unusable."""
     return _bad(setup, percent, listed=False)
 
 

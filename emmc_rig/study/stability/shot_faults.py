@@ -33,13 +33,13 @@ def flicker(setup: Setup, percent: float) -> Trial:
 
 
 def scene_motion(setup: Setup, px: float) -> Trial:
-    """Things move to the right before a background that stands, so many samples a shot."""
+    """Things move to the right before a background that stands, from shot to shot."""
     setup.need_built_in()
     return _moving(setup, px, background=False)
 
 
 def camera_motion(setup: Setup, px: float) -> Trial:
-    """The camera turns: the picture moves aslant, so many samples from shot to shot.
+    """The camera turns: the picture moves aslant from shot to shot.
 
     A measured scene is interpolated, and needs to be larger than what is reconstructed.
     """
@@ -86,7 +86,7 @@ def _moving(setup: Setup, px: float, background: bool) -> Trial:
 
 
 def missing_shot(setup: Setup, count: float) -> Trial:
-    """So many of the last shots stay dark: no light came through."""
+    """The last shots stay dark: no light came through."""
     dark = len(setup.camera.shots) - _count(setup, count)
 
     def lost(clean: Array) -> Array:
@@ -98,7 +98,7 @@ def missing_shot(setup: Setup, count: float) -> Trial:
 
 
 def repeated_shot(setup: Setup, count: float) -> Trial:
-    """The mask stage stays where it is before so many of the last shots."""
+    """The mask stage stays where it is before the last shots."""
     truth = setup.scene_seen().light_field
     psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
     weights = psi.weights.copy()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import colours_of
 from emmc_rig.pages.page import Section, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.stability.curves import Curve, below_best, break_row, curves, span_words
+from emmc_rig.reconstruct.pool import opened_pool
+from emmc_rig.study.stability.curves import Curve, break_row, curves
 from emmc_rig.study.stability.fault_sweep import (
     Point,
     StabilitySettings,
@@ -40,13 +42,10 @@ from emmc_rig.study.stability.stability_page import (
 )
 from emmc_rig.study.stability.theory import METHODS_COMPARED, measure_theory
 from emmc_rig.study.stability.theory_section import (
-    BOUND,
-    ORACLE,
-    Compared,
-    agreement,
+    breaking,
     compared,
+    is_predicted,
     oracle_offset,
-    rank_correlation,
     theory_sections,
 )
 from emmc_rig.study.sweep import (
@@ -60,7 +59,6 @@ from emmc_rig.study.sweep import (
 from reconstruction.methods import METHODS
 
 DRAWN = "charts"
-NOT_PREDICTED = ("sooner", "later", "only", "not measured")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +79,8 @@ def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watch
     write_text(new / "theory.csv", csv_text(rows))
     every = compared(points, METHODS_COMPARED)
     mean, root = oracle_offset(every)
-    breaks = [_theory_break(one, method) for one in every for method in METHODS_COMPARED]
-    agreed = sum(not any(word in one["judged"] for word in NOT_PREDICTED) for one in breaks)
+    breaks = [breaking(one, method) for one in every for method in METHODS_COMPARED]
+    agreed = sum(is_predicted(one["judged"]) for one in breaks)
     metrics = {"oracle_less_bound_db": {"mean": mean, "rms": root}, "breaks": breaks}
     line = (
         f"theory: the bound says where a method breaks in {agreed} of {len(breaks)} curves; "
@@ -90,25 +88,6 @@ def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watch
     )
     sections = theory_sections(points, METHODS_COMPARED, new / DRAWN)
     return Beside(sections, {"theory": metrics}, [line])
-
-
-def _theory_break(one: Compared, method: str) -> dict:
-    """Return where bound, oracle and a method break, and whether the bound predicts the method."""
-
-    def break_of(key: str) -> str:
-        return span_words(below_best(one.levels[key], one.fault.whole), one.strengths)
-
-    measured = f"{method}_db"
-    return {
-        "scene": one.scene,
-        "fault": one.fault.name,
-        "method": method,
-        "bound": break_of(BOUND),
-        "oracle": break_of(ORACLE),
-        "measured": break_of(measured),
-        "judged": agreement(one, method),
-        "rank_correlation": rank_correlation(one.levels[BOUND], one.levels[measured]),
-    }
 
 
 def _numerics(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
@@ -203,12 +182,14 @@ def run_stability(
     more: Sequence[Section] = (),
     figures: Mapping[str, object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    workers: int | None = None,
 ) -> StabilityOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
     more: sections of the page between the curves and where they came from. figures: of them, for
-    metrics.json. Raises SweepStopped at Ctrl-C, AppError for wrong input and a folder that cannot
-    be written, and the errors of the layers below; what is done is kept in each case.
+    metrics.json. workers: processes that share the trials; None: this one. Raises SweepStopped at
+    Ctrl-C, AppError for wrong input and a folder that cannot be written, and the errors of the
+    layers below; what is done is kept in each case.
     """
     started = clock()
     points = planned(settings)
@@ -219,7 +200,8 @@ def run_stability(
         open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
     with sweep_folder(out, StabilitySweep.journal, "stability") as folder:
         sweep = StabilitySweep(settings, folder)
-        sweep.run(points, watcher)
+        with opened_pool(workers) if workers else nullcontext() as pool:
+            sweep.run(points, watcher, pool)
         left_out = [*sweep.unmeasured(), *sweep.failures()]
         found = curves(sweep.results)
         if not found:
@@ -301,6 +283,6 @@ def _about(sweep: StabilitySweep, left_out: Sequence[str]) -> list[str]:
     size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(sweep.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
-        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}.",
+        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
     return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
-from emmc_rig.model.lightfield import centre_view
+from emmc_rig.model.lightfield import OPPONENT, centre_view
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import swept_disparity
+from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.fault_sweep import StabilitySettings, strengths
 from emmc_rig.study.stability.faults import FAULTS
 from emmc_rig.study.sweep import Results, Sweep
@@ -29,7 +29,6 @@ from emmc_rig.study.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct
-from reconstruction.problem import OPPONENT
 from reconstruction.theory.bounds import disparity_information, distances, ziv_zakai
 from reconstruction.theory.conditioning import (
     condition,

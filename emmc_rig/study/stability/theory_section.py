@@ -12,15 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from scipy.stats import spearmanr
 
-from emmc_rig.pages.drawing import (
-    COLOURS,
-    FAINT,
-    INK,
-    legend_below,
-    save_drawing,
-    sheet,
-    titled,
-)
+from emmc_rig.pages.drawing import COLOURS, FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment, number
 from emmc_rig.study.stability.curves import Span, below_best, span_words, strength_at
 from emmc_rig.study.stability.faults import FAULTS
@@ -127,6 +119,29 @@ def _apart(one: Compared, found: float, wanted: float, end: str) -> str:
     return f"method {'sooner' if earlier else 'later'}{factor}"
 
 
+def breaking(one: Compared, method: str) -> dict:
+    """Return where bound, oracle and a method break, and whether the bound predicts the method."""
+    levels = {"bound": one.levels[BOUND], "oracle": one.levels[ORACLE]}
+    levels["measured"] = one.levels[f"{method}_db"]
+    spans = {
+        key: span_words(below_best(some, one.fault.whole), one.strengths)
+        for key, some in levels.items()
+    }
+    return {
+        "scene": one.scene,
+        "fault": one.fault.name,
+        "method": method,
+        **spans,
+        "judged": agreement(one, method),
+        "rank_correlation": rank_correlation(levels["bound"], levels["measured"]),
+    }
+
+
+def is_predicted(words: str) -> bool:
+    """Return whether an agreement in words is one."""
+    return not any(word in words for word in ("sooner", "later", "only", "not measured"))
+
+
 def draw_theory(some: Sequence[Compared], path: Path) -> Path:
     """Write a panel a fault as SVG and PNG; return the SVG's path."""
     figure, axes = sheet(len(some), 3.9, 2.75, columns=min(3, len(some)))
@@ -190,19 +205,13 @@ def _breaks_table(some: Sequence[Compared]) -> Table:
     methods = some[0].methods
     heads = ["Fault", "Unit", "Bound", "Oracle"]
     for method in methods:
-        heads += [method, "judged", "rank correlation"]
+        heads += [method, "agreement", "rank correlation"]
     rows = []
     for one in some:
-        row = [one.fault.title, one.fault.unit]
-        for key in (BOUND, ORACLE):
-            row.append(span_words(below_best(one.levels[key], one.fault.whole), one.strengths))
-        for method in methods:
-            levels = one.levels[f"{method}_db"]
-            row.append(span_words(below_best(levels, one.fault.whole), one.strengths))
-            row += [
-                agreement(one, method),
-                number(rank_correlation(one.levels[BOUND], levels), "+.2f"),
-            ]
+        found = [breaking(one, method) for method in methods]
+        row = [one.fault.title, one.fault.unit, found[0]["bound"], found[0]["oracle"]]
+        for each in found:
+            row += [each["measured"], each["judged"], number(each["rank_correlation"], "+.2f")]
         rows.append(row)
     return heads, rows
 
@@ -230,7 +239,7 @@ def _summary(some: Sequence[Compared]) -> list[str]:
         missed = [
             f"{title.lower()} ({verdict})"
             for title, verdict in verdicts.items()
-            if any(word in verdict for word in ("sooner", "later", "only"))
+            if not is_predicted(verdict)
         ]
         agreed = len(verdicts) - len(missed)
         lines.append(

@@ -24,10 +24,9 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.scores import swept_disparity
-from emmc_rig.study.stability import fault_sweep
+from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
-from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES
+from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES, named_methods
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
     Results,
@@ -39,7 +38,7 @@ from emmc_rig.study.sweep import (
     provenance,
 )
 from emmc_rig.study.trial import Setup, Trial, trial_of
-from reconstruction.methods import find_method, reconstruct
+from reconstruction.methods import reconstruct
 
 Array = NDArray[np.floating]
 CAMERA = "rgbw-bayer-1shot"
@@ -91,11 +90,9 @@ def worst_settings(
         raise AppError(f"--size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
     scenes = tuple(scenes) or (FAST_SCENES if fast else SCENES)
     check_scene_names(scenes)
-    for name in methods:
-        find_method(name)
+    methods = named_methods(methods, fast)
     camera = camera or CAMERA
     find_camera(camera)
-    methods = tuple(methods) or (fault_sweep.FAST_METHODS if fast else fault_sweep.SWEPT_METHODS)
     return WorstSettings(
         scenes=scenes, camera=camera, methods=methods, size=size, fast=fast,
         dictionary=dictionary, seed=seed,

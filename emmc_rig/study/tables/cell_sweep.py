@@ -14,11 +14,11 @@ from pydantic import Field
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import number
-from emmc_rig.pages.pictures import Pictures, pictures_of, telling_lines
+from emmc_rig.pages.pictures import Pictures, epipolar_lines, pictures_of
 from emmc_rig.progress import Watcher
+from emmc_rig.study.scores import colour_scored
 from emmc_rig.study.sweep import Results, Sweep, digest_of
 from emmc_rig.study.tables.cells import PARTS, Capture, Cell, Part, cells_of, distinct, scenes_of
-from emmc_rig.study.tables.colour_scores import scored
 from emmc_rig.study.tables.library import Array, Cut, Library, Source, TrainingSettings
 from emmc_rig.study.tables.shots import Sensors, Shots
 from reconstruction.bpdn import BPDNSettings
@@ -216,9 +216,9 @@ class TablesSweep(Sweep[Cell]):
                 dictionary = self.source.dictionary(scene, capture.binning, watcher)
                 first = _first_stage(shots, dictionary, settings.sparse, self.clock)
             found, seconds = _solved(cell.method, shots, settings, first, self.clock)
-            scores = scored(found.light_field, truth)
+            scores = colour_scored(found.light_field, truth)
             if cell in self.pictured:
-                kept = pictures_of(found.light_field, telling_lines(truth))
+                kept = pictures_of(found.light_field, epipolar_lines(truth))
                 kept.save(self.picture(cell))
             self._forecast.done(cell, self.clock() - started)
             yield {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -10,13 +9,8 @@ from typing import Literal
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, shipped_cameras
-from emmc_rig.model.masks import (
-    AnyPattern,
-    GaussianColour,
-    RandomBinary,
-    RandomRGBW,
-    UniformColour,
-)
+from emmc_rig.model.errors import nearest_of
+from emmc_rig.model.masks import AnyPattern, GaussianColour, RandomBinary, RandomRGBW, UniformColour
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.paper import Scenario
 
@@ -225,9 +219,7 @@ def chosen_parts(only: str | None) -> tuple[Part, ...]:
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
     for name in names:
         if name not in PARTS:
-            near = difflib.get_close_matches(name, PARTS, n=1, cutoff=0.4)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise AppError(f"--only {name}: {hint}known are {', '.join(PARTS)}")
+            raise AppError(f"--only {name}: {nearest_of(name, PARTS)}")
     if not names:
         raise AppError(f"--only names nothing: known are {', '.join(PARTS)}")
     return tuple(part for part in PARTS.values() if part.name in names)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emmc_rig.pages.drawing import FAINT, INK, save_svg, sheet, titled
+from emmc_rig.pages.drawing import FAINT, LEGEND, save_svg, sheet, titled
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import (
     MASK_TITLES,
@@ -26,11 +28,7 @@ METHOD_COLOURS = {"dict-admm": "#7a869a", "tv-dict": "#1d5a9e", "tv": "#18794e"}
 
 
 def mean_db(
-    measured: Measured,
-    scenes: Sequence[str],
-    capture: Capture,
-    method: str,
-    what: str = "psnr_db",
+    measured: Measured, scenes: Sequence[str], capture: Capture, method: str, what: str = "psnr_db"
 ) -> float | None:
     """Return the mean of a figure over the scenes that have it; None without any."""
     values = []
@@ -93,95 +91,88 @@ def _shots(measured: Measured, scenes: Sequence[str]) -> Figure | None:
                         markersize=5,
                     )
         axes.set_xticks(range(1, 5 if name == "table4" else 4))
-        axes.set_xlabel("images: shots, or full-colour images of (i)", color=FAINT, fontsize=9)
-        titled(axes, f"TV-Dict, {title}, noise-free")
+        across = "images: shots, or full-colour images of (i)"
+        titled(axes, f"TV-Dict, {title}, noise-free", across)
     panels[-1].plot([], [], "--", color=FAINT, alpha=0.6, label="the paper's 7 scenes")
-    panels[-1].legend(fontsize=8.5, frameon=False, labelcolor=INK)
+    panels[-1].legend(**LEGEND)
     return figure
+
+
+def _bars(
+    axes: Axes, groups: Sequence[tuple[Sequence[float], Sequence[float], dict[str, Any]]],
+    width: float, room: float = 2,
+) -> None:  # fmt: skip
+    """Draw groups of bars (places, values, look) that say their values; room: above them, dB."""
+    for at, values, look in groups:
+        axes.bar_label(axes.bar(at, values, width, **look), fmt="%.1f", fontsize=8)
+    levels = [value for _, values, _ in groups for value in values]
+    axes.set_ylim(np.floor(min(levels)) - 2, np.ceil(max(levels)) + room)
 
 
 def _noise(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     part = PARTS["table2"]
     shown = scenes_of(part, scenes)
-    printed = printed_figures()
-    theirs = scenes_of(part, list(paper.TITLES))
-    captures = part.captures
-    if all(mean_db(measured, shown, c, "tv-dict") is None for c in captures):
+    if all(mean_db(measured, shown, c, "tv-dict") is None for c in part.captures):
         return None
     figure, panels = sheet(2, 4.2)
+    theirs = scenes_of(part, list(paper.TITLES))
     for axes, source, names, title in (
         (panels[0], measured, shown, "Ours, TV-Dict"),
-        (panels[1], printed, theirs, "The paper, TV-Dict"),
+        (panels[1], printed_figures(), theirs, "The paper, TV-Dict"),
     ):
-        low = []
-        for i, (scenario, sensor) in enumerate(SCENARIOS.items()):
-            for capture in captures:
+        groups = []
+        for i, scenario in enumerate(SCENARIOS):
+            for capture in (c for c in part.captures if c.scenario == scenario):
                 value = mean_db(source, names, capture, "tv-dict")
-                if capture.scenario == scenario and value is not None:
-                    low.append(value)
-                    at = i + (0.2 if capture.noisy else -0.2)
-                    axes.bar(
-                        at, value, 0.37, color=COLOURS[scenario], alpha=0.5 if capture.noisy else 1
-                    )
-                    axes.text(at, value, f"{value:.1f}", ha="center", va="bottom", fontsize=8)
-            del sensor
-        axes.set_xticks(
-            range(3), [f"({scenario}) {sensor}" for scenario, sensor in SCENARIOS.items()]
-        )
-        axes.set_ylim(np.floor(min(low)) - 2, np.ceil(max(low)) + 1)
-        titled(axes, title)
-    panels[0].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
-    panels[1].set_xlabel("full: noise-free, pale: noisy", color=FAINT, fontsize=9)
+                if value is not None:
+                    look = {"color": COLOURS[scenario], "alpha": 0.5 if capture.noisy else 1}
+                    groups.append(([i + (0.2 if capture.noisy else -0.2)], [value], look))
+        _bars(axes, groups, 0.37, room=1)
+        axes.set_xticks(range(3), [f"({one}) {sensor}" for one, sensor in SCENARIOS.items()])
+        titled(axes, title, "full: noise-free, pale: noisy")
     return figure
 
 
 def _colour(measured: Measured, scenes: Sequence[str]) -> Figure | None:
     shown = scenes_of(PARTS["table3"], scenes)
     captures = [c for c in PARTS["table3"].captures if c.shots < 3 or c.scenario != "ii"]
-    values = {
-        what: [mean_db(measured, shown, c, "tv-dict", what) for c in captures]
-        for what in ("luma_psnr_db", CHROMA)
-    }
-    if any(value is None for column in values.values() for value in column):
-        return None
-    figure, (axes,) = sheet(1, 6.4)
-    at = np.arange(len(captures))
-    levels = [[v for v in column if v is not None] for column in values.values()]
-    for shift, level, colour, label in (
-        (-0.2, levels[0], "#7a869a", "brightness"),
-        (0.2, levels[1], "#c2410c", "colour (mean of two chrominances)"),
+    at, groups = np.arange(len(captures)), []
+    for what, shift, colour, label in (
+        ("luma_psnr_db", -0.2, "#7a869a", "brightness"),
+        (CHROMA, 0.2, "#c2410c", "colour (mean of two chrominances)"),
     ):
-        axes.bar(at + shift, level, 0.37, color=colour, label=label)
-        for x, value in zip(at + shift, level, strict=True):
-            axes.text(x, value, f"{value:.1f}", ha="center", va="bottom", fontsize=8)
+        values = [mean_db(measured, shown, c, "tv-dict", what) for c in captures]
+        known = [value for value in values if value is not None]
+        if len(known) < len(captures):
+            return None
+        groups.append((at + shift, known, {"color": colour, "label": label}))
+    figure, (axes,) = sheet(1, 6.4)
+    _bars(axes, groups, 0.37, room=3)
     axes.set_xticks(at, [f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures])
-    axes.set_ylim(np.floor(min(map(min, levels))) - 2, np.ceil(max(map(max, levels))) + 3)
-    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc="upper left", ncols=2)
+    axes.legend(**LEGEND, loc="upper left", ncols=2)
     titled(axes, "TV-Dict, Table III's scenes, noise-free")
     return figure
 
 
 def _masks(measured: Measured, scenes: Sequence[str]) -> Figure | None:
-    part = PARTS["figure8"]
-    shown = scenes_of(part, scenes)
-    found = {
-        method: [mean_db(measured, shown, c, method) for c in part.captures] for method in METHODS
-    }
-    found = {m: [v for v in values if v is not None] for m, values in found.items()}
-    found = {m: values for m, values in found.items() if len(values) == len(part.captures)}
+    captures = PARTS["figure8"].captures
+    shown = scenes_of(PARTS["figure8"], scenes)
+    found = {}
+    for method in METHODS:
+        values = [mean_db(measured, shown, capture, method) for capture in captures]
+        known = [value for value in values if value is not None]
+        if len(known) == len(captures):
+            found[method] = known
     if not found:
         return None
     figure, (axes,) = sheet(1, 6.4)
-    at = np.arange(len(part.captures))
-    width = 0.8 / len(found)
+    at, width = np.arange(len(captures)), 0.8 / len(found)
+    groups = []
     for i, (method, values) in enumerate(found.items()):
-        x = at + (i - (len(found) - 1) / 2) * width
-        axes.bar(x, values, width * 0.93, color=METHOD_COLOURS[method], label=METHOD_TITLES[method])
-        for place, value in zip(x, values, strict=True):
-            axes.text(place, value, f"{value:.1f}", ha="center", va="bottom", fontsize=8)
-    axes.set_xticks(at, [MASK_TITLES[c.mask] for c in part.captures])
-    levels = [value for values in found.values() for value in values]
-    axes.set_ylim(np.floor(min(levels)) - 2, np.ceil(max(levels)) + 2)
-    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, ncols=3, loc="upper left")
+        look = {"color": METHOD_COLOURS[method], "label": METHOD_TITLES[method]}
+        groups.append((at + (i - (len(found) - 1) / 2) * width, values, look))
+    _bars(axes, groups, width * 0.93)
+    axes.set_xticks(at, [MASK_TITLES[c.mask] for c in captures])
+    axes.legend(**LEGEND, ncols=3, loc="upper left")
     titled(axes, "One noisy CFA shot, Table II's scenes")
     return figure

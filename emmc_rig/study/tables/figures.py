@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
 from emmc_rig.pages.drawing import FAINT, INK, save_publication
-from emmc_rig.pages.pictures import Pictures, Piece, pictures_of, telling_lines, telling_pieces
+from emmc_rig.pages.pictures import Pictures, Piece, detailed_pieces, epipolar_lines, pictures_of
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (
@@ -139,7 +139,6 @@ def write_mosaic(
     save_publication(figure, path.with_suffix(".pdf"), f"{title}. {note}")
 
 
-Array = NDArray[np.floating]
 PIECE_SHARE, LEAST_PIECE_PX = 0.16, 28
 EPI_PX, EPI_ROW_PX = 80, 3
 MASK_CELLS = 24
@@ -161,16 +160,6 @@ def draw_figures(folder: Path, run: TablesSweep, results: Mapping[Cell, dict]) -
     return written
 
 
-def _piece_side(picture: Array) -> int:
-    return max(LEAST_PIECE_PX, round(PIECE_SHARE * picture.shape[1]))
-
-
-def _kept(run: TablesSweep, cell: Cell) -> Pictures:
-    found = Pictures.load(run.picture(cell))
-    assert found is not None, "the sweep leaves pictures for every cell of a figure"
-    return found
-
-
 def _name(capture: Capture) -> str:
     name = f"({capture.scenario}) {SCENARIOS[capture.scenario]} × {capture.shots}"
     return f"{name}, demosaiced first" if capture.demosaiced else name
@@ -182,12 +171,48 @@ def _db(result: Mapping, cell: Cell) -> str:
     return text if printed is None else f"{text} (paper: {printed:.2f})"
 
 
+class _Seen:
+    """The scene that a figure shows: its light field, true pictures, screen curve and pieces."""
+
+    def __init__(self, part: Part, run: TablesSweep, corner: bool = False, pieces: int = 1):
+        self.scene = scenes_of(part, run.library.names)[0]
+        self.run = run
+        self.truth = run.truth(Cell(self.scene, part.captures[0], ""))
+        self.lines = epipolar_lines(self.truth)
+        self.true = pictures_of(self.truth, self.lines)
+        picture = self.true.corner if corner else self.true.centre
+        self.curve = DisplayCurve.fitted_to(self.true.centre)
+        side = max(LEAST_PIECE_PX, round(PIECE_SHARE * picture.shape[1]))
+        self.pieces = detailed_pieces(picture, side, pieces)
+
+    def kept(self, cell: Cell) -> Pictures:
+        """Return the pictures that the sweep has left of a cell."""
+        found = Pictures.load(self.run.picture(cell))
+        assert found is not None, "the sweep leaves pictures for every cell of a figure"
+        return found
+
+    def titled(self, capture: Capture, method: str, results: Mapping[Cell, dict]):
+        """Return a cell's title with its PSNR, and its pictures."""
+        cell = Cell(self.scene, capture, method)
+        return f"{_name(capture)}\n{_db(results[cell], cell)}", self.kept(cell)
+
+    def corner(self, title: str, pictures: Pictures) -> Tile:
+        """Return the top-left view with the piece from it and from the centre view."""
+        (piece,) = self.pieces
+        corner, centre = screen(pictures.corner, self.curve), screen(pictures.centre, self.curve)
+        return Tile(title, corner, (piece.of(corner), piece.of(centre)), (piece,))
+
+    def centre(self, title: str, picture: Array) -> Tile:
+        """Return the centre view with all pieces."""
+        codes = screen(picture, self.curve)
+        cut = tuple(piece.of(codes) for piece in self.pieces)
+        return Tile(title, codes, cut, tuple(self.pieces))
+
+
 def _figure_5(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    (scene,) = scenes_of(part, run.library.names)
-    sensors = Sensors(run.settings.seed)
-    truth = run.library.light_field(scene, run.settings.cut)
+    seen, sensors = _Seen(part, run, corner=True), Sensors(run.settings.seed)
+    scene, truth, (piece,) = seen.scene, seen.truth, seen.pieces
     tiles: list[Tile | None] = []
-    (piece,) = telling_pieces(truth[0, 0], _piece_side(truth[0, 0]))
     # What reaches the sensor in the same total time, relative to one CFA shot.
     shown: list[tuple[str, Shots, Array, float]] = []
     for capture in part.captures:
@@ -241,31 +266,15 @@ def _stretched(picture: Array) -> NDArray[np.uint8]:
     return (np.sqrt(scaled) * 255 + 0.5).astype(np.uint8)
 
 
-def _view_tile(title: str, pictures: Pictures, piece: Piece, curve: DisplayCurve) -> Tile:
-    """Return the top-left view with the piece from it and from the centre view."""
-    corner, centre = screen(pictures.corner, curve), screen(pictures.centre, curve)
-    return Tile(title, corner, (piece.of(corner), piece.of(centre)), (piece,))
-
-
 def _figure_6(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    (scene,) = scenes_of(part, run.library.names)
-    truth = run.library.light_field(scene, run.settings.cut)
-    true = pictures_of(truth, telling_lines(truth))
-    curve = DisplayCurve.fitted_to(true.centre)
-    (piece,) = telling_pieces(true.corner, _piece_side(true.corner))
-    (method,) = part.methods
-    rows = []
+    seen, (method,), rows = _Seen(part, run, corner=True), part.methods, []
     for noisy, heading in ((False, "Noise-free"), (True, "With sensor noise")):
-        tiles: list[Tile | None] = [_view_tile("true\n", true, piece, curve)]
-        for capture in part.captures:
-            if capture.noisy == noisy:
-                cell = Cell(scene, capture, method)
-                title = f"{_name(capture)}\n{_db(results[cell], cell)}"
-                tiles.append(_view_tile(title, _kept(run, cell), piece, curve))
-        rows.append((heading, tiles))
+        captures = [capture for capture in part.captures if capture.noisy == noisy]
+        tiles = [seen.corner(*seen.titled(capture, method, results)) for capture in captures]
+        rows.append((heading, [seen.corner("true\n", seen.true), *tiles]))
     write_mosaic(
         path,
-        f"{part.title}: {scene}",
+        f"{part.title}: {seen.scene}",
         rows,
         "Top-left view; below, the framed piece of it, and the same place in the centre view.",
         tile_px=320,
@@ -273,12 +282,8 @@ def _figure_6(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, d
 
 
 def _figure_7(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    (scene,) = scenes_of(part, run.library.names)
-    (capture,) = part.captures
-    truth = run.library.light_field(scene, run.settings.cut)
-    y, x = telling_lines(truth)
-    true = pictures_of(truth, (y, x))
-    curve = DisplayCurve.fitted_to(true.centre)
+    seen, (capture,) = _Seen(part, run), part.captures
+    scene, (y, x), true, curve = seen.scene, seen.lines, seen.true, seen.curve
     length = min(EPI_PX, *true.centre.shape[:2])
     left, top = (_busiest(epi, length) for epi in (true.across, true.down))
 
@@ -304,7 +309,7 @@ def _figure_7(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, d
     shown = {"true": true}
     for method in part.methods:
         cell = Cell(scene, capture, method)
-        shown[f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"] = _kept(run, cell)
+        shown[f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"] = seen.kept(cell)
     named = list(shown.items())
     write_mosaic(
         path,
@@ -327,17 +332,13 @@ def _busiest(epi: Array, width: int) -> int:
 
 
 def _figure_8(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    scene = scenes_of(part, run.library.names)[0]
-    (method,) = part.pictured
-    truth = run.library.light_field(scene, run.settings.cut)
-    true = truth[0, 0]
-    curve = DisplayCurve.fitted_to(true)
-    (piece,) = telling_pieces(true, _piece_side(true))
-    codes = screen(true, curve)
+    seen, (method,) = _Seen(part, run, corner=True), part.pictured
+    scene, curve, (piece,) = seen.scene, seen.curve, seen.pieces
+    codes = screen(seen.true.corner, curve)
     tiles: list[Tile | None] = [Tile("true\n", codes, (piece.of(codes),), (piece,))]
     for capture in part.captures:
         cell = Cell(scene, capture, method)
-        found = screen(_kept(run, cell).corner, curve)
+        found = screen(seen.kept(cell).corner, curve)
         cells = MASKS[capture.mask].draw(1, MASK_CELLS, MASK_CELLS, 1.0)[0]
         pattern = (cells * 255 + 0.5).astype(np.uint8)
         title = f"{MASK_TITLES[capture.mask]}\n{results[cell]['psnr_db']:.2f} dB"
@@ -351,53 +352,34 @@ def _figure_8(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, d
     )
 
 
-def _centre_tile(title: str, picture: Array, pieces: Sequence[Piece], curve: DisplayCurve) -> Tile:
-    codes = screen(picture, curve)
-    return Tile(title, codes, tuple(piece.of(codes) for piece in pieces), tuple(pieces))
-
-
 def _figure_9(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    (scene,) = scenes_of(part, run.library.names)
-    truth = run.library.light_field(scene, run.settings.cut)
-    true = pictures_of(truth, telling_lines(truth)).centre
-    curve = DisplayCurve.fitted_to(true)
-    pieces = telling_pieces(true, _piece_side(true), 2)
-    rows = []
+    seen, rows = _Seen(part, run, pieces=2), []
     for method in part.methods:
-        tiles: list[Tile | None] = [_centre_tile("true\n", true, pieces, curve)]
+        tiles = [seen.centre("true\n", seen.true.centre)]
         for capture in part.captures:
-            cell = Cell(scene, capture, method)
-            title = f"{_name(capture)}\n{_db(results[cell], cell)}"
-            tiles.append(_centre_tile(title, _kept(run, cell).centre, pieces, curve))
+            title, pictures = seen.titled(capture, method, results)
+            tiles.append(seen.centre(title, pictures.centre))
         rows.append((METHOD_TITLES[method], tiles))
     note = "Centre view, noise-free; below, the framed pieces."
-    write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=300)
+    write_mosaic(path, f"{part.title}: {seen.scene}", rows, note, tile_px=300)
 
 
 def _figure_10(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
-    (scene,) = scenes_of(part, run.library.names)
-    (method,) = part.methods
-    truth = run.library.light_field(scene, run.settings.binned_cut)
-    true = pictures_of(truth, telling_lines(truth)).centre
-    curve = DisplayCurve.fitted_to(true)
-    pieces = telling_pieces(true, _piece_side(true), 2)
+    seen, (method,) = _Seen(part, run, pieces=2), part.methods
+    truth, true = seen.truth, seen.true.centre
     found: dict[bool, list[Tile | None]] = {False: [], True: []}
     for capture in part.captures:
-        cell = Cell(scene, capture, method)
-        title = f"{_name(capture)}\n{_db(results[cell], cell)}"
+        title, pictures = seen.titled(capture, method, results)
         several = capture.shots > (3 if capture.scenario == "i" else 1)
-        found[several].append(_centre_tile(title, _kept(run, cell).centre, pieces, curve))
+        found[several].append(seen.centre(title, pictures.centre))
     small = truth[2, 2].reshape(truth.shape[2] // 2, 2, truth.shape[3] // 2, 2, 3).mean((1, 3))
-    seen = cv2.resize(small, true.shape[1::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    large = cv2.resize(small, true.shape[1::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     rows = [
-        ("One image", [_centre_tile("true\n", true, pieces, curve), *found[False]]),
-        (
-            "Four images",
-            [_centre_tile("true, at the pixels' size\n", seen, pieces, curve), *found[True]],
-        ),
+        ("One image", [seen.centre("true\n", true), *found[False]]),
+        ("Four images", [seen.centre("true, at the pixels' size\n", large), *found[True]]),
     ]
     note = "Centre view, noise-free, one pixel sums 2x2 samples; below, the framed pieces."
-    write_mosaic(path, f"{part.title}: {scene}", rows, note, tile_px=340)
+    write_mosaic(path, f"{part.title}: {seen.scene}", rows, note, tile_px=340)
 
 
 _DRAW: dict[str, Callable[[Path, Part, TablesSweep, Mapping[Cell, dict]], None]] = {

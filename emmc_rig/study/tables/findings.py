@@ -62,7 +62,7 @@ Gain = Callable[[SceneFigures, str], float]
 class Claim:
     """What the paper says, where, and what is compared here.
 
-    part: whose scenes. judged_by: the paper's method. methods: all that it is evaluated for.
+    part: whose scenes. by_method: the paper's method. methods: all that it is evaluated for.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Claim:
     compares: str
     part: str
     gain: Gain
-    judged_by: str = "tv-dict"
+    by_method: str = "tv-dict"
     methods: tuple[str, ...] = METHODS
 
 
@@ -84,16 +84,16 @@ class Finding:
     printed: Spread | None
 
     @property
-    def judged(self) -> Spread | None:
-        """What the judging method found; None when its cells were not measured."""
-        return self.ours.get(self.claim.judged_by)
+    def spread(self) -> Spread | None:
+        """The difference by the paper's method; None when its cells were not measured."""
+        return self.ours.get(self.claim.by_method)
 
     @property
     def verdict(self) -> str:
         """In words."""
-        if self.judged is None:
+        if self.spread is None:
             return "not measured"
-        return "holds" if self.judged.holds else "does not hold"
+        return "holds" if self.spread.holds else "does not hold"
 
 
 def _over(better: Sequence[Capture], worse: Sequence[Capture], what: str = "psnr_db") -> Gain:
@@ -236,7 +236,7 @@ CLAIMS = (
         "Figure 8: the worse of RGBW and binary less the better of uniform and Gaussian colour",
         "figure8",
         _over([_MASKED["rgbw"], _MASKED["binary"]], [_MASKED["uniform"], _MASKED["gaussian"]]),
-        judged_by="dict-admm",
+        by_method="dict-admm",
     ),
     *(
         Claim(
@@ -262,7 +262,9 @@ CLAIMS = (
 )
 
 
-def spread(measured: Measured, claim: Claim, scenes: Sequence[str], method: str) -> Spread | None:
+def spread_of(
+    measured: Measured, claim: Claim, scenes: Sequence[str], method: str
+) -> Spread | None:
     """Return a claim's difference over the scenes that were measured; None without any."""
     gains = []
     for scene in scenes:
@@ -289,16 +291,16 @@ def printed_figures() -> dict[Cell, dict[str, object]]:
     }
 
 
-def judge(measured: Measured, scenes: Sequence[str]) -> list[Finding]:
+def findings_from(measured: Measured, scenes: Sequence[str]) -> list[Finding]:
     """Return all claims tested on cells of the given scenes."""
     printed = printed_figures()
     findings = []
     for claim in CLAIMS:
         about = scenes_of(PARTS[claim.part], scenes)
-        found = {method: spread(measured, claim, about, method) for method in claim.methods}
+        found = {method: spread_of(measured, claim, about, method) for method in claim.methods}
         ours = {method: value for method, value in found.items() if value is not None}
-        theirs = spread(
-            printed, claim, scenes_of(PARTS[claim.part], list(paper.TITLES)), claim.judged_by
+        theirs = spread_of(
+            printed, claim, scenes_of(PARTS[claim.part], list(paper.TITLES)), claim.by_method
         )
         findings.append(Finding(claim, ours, theirs))
     return findings

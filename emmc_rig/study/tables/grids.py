@@ -114,13 +114,13 @@ def _papers_means(
     lines = []
     for heads, captures, methods in rows:
         for method in methods:
-            pairs = []
-            for capture in captures:
-                cells = [Cell(scene, capture, method) for scene in scenes]
-                values = [cell.paper_psnr_db for cell in cells]
-                known = [value for value in values if value is not None]
-                pairs.append(Pair(None, float(np.mean(known)) if known else None))
-            if any(pair.paper is not None for pair in pairs):
+            printed = [
+                [Cell(scene, capture, method).paper_psnr_db for scene in scenes]
+                for capture in captures
+            ]
+            known = [[value for value in column if value is not None] for column in printed]
+            if any(known):
+                pairs = (Pair(None, float(np.mean(some)) if some else None) for some in known)
                 heading = (f"paper's {len(scenes)}", *heads, METHOD_TITLES[method])
                 lines.append(Line(heading, tuple(pairs), True))
     return lines

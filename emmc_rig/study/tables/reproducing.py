@@ -21,7 +21,7 @@ from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import METHOD_TITLES, PARTS, Cell, Part, cells_of, chosen_parts
 from emmc_rig.study.tables.charts import draw_charts
 from emmc_rig.study.tables.figures import draw_figures
-from emmc_rig.study.tables.findings import Finding, judge
+from emmc_rig.study.tables.findings import Finding, findings_from
 from emmc_rig.study.tables.grids import Grid, Pair, grids
 from emmc_rig.study.tables.library import Given, LeaveOneOut, Library, Source, scene_specs
 from reconstruction.methods import METHODS
@@ -142,15 +142,15 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
     table.add_column("finding")
     missing = 0
     for finding in findings:
-        judged, printed = finding.judged, finding.printed
-        if judged is None:
+        spread, printed = finding.spread, finding.printed
+        if spread is None:
             missing += 1
             continue
-        judge = finding.claim.judged_by
-        by_method = "" if judge == "tv-dict" else f" [dim](by {METHOD_TITLES[judge]})[/]"
+        method = finding.claim.by_method
+        by_method = "" if method == "tv-dict" else f" [dim](by {METHOD_TITLES[method]})[/]"
         table.add_row(
             Text(finding.verdict, style=COLOURS[finding.verdict]),
-            f"{judged}, {judged.holding}/{judged.scenes}",
+            f"{spread}, {spread.holding}/{spread.scenes}",
             "-" if printed is None else f"{printed.mean_db:+.2f}",
             finding.claim.says + by_method,
         )
@@ -205,7 +205,7 @@ def run_tables(
         results = sweep.measure(watcher)
         watcher.begin("write the tables and figures", None)
         found = grids(parts, results, library.names)
-        findings = judge(results, library.names)
+        findings = findings_from(results, library.names)
         outcome = TablesOutcome(found, findings, folder / PAGE, clock() - started)
         more = {
             **{f"Scene {name}": spec for name, spec in library.specs.items()},
@@ -265,23 +265,21 @@ def _metrics(sweep: TablesSweep, dictionaries: Sequence[str], outcome: TablesOut
 
 
 def _described_finding(finding: Finding) -> dict[str, object]:
-    judged = finding.judged
-    spread = (
-        {}
-        if judged is None
-        else {
-            "by_db": judged.mean_db,
-            "lowest_scene_db": judged.low_db,
-            "highest_scene_db": judged.high_db,
-            "scenes": judged.scenes,
-            "scenes_holding": judged.holding,
+    figures = {}
+    if finding.spread is not None:
+        spread = finding.spread
+        figures = {
+            "by_db": spread.mean_db,
+            "lowest_scene_db": spread.low_db,
+            "highest_scene_db": spread.high_db,
+            "scenes": spread.scenes,
+            "scenes_holding": spread.holding,
         }
-    )
     return {
         "name": finding.claim.name,
         "says": finding.claim.says,
         "verdict": finding.verdict,
-        **spread,
+        **figures,
         "paper_db": None if finding.printed is None else finding.printed.mean_db,
     }
 

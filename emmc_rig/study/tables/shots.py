@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import build_imaging_matrix, pixel_light
+from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.tables.cells import Capture
@@ -96,20 +96,14 @@ class Sensors:
 
         The noise depends on the seed and the scene's name only, not on what was taken before.
         """
-        camera = capture.camera()
         size = light_field.shape[2], light_field.shape[3]
         psi = self.psi(capture, size)
         clean = psi.forward(light_field)
         frames, usable, sigma = clean, np.ones(clean.shape, dtype=bool), 0.0
         if capture.noisy:
-            noise = camera.sensor.noise
-            light, exposures_s = pixel_light(camera, size), camera.exposures_s()[:, None, None]
             rng = np.random.default_rng([self._seed, *scene.encode()])
-            frames_dn = noise.expose_dn(clean, exposures_s, light, rng)
-            usable = ~noise.saturated(frames_dn)
-            frames = noise.normalise(frames_dn, exposures_s, light)
-            variance = noise.variance(frames, exposures_s, light)
-            sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
+            found = capture.camera().read_out(clean, rng)
+            frames, usable, sigma = found.readings, found.usable, found.noise_sigma
         quality = psnr_db(frames, clean)
         if capture.demosaiced:
             frames = demosaiced_rggb(frames[0])

@@ -1,7 +1,7 @@
-"""The paper's full-splitting algorithm (Section VI-B, eq. 10-13), exactly as written: a reference.
+"""The paper's full-splitting algorithm (Section VI-B, eq. 10-13), in plain NumPy: a reference.
 
-It takes the gradients of the misfits of frames and patches where `tv` takes their exact proximal
-step, reaches the same minimiser, and needs many times the steps.
+It takes the gradients of the misfits of frames and patches where `reconstruction.tv` takes their
+exact proximal step, reaches the same minimiser, and needs many times the steps.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy import sparse
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -23,7 +25,7 @@ from reconstruction.choices import (
     first_light_field,
     smooth_guess,
 )
-from reconstruction.differences import adjoint, gradient, norm_squared
+from reconstruction.differences import fitting_indices, norm_squared
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
@@ -31,9 +33,52 @@ from reconstruction.problem import Problem, colour_metric
 from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
+AXIS = (3, 2, 1, 0)
+"""Entries of a multi-index, x y u v, as axes of (v, u, y, x, c)."""
 METHOD = "full-splitting"
 MARGIN = 0.99
 """Of the largest step sizes allowed, what is taken where the settings leave it open."""
+
+
+def from_patches(positions, patches, weights, shape):
+    """Return the term of patches (v, u, y, x, c) at their corners; weights: None counts each once.
+
+    The paper's P and its weights: what covers a sample is averaged, as each patch weighs.
+    """
+    total, weight = np.zeros(shape, np.float32), np.zeros(shape[2:4], np.float32)
+    for (y, x), patch, share in zip(
+        positions, patches, weights or [1.0] * len(patches), strict=True
+    ):
+        place = np.s_[y : y + patch.shape[2], x : x + patch.shape[3]]
+        weight[place] += share
+        total[(slice(None), slice(None), *place)] += np.float32(share)[..., None] * patch
+    return PatchTerm(total / np.where(weight > 0, weight, 1)[..., None], weight)
+
+
+@cache
+def difference_matrix(shape, order):
+    """Return the derivatives of flattened light fields as a sparse matrix, index by index."""
+    blocks = []
+    for index in fitting_indices(order, shape):
+        parts = [sparse.eye_array(length) for length in shape]
+        for entry, axis in zip(index, AXIS, strict=True):
+            inside = sparse.csr_array(np.diff(np.eye(shape[axis]), entry, axis=0))
+            inside.resize((shape[axis], shape[axis]))
+            parts[axis] = inside
+        blocks.append(reduce(sparse.kron, parts))
+    return sparse.vstack(blocks).tocsr()
+
+
+def gradient(light_field, order):
+    """Return all derivatives (index, v, u, y, x, c) that fit somewhere, 0 where they do not."""
+    matrix = difference_matrix(light_field.shape, order)
+    return (matrix @ light_field.ravel()).reshape(-1, *light_field.shape)
+
+
+def adjoint(derivatives, order):
+    """Return the adjoint of `gradient`; values where a derivative does not fit do not count."""
+    shape = derivatives.shape[1:]
+    return (difference_matrix(shape, order).T @ derivatives.ravel()).reshape(shape)
 
 
 class FullSplittingSettings(Settings):

@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pickle
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
@@ -43,7 +45,6 @@ from reconstruction.tiles import (
     Block,
     Grid,
     Place,
-    SavedPsi,
     SolvedBlock,
     Survey,
     assembled,
@@ -53,6 +54,7 @@ from reconstruction.tiles import (
     solve_block,
     summed_up,
     surveyed,
+    within,
 )
 from reconstruction.verdict.blocks import judged_together
 from reconstruction.verdict.evidence import Evidence
@@ -80,7 +82,7 @@ class Capture:
     @cached_property
     def psi(self) -> SavedPsi:
         """Psi, read window by window."""
-        return SavedPsi(self.psi_path)
+        return open_psi(self.psi_path)
 
     def opened_dictionary(self) -> Dictionary | None:
         """Return the dictionary where the method needs one."""
@@ -154,14 +156,15 @@ def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
         return _sha256(partial)
 
 
-def survey_task(capture: Capture) -> dict[str, Any]:
-    """Settle in a worker what holds for the whole capture; return it as plain data."""
+def survey_task(capture: Capture) -> tuple[dict[str, Any], float]:
+    """Settle in a worker what holds for the whole capture; return it as plain data, and its CPU."""
+    started = time.process_time()
     readings, usable = _frames(capture.kept / FRAMES, np.s_[:, :, :])
     survey = surveyed(
         capture.method, capture.psi, readings, capture.noise_sigma, usable,
         capture.opened_dictionary(), capture.settings,
     )  # fmt: skip
-    return _plain(survey)
+    return _plain(survey), time.process_time() - started
 
 
 def _plain(survey: Survey) -> dict[str, Any]:
@@ -183,7 +186,7 @@ def block_task(task: BlockTask) -> None:
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
-    started = time.perf_counter()
+    started, cpu = time.perf_counter(), time.process_time()
     try:
         solved = _solved(task)
     except ERRORS as fault:
@@ -203,10 +206,20 @@ def block_task(task: BlockTask) -> None:
                 for key in ("status", "advice", "steps", "parameters", "left_out")
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
+            "variance": _variance(task.block, solved.arrays),
             "seconds": time.perf_counter() - started,
+            "cpu_seconds": time.process_time() - cpu,
             "peak_mib": peak_memory_mib(),
         },
     )
+
+
+def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
+    """Return the sum of the light field's variance over a block's inner part; None without one."""
+    if "sigma" not in arrays:
+        return None
+    inner = arrays["sigma"][:, :, *within(block.inner, block.part)]
+    return float(np.sum(np.square(inner, dtype=np.float64)))
 
 
 def _solved(task: BlockTask) -> SolvedBlock:
@@ -227,11 +240,13 @@ def _solved(task: BlockTask) -> SolvedBlock:
 
 @dataclass(frozen=True)
 class DoneBlock:
-    """What a block says of itself, without its arrays."""
+    """What a block says of itself, without its arrays; variance: see `_variance`."""
 
     result: Reconstruction
     verdict: Verdict | None
+    variance: float | None
     seconds: float
+    cpu_seconds: float
     peak_mib: float
 
 
@@ -239,6 +254,8 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     """Return a block that is done and whole on the disk, else None."""
     kept = _read_json(task.path("json"))
     if kept is None or kept.get("fingerprint") != task.capture.fingerprint:
+        return None
+    if "cpu_seconds" not in kept:  # of an earlier version
         return None
     if kept.get("sha256") != _sha256(task.path("h5")):
         return None
@@ -254,7 +271,8 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     verdict = (
         None if kept["evidence"] is None else verdict_from(Evidence.from_dict(kept["evidence"]))
     )
-    return DoneBlock(result, verdict, kept["seconds"], kept["peak_mib"])
+    measured = (kept[key] for key in ("variance", "seconds", "cpu_seconds", "peak_mib"))
+    return DoneBlock(result, verdict, *measured)
 
 
 def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey:
@@ -268,13 +286,16 @@ def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey
             path.unlink()
         _write_arrays(capture.kept / FRAMES, {"readings": frames.readings, "usable": frames.usable})
         if alone:
-            found = _plain(Survey.of_one_block(capture.settings, len(frames.readings)))
+            found, cpu_s = _plain(Survey.of_one_block(capture.settings, len(frames.readings))), 0.0
         else:
-            ((_, found),) = pool.run(survey_task, [capture])
+            ((_, (found, cpu_s)),) = pool.run(survey_task, [capture])
         survey = _survey(found)
         readings, usable = survey.applied(frames.readings, frames.usable)
         sha256 = _write_arrays(capture.kept / FRAMES, {"readings": readings, "usable": usable})
-        job = {"fingerprint": capture.fingerprint, "frames": sha256, "survey": found}
+        job = {
+            "fingerprint": capture.fingerprint, "frames": sha256, "survey": found,
+            "survey_cpu_seconds": cpu_s,
+        }  # fmt: skip
         _write_json(capture.kept / JOB, job)
     survey = _survey(job["survey"])
     if _sha256(capture.kept / FRAMES) != job["frames"]:
@@ -301,15 +322,30 @@ class Blocks:
         """Return what metrics.json has of the blocks.
 
         peak_gib: the largest resident memory of a worker, workers: at a time, program_peak_gib: of
-        this process, all measured.
+        this process, task_bytes: that travel to a worker for a block, all measured.
         """
+        job = _read_json(self.kept / JOB) or {}
         return {
             "blocks": list(self.grid.shape),
+            "stated_db": self.stated_db,
             "block_seconds": [one.seconds for one in self.done.values()],
+            "block_cpu_seconds": [one.cpu_seconds for one in self.done.values()],
+            "survey_cpu_seconds": job.get("survey_cpu_seconds"),
+            "task_bytes": len(pickle.dumps(next(iter(self.tasks.values())))),
             "workers": self.workers,
             "peak_gib": max(one.peak_mib for one in self.done.values()) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
+
+    @property
+    def stated_db(self) -> float | None:
+        """The PSNR that the deviations of all blocks stand for; None where one has none."""
+        each = [one.variance for one in self.done.values()]
+        views = int(np.prod(next(iter(self.tasks.values())).capture.psi.views))
+        if None in each:
+            return None
+        mean = sum(one for one in each if one is not None) / (views * np.prod(self.grid.size))
+        return float(-10 * np.log10(mean))
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""

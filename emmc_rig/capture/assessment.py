@@ -1,8 +1,8 @@
-"""Are the shots so far enough? The PSNR they are stated to give, and the shot to take next if not.
+"""Assessment of the shots so far: the PSNR that they are stated to give, and the shot to take next.
 
 The method's own deviation, calibrated on readings that it kept from the fit, says how far off the
-light field is. For every shot that could follow, the error is foretold from its Psi and from what
-the scene was found to be made of (`reconstruction.adaptive.planning`), before it is taken.
+light field is. For every shot that could follow, the error is predicted from its Psi and from the
+surfaces and textures that were estimated (`reconstruction.adaptive.planning`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LEAST_GAIN_DB = 0.1
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Assessment:
     """What is known after some shots.
 
     expected_db: the stated PSNR to expect with each further shot. next: the one to take; None: no
@@ -51,31 +51,31 @@ def stated_psnr_db(result: Reconstruction) -> float:
     return float(-10 * np.log10(np.mean(np.square(result.maps["sigma"], dtype=np.float64))))
 
 
-def judged(
+def assessed(
     psi: ImagingMatrix,
     result: Reconstruction,
     shots: Sequence[int],
     noise_sigma: float,
     target_db: float,
     clock: Callable[[], float] = time.perf_counter,
-) -> Judgement:
+) -> Assessment:
     """Return whether some shots are enough, and which should follow.
 
     psi: of every planned shot. result: the light field that `shots` gave, with maps of its sigma,
-    disparity and texture. Raises AppError or ReconstructionError where it is too small to judge.
+    disparity and texture. Raises AppError or ReconstructionError where it is too small.
     """
     began = clock()
     stated_db = stated_psnr_db(result)
     free = [shot for shot in range(psi.shots) if shot not in shots]
 
-    def told(why: str, expected: Mapping[int, float] | None = None, next: int | None = None):
+    def assessment(why: str, expected: Mapping[int, float] | None = None, next: int | None = None):
         seconds = result.seconds + clock() - began
-        return Judgement(stated_db, expected or {}, next, why, result.advice, seconds)
+        return Assessment(stated_db, expected or {}, next, why, result.advice, seconds)
 
     if stated_db >= target_db:
-        return told("the target is reached")
+        return assessment("the target is reached")
     if not free:
-        return told("every planned shot is taken")
+        return assessment("every planned shot is taken")
     views_v, views_u = result.light_field.shape[:2]
     errors = expected_errors(
         psi,
@@ -91,5 +91,5 @@ def judged(
     best = free[int(gains_db.argmax())]
     if expected[best] - stated_db < LEAST_GAIN_DB:
         why = f"no further shot is expected to gain {LEAST_GAIN_DB:g} dB"
-        return told(why, expected)
-    return told(f"expected to give {expected[best]:.2f} dB", expected, best)
+        return assessment(why, expected)
+    return assessment(f"expected to give {expected[best]:.2f} dB", expected, best)

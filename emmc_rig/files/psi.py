@@ -1,0 +1,158 @@
+"""Psi on the disk, read window by window: an HDF5 file, or a Zarr group of shards."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.files.frames import PSI
+from emmc_rig.files.shards import CHUNK, SHARD, created_group, opened_group
+from emmc_rig.model.errors import SensingError
+from emmc_rig.model.reading import shown_path, stored_arrays
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
+
+PSI_GROUP = "psi.zarr"
+AGAIN = "measure Psi again"
+NO_COLOUR = 255
+"""Where the colours of a Zarr group are missing."""
+
+
+class SavedPsi:
+    """The imaging matrix in a file, read window by window.
+
+    The file's checksum is not verified, which would need all of it: `verify` does. Raises
+    SensingError when the file is no imaging matrix.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with self._opened() as stored:
+            weights = stored.dataset("weights")
+            self.shape = weights.shape
+            self.views = weights.shape[1], weights.shape[2]
+            self.size = weights.shape[3], weights.shape[5]
+            self.binning = int(np.asarray(stored.attributes["binning"]))
+            self.checksum = str(stored.attributes["sha256"])
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]:
+        """(shot, pixel_y, pixel_x)."""
+        rows, columns = (length // self.binning for length in self.size)
+        return self.shape[0], rows, columns
+
+    def verify(self) -> None:
+        """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
+        with self._opened() as stored:
+            camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
+            digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{camera}".encode())
+            for place in np.ndindex(self.shape[:3]):
+                plane = self._whole(weights[place])
+                digest.update(np.ascontiguousarray(plane).view(np.uint8).data)
+            colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
+            colour = self._whole(colour)
+            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
+        if digest.hexdigest() != self.checksum:
+            raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
+
+    def load(self) -> ImagingMatrix:
+        """Return all of it, verified."""
+        return ImagingMatrix.load(self._path)
+
+    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+        """Return the imaging matrix of some samples; the slices are multiples of k."""
+        with self._opened() as stored:
+            weights = stored.dataset("weights")[:, :, :, rows, :, columns]
+            colour = None
+            if "colour" in stored:
+                colour = self._whole(stored.dataset("colour")[:, rows, columns])
+            camera = str(stored.attributes["camera"])
+            return ImagingMatrix(self._whole(weights), colour, self.binning, camera)
+
+    def _whole(self, values: NDArray) -> NDArray:
+        """Return values that were read, after a check that none is missing."""
+        return values
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        with stored_arrays(self._path, SensingError, AGAIN) as stored:
+            if stored.attributes.get("format") != FORMAT or "weights" not in stored:
+                raise SensingError(f"{self._path}: not an imaging matrix of this program")
+            yield stored
+
+
+class ShardedPsi(SavedPsi):
+    """The imaging matrix in a Zarr group; a shard holds all views of SHARD x SHARD samples."""
+
+    def load(self) -> ImagingMatrix:
+        """Return all of it, verified."""
+        self.verify()
+        return self.window(*(slice(0, length) for length in self.size))
+
+    def _whole(self, values: NDArray) -> NDArray:
+        gone = np.isnan(values) if values.dtype.kind == "f" else values == NO_COLOUR
+        if gone.any():
+            raise SensingError(
+                f"{shown_path(self._path)}: a file of it is missing; copy the folder again, or "
+                f"{AGAIN}"
+            )
+        return values
+
+    @contextmanager
+    def _opened(self) -> Iterator[_Group]:
+        group = opened_group(self._path, SensingError, AGAIN)
+        if group.attrs.get("format") != FORMAT or "weights" not in group:
+            raise SensingError(f"{shown_path(self._path)}: not an imaging matrix of this program")
+        yield _Group(group)
+
+
+class _Group:
+    """A Zarr group, read as `StoredArrays` are."""
+
+    def __init__(self, group: Any) -> None:
+        self._group, self.attributes = group, group.attrs
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._group
+
+    def dataset(self, name: str) -> Any:
+        return self._group[name]
+
+    def array(self, name: str) -> NDArray:
+        return np.asarray(self._group[name][...])
+
+
+def open_psi(path: Path) -> SavedPsi:
+    """Return a saved imaging matrix, not read; raises SensingError when there is none."""
+    return ShardedPsi(path) if path.is_dir() else SavedPsi(path)
+
+
+def psi_beside(folder: Path) -> Path:
+    """Return where a folder of frames has its imaging matrix."""
+    return folder / (PSI_GROUP if (folder / PSI_GROUP).is_dir() else PSI)
+
+
+def save_shards(psi: ImagingMatrix, folder: Path) -> None:
+    """Write Psi as a Zarr group into a folder that must not exist; raises AppError without Zarr."""
+    group = created_group(folder)
+    shots, v, u, _, stored, _ = psi.weights.shape
+    arrays = {
+        "weights": (psi.weights, (1, 1, 1, CHUNK, stored, CHUNK),
+                    (shots, v, u, SHARD, stored, SHARD), np.nan),
+        "colour": (psi.colour, (1, CHUNK, CHUNK), (shots, SHARD, SHARD), NO_COLOUR),
+    }  # fmt: skip
+    for name, (values, chunks, shards, missing) in arrays.items():
+        if values is not None:
+            made = group.create_array(
+                name, shape=values.shape, dtype=values.dtype, chunks=chunks, shards=shards,
+                fill_value=missing,
+            )  # fmt: skip
+            made[...] = values
+    group.attrs.update(
+        format=FORMAT, binning=psi.binning, camera=psi.camera_json, sha256=psi.checksum()
+    )

@@ -1,0 +1,91 @@
+"""Numbers set in a YAML text, everything else of it left as it stands: comments, order, layout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import yaml
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.reading import parse_yaml
+
+Key = tuple[str | int, ...]
+DIGITS = 6
+
+
+def with_values(text: str, values: Mapping[Key, float], source: str) -> str:
+    """Return the text with these numbers, each named by its keys and places from the top.
+
+    source: the file's name, for messages. Raises AppError for a text that cannot be edited so
+    that nothing else changes.
+    """
+    wanted = parse_yaml(text, source, AppError)
+    for key, value in values.items():
+        number = _written(value)
+        wanted = _set(wanted, key, float(number))
+        text = _with_value(text, key, number)
+        try:
+            same = parse_yaml(text, source, AppError) == wanted
+        except AppError:
+            same = False
+        if not same:
+            raise AppError(
+                f"{source}: cannot be edited here; write {'.'.join(map(str, key))}: {number}"
+            )
+    return text
+
+
+def _written(value: float) -> str:
+    return np.format_float_positional(value, precision=DIGITS, trim="0")
+
+
+def _set(data: Any, key: Key, value: float) -> Any:
+    """Return a copy of plain data with a value at its place, mappings made that are missing."""
+    if not key:
+        return value
+    first, rest = key[0], key[1:]
+    if isinstance(data, list):
+        return [_set(one, rest, value) if i == first else one for i, one in enumerate(data)]
+    found = data if isinstance(data, dict) else {}
+    return {**found, first: _set(found.get(first), rest, value)}
+
+
+def _with_value(text: str, key: Key, number: str) -> str:
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    for depth, name in enumerate(key):
+        found = _child(node, name)
+        if found is None:
+            return _inserted(text, node, key[depth:], number)
+        node = found
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style:
+        return text
+    return text[: node.start_mark.index] + number + text[node.end_mark.index :]
+
+
+def _child(node: yaml.Node | None, name: str | int) -> yaml.Node | None:
+    if isinstance(node, yaml.SequenceNode) and isinstance(name, int):
+        return node.value[name]
+    if isinstance(node, yaml.MappingNode):
+        return next((value for key, value in node.value if key.value == name), None)
+    return None
+
+
+def _inserted(text: str, node: yaml.Node | None, key: Key, number: str) -> str:
+    """Return the text with what is missing below a node: a line in a block, else in its braces."""
+    line = number
+    for name in reversed(key[1:]):
+        line = f"{{{name}: {line}}}"
+    line = f"{key[0]}: {line}"
+    if isinstance(node, yaml.MappingNode) and node.value:
+        if node.flow_style:
+            return f"{text[: node.start_mark.index + 1]}{line}, {text[node.start_mark.index + 1 :]}"
+        if node.start_mark.column == 0:
+            return f"{text.rstrip()}\n{line}\n"
+        first = node.value[0][0].start_mark
+        return f"{text[: first.index]}{line}\n{' ' * first.column}{text[first.index :]}"
+    if node is None:
+        return f"{text}{line}\n"
+    start, end = node.start_mark.index, node.end_mark.index
+    return f"{text[:start]}{' ' if start == end else ''}{{{line}}}{text[end:]}"

@@ -1,0 +1,84 @@
+"use strict";
+// What the pages share: one state that the server pushes, actions, and texts that are written once.
+const $ = (id) => document.getElementById(id);
+let state = { version: 0 };
+
+async function ask(path, options) {
+  const answer = await fetch(path, { cache: "no-store", ...options });
+  if (!answer.ok) throw new Error((await answer.text()).trim());
+  return answer;
+}
+
+// Returns what the action answers, null where it was refused.
+async function act(name, values = {}) {
+  try {
+    const answer = await ask("do/" + name, {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(values),
+      priority: name === "stop" ? "high" : "auto",
+    });
+    complain("");
+    return await answer.json();
+  } catch (fault) { complain(fault.message); return null; }
+}
+
+let complaint = "";
+function complain(text) { complaint = text; drawTrouble(); }
+
+// What is announced is written only when it changes: a screen reader reads it again otherwise.
+function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
+
+function drawTrouble() {
+  const lines = [complaint, ...Object.values(state.trouble || {})].filter(Boolean);
+  $("trouble").hidden = lines.length === 0;
+  write("trouble", lines.join("; "));
+}
+
+// Draw every newer state; what is seen of the light field follows it.
+function follow(draw) {
+  const source = new EventSource("events");
+  source.onmessage = (event) => {
+    const before = state;
+    state = JSON.parse(event.data);
+    $("lost").hidden = true;
+    $("read-only").hidden = !state.read_only;
+    drawTrouble();
+    drawField();
+    draw(before);
+    showField();
+    if (state.ended) source.close();
+  };
+  source.onerror = () => { $("lost").hidden = false; };
+}
+
+function cell(kind, text, style = "") {
+  const made = document.createElement(kind);
+  made.textContent = text;
+  if (style) made.className = style;
+  return made;
+}
+
+function heading(text) {
+  const made = cell("th", text);
+  made.scope = "row";
+  return made;
+}
+
+function fill(parent, children) { parent.replaceChildren(...children); }
+
+function button(text, call, label, off = false) {
+  const made = cell("button", text);
+  made.disabled = off;
+  if (label) { made.title = label; made.setAttribute("aria-label", label); }
+  made.addEventListener("click", call);
+  return made;
+}
+
+function number(field) {
+  const value = Number(field.value.replace(",", "."));
+  return field.value.trim() === "" || Number.isNaN(value) ? field.value : value;
+}
+
+function percent(value, deviation) {
+  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(Math.max(100 * deviation, 1e-3)))));
+  return `${(100 * value).toFixed(digits)} \u00b1 ${(100 * deviation).toFixed(digits)} %`;
+}

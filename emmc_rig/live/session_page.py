@@ -1,0 +1,314 @@
+"""The page of a running capture: its frames, time left, pauses, the light field so far."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.errors import CalibrationError
+from drivers.raw import RawFrame
+from emmc_rig.capture.assessment import METHOD, stated_psnr_db
+from emmc_rig.capture.checks import Figures
+from emmc_rig.capture.control import Control
+from emmc_rig.capture.events import Event, EventWatcher
+from emmc_rig.capture.until import light_field_so_far
+from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.errors import AppError
+from emmc_rig.live.field_pictures import Pictures, drawn, field_pictures
+from emmc_rig.live.picture import View, encoded, picture
+from emmc_rig.live.server import Action, Picture, Pictured, Query
+from emmc_rig.model.errors import SensingError
+from emmc_rig.pages.session_sheet import small_jpeg, stored_jpeg
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.readings import Scale, session_scale
+from emmc_rig.session.session import Session
+from reconstruction.errors import ReconstructionError
+from reconstruction.result import Progress, Reconstruction
+
+SHOWN_FRAMES, SHOWN_MESSAGES = 300, 12
+PATIENCE_S = 10.0
+
+
+class _EndedError(Exception):
+    """The capture is over, and nobody waits for its light field any more."""
+
+
+class SessionPage(EventWatcher):
+    """A `emmc_rig.live.server.Page`, and the watcher of the capture that it shows.
+
+    folder: of the session. other: is told too. computes: reconstructs after each shot what is on
+    the disk; where the capture itself does (`--until`) its light field is shown.
+    """
+
+    files = ("session.html", "page.css", "common.js", "field.js", "session.js")
+    urgent = frozenset({"pause", "stop"})
+
+    def __init__(
+        self,
+        folder: Path,
+        control: Control,
+        other: CaptureWatcher | None = None,
+        computes: bool = True,
+    ) -> None:
+        super().__init__(self._heard, other)
+        self._folder, self._control, self._computes = folder, control, computes
+        self._changed = threading.Condition()
+        self._listeners: list[Callable[[], None]] = []
+        self._frames: dict[str, dict[str, Any]] = {}
+        self._small: dict[str, bytes] = {}
+        self._newest: tuple[int, RawFrame] | None = None
+        self._shots: set[int] = set()
+        self._scale: Scale | None = None
+        self._wanted, self._retaken = False, 0
+        self._pictures: Pictures | None = None
+        self._ending = threading.Event()
+        self._thread = threading.Thread(
+            target=self._reconstruct, name="page light field", daemon=True
+        )
+        self._state: dict[str, Any] = {
+            "version": 0,
+            "title": folder.name,
+            "step": "",
+            "paused": None,
+            "held": False,
+            "wish": "",
+            "done": 0,
+            "planned": 0,
+            "left": None,
+            "frame": 0,
+            "frames": [],
+            "taken": 0,
+            "messages": [],
+            "verdict": None,
+            "end": None,
+            "ended": False,
+            "light_field": None,
+            "trouble": {"light field": ""},
+        }
+        self.pictures: dict[str, Pictured] = {
+            "newest.jpg": self._newest_picture,
+            "frame.jpg": self._small_picture,
+            **field_pictures(lambda: self._pictures),
+        }
+        self.actions: dict[str, Action] = {
+            "pause": lambda: self._wish("pausing after this frame", control.pause),
+            "resume": lambda: self._wish("", control.resume),
+            "stop": lambda: self._wish("stopping after this frame", control.stop),
+            "retake": self._retake,
+            "plan": lambda: {"text": Session(folder).plan_yaml},
+            "preview": lambda text: {"changes": self._preview(text)},
+            "amend": self._amend,
+        }
+
+    def start(self) -> None:
+        """Begin to reconstruct."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let those who look know that the capture is over."""
+        self._ending.set()
+        self._publish(ended=True, step="", wish="")
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join(PATIENCE_S)
+
+    @property
+    def version(self) -> int:
+        """Grows with every change of the state."""
+        return self._state["version"]
+
+    def state(self) -> dict[str, Any]:
+        """Return what is known, plain data."""
+        with self._changed:
+            return dict(self._state)
+
+    def looked(self) -> None:
+        """Take no notice: the capture goes on whether somebody looks or not."""
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Let `listener` be called after every change, by whichever thread made it."""
+        self._listeners.append(listener)
+
+    def step(self, name: str, frame: PlannedFrame) -> None:
+        """Show what is under way."""
+        super().step(name, frame)
+        if name != "write":
+            self._publish(step=f"{frame.id}: {name}")
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """Keep what is shown of a frame."""
+        self._small[planned.id] = small_jpeg(frame)
+        self._newest = self._state["frame"] + 1, frame
+        self._publish(frame=self._newest[0])
+        super().taken(planned, frame, found)
+
+    def light_field(self, shots: Sequence[int], result: Reconstruction) -> None:
+        """Show what these shots give."""
+        super().light_field(shots, result)
+        number = 1 if self._pictures is None else self._pictures.number + 1
+        self._pictures = drawn(result.light_field, result.maps.get("disparity"), number)
+        try:
+            stated = f", states {stated_psnr_db(result):.1f} dB"
+        except AppError:
+            stated = ""
+        self._show_field(f"{result.method}: {result.status}{stated}", shots)
+
+    def _publish(self, **parts: Any) -> None:
+        with self._changed:
+            self._state.update(parts)
+            self._state["version"] += 1
+        for listener in self._listeners:
+            listener()
+
+    def _heard(self, event: Event) -> None:
+        with self._changed:
+            self._take_note(event, dict(event.facts))
+
+    def _take_note(self, event: Event, facts: dict[str, Any]) -> None:
+        if event.name == "begin":
+            self._begin(facts)
+        elif event.name == "frame.taken":
+            self._frames[facts["id"]] = {**facts, "number": self._state["frame"], "stored": False}
+            self._publish_frames()
+        elif event.name == "frame.written":
+            self._frames[facts["id"]]["stored"] = True
+            if facts["kind"] != "shot":
+                self._scale = None
+            self._publish_frames(planned=facts["planned"] - self._retaken)
+        elif event.name == "shot.done":
+            self._shots.add(facts["shot"])
+            self._wanted = self._computes
+            self._changed.notify_all()
+        elif event.name in ("pause", "resume"):
+            self._publish(paused=facts if event.name == "pause" else None, wish="", step="")
+        elif event.name in ("left", "verdict", "end"):
+            self._publish(**{event.name: facts})
+        elif event.name == "message":
+            lines = [*self._state["messages"], facts["text"]]
+            self._publish(messages=lines[-SHOWN_MESSAGES:])
+
+    def _begin(self, facts: dict[str, Any]) -> None:
+        """Show what is there already."""
+        session = Session(self._folder)
+        for frame in session.frames:
+            entry = session.stored.get(frame.id)
+            if entry is not None and frame.id not in self._frames:
+                span_dn = entry["white_level_dn"] - float(np.mean(entry["black_level_dn"]))
+                self._frames[frame.id] = {
+                    "id": frame.id,
+                    "kind": frame.kind,
+                    "shot": frame.bench.shot,
+                    "exposure_s": entry["exposure_s"],
+                    "level": entry["figures"]["bright_dn"] / span_dn,
+                    "saturated": entry["figures"]["saturated"],
+                    "number": 0,
+                    "stored": True,
+                }
+        missing = {frame.bench.shot for frame in session.missing() if frame.kind == "shot"}
+        taken = {frame.bench.shot for frame in session.needed if frame.kind == "shot"} - missing
+        self._shots |= taken
+        self._wanted = bool(taken) and self._computes
+        self._changed.notify_all()
+        self._retaken = 0
+        self._publish_frames(title=session.header["title"], planned=facts["planned"])
+
+    def _publish_frames(self, **more: Any) -> None:
+        known = list(self._frames.values())
+        self._publish(
+            frames=[dict(one) for one in known[-SHOWN_FRAMES:]],
+            taken=len(known),
+            done=sum(one["stored"] for one in known),
+            **more,
+        )
+
+    def _wish(self, words: str, ask: Callable[[], None]) -> None:
+        ask()
+        self._publish(wish=words, held=self._control.paused)
+
+    def _retake(self, ids: list[str]) -> None:
+        for name in ids:
+            known = self._frames.get(name)
+            if known is None or not known["stored"]:
+                raise AppError(f"frame {name!r} is not on the disk, so it cannot be taken again")
+            if known["kind"] == "metering":
+                raise AppError(f"frame {name}: others were exposed by it; begin another session")
+        if not ids:
+            raise AppError("choose the frames to take once more")
+        with self._changed:
+            for name in ids:
+                self._frames[name]["stored"] = False
+                if self._frames[name]["kind"] == "shot":
+                    self._shots.discard(self._frames[name]["shot"])
+            self._retaken += len(ids)
+            self._control.take_again(ids)
+            self._publish_frames()
+
+    def _preview(self, text: object) -> str:
+        if self._control.preview is None:
+            raise AppError("the capture has not begun yet")
+        return self._control.preview(str(text))
+
+    def _amend(self, text: str) -> dict[str, Any]:
+        changes = self._preview(text)
+        self._wish("the edited plan holds after this frame", lambda: None)
+        self._control.edited = text
+        return {"changes": changes}
+
+    def _newest_picture(self, query: Query) -> Picture | None:
+        newest = self._newest
+        if newest is None:
+            return None
+        number, frame = newest
+        return Picture("newest", number, lambda: encoded(picture(frame, View(longest_px=1200))))
+
+    def _small_picture(self, query: Query) -> Picture | None:
+        name = query.get("id", "")
+        known = self._frames.get(name)
+        if known is None:
+            raise AppError(f"no frame {name!r}")
+
+        def make() -> bytes:
+            if name not in self._small:
+                self._small[name] = stored_jpeg(Session(self._folder), name)
+            return self._small[name]
+
+        return Picture(name, known["number"], make)
+
+    def _reconstruct(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted or self._ending.is_set())
+                if self._ending.is_set():
+                    return
+                self._wanted, shots = False, sorted(self._shots)
+            if not shots:
+                continue
+            try:
+                session = Session(self._folder)
+                self._scale = scale = self._scale or session_scale(session)
+                self._show_field(f"{METHOD} at work", shots)
+                self.light_field(shots, light_field_so_far(session, scale, shots, self._go_on)[0])
+            except _EndedError:
+                return
+            except (AppError, CalibrationError, ReconstructionError, SensingError) as fault:
+                self._show_field("no light field yet", shots, str(fault))
+
+    def _go_on(self, progress: Progress) -> None:
+        if self._ending.is_set():
+            raise _EndedError
+
+    def _show_field(self, stage: str, shots: Sequence[int], why: str = "") -> None:
+        shown = None if self._pictures is None else self._pictures.facts()
+        of = sorted({one["shot"] for one in self._frames.values() if one["kind"] == "shot"})
+        self._publish(
+            light_field={
+                "stage": stage,
+                "why": why,
+                "shots": [len(shots), max(len(shots), len(of))],
+                "pictures": shown,
+            }
+        )

@@ -1,0 +1,99 @@
+"""The steps from an unpacked box to a plan: expose, centre the mask, align it, focus, save."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from emmc_rig.live.save import Found
+
+WANTED_LEVELS = (0.7, 0.9)
+"""Of white, where the brightest readings come."""
+LOW_LEVEL = 0.35
+"""Of white, from which on an exposure will do."""
+AWAY_UM = 5.0
+"""From where an axis centres the mask or opens the aperture, it is not there."""
+ALIGNED_DEG = 0.1
+NO_FOCUS = (
+    "this stage has no axis `focus`, and the camera's driver moves no lens: turn the lens by hand "
+    "until the sharpness no longer grows"
+)
+
+
+def steps(
+    figures: Mapping[str, Any] | None,
+    mask: Mapping[str, Any] | None,
+    off_um: Mapping[str, float | None],
+    has_focus: bool,
+    found: Found,
+    takes: Sequence[str],
+) -> list[dict[str, Any]]:
+    """Return for every step its name, whether it is done, what to say, and the action that does it.
+
+    figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
+    mask or opens the aperture; None: not homed. takes: what can be saved.
+    """
+    return [
+        _exposure(figures),
+        _centre(off_um),
+        _align(mask, found),
+        _focus(has_focus, found),
+        {
+            "name": "save",
+            "done": False,
+            "text": f"{', '.join(takes)} can be written into your files"
+            if takes
+            else "to write it into your files start with --plan plan.yaml, --rig rig.yaml",
+            "action": "preview" if takes else "",
+        },
+    ]
+
+
+def _exposure(figures: Mapping[str, Any] | None) -> dict[str, Any]:
+    if figures is None:
+        return {"name": "exposure", "done": False, "text": "no frame yet", "action": ""}
+    level, saturated = max(figures["brightest"].values()), figures["saturated"]
+    done = level >= LOW_LEVEL and saturated <= 0.001
+    text = f"the brightest readings reach {100 * level:.0f} % of white"
+    if saturated > 0.001:
+        text += f", {100 * saturated:.1f} % are saturated"
+    return {"name": "exposure", "done": done, "text": text, "action": "" if done else "autoexpose"}
+
+
+def _centre(off_um: Mapping[str, float | None]) -> dict[str, Any]:
+    if not off_um:
+        text = "it is not known where the mask is centred: name zero_um in the rig's file"
+        return {"name": "centre the mask", "done": False, "text": text, "action": ""}
+    away = [axis for axis, um in off_um.items() if um is None or abs(um) > AWAY_UM]
+    text = f"{', '.join(away)} not there" if away else "mask centred, aperture open"
+    action = "centre" if away else ""
+    return {"name": "centre the mask", "done": not away, "text": text, "action": action}
+
+
+def _align(mask: Mapping[str, Any] | None, found: Found) -> dict[str, Any]:
+    place = found.mask
+    if place is None:
+        text = (mask or {}).get("why") or "looking for the mask's shadow: show it a white board"
+        return {"name": "align", "done": False, "text": text, "action": "", "look": "whiteboard"}
+    turn, deviation = place.rotation_deg, place.rotation_deviation_deg
+    done = abs(turn) <= ALIGNED_DEG + 2 * deviation
+    way = "clockwise" if turn > 0 else "counterclockwise"
+    text = (
+        f"rotation {turn:.2f} \u00b1 {deviation:.2f}\u00b0, scale {100 * (place.scale - 1):+.2f} "
+        f"\u00b1 {100 * place.scale_deviation:.2f} %"
+    )
+    if not done:
+        text += f": turn the mask {way} in the picture"
+    return {"name": "align", "done": done, "text": text, "action": ""}
+
+
+def _focus(has_focus: bool, found: Found) -> dict[str, Any]:
+    if found.focus is not None:
+        text = (
+            f"sharpest at {found.focus.place_um:.0f} \u00b1 {found.focus.deviation_um:.0f} \u00b5m"
+        )
+        return {"name": "focus", "done": True, "text": text, "action": "autofocus"}
+    if has_focus:
+        text = "show it the scene: a white board has nothing to focus on"
+        return {"name": "focus", "done": False, "text": text, "action": "autofocus"}
+    return {"name": "focus", "done": False, "text": NO_FOCUS, "action": ""}

@@ -1,0 +1,186 @@
+"""Train an unrolled network: random worlds through random masks, noise, steps, checkpoints."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import new_file
+from emmc_rig.files.results import command_line, versions
+from emmc_rig.model.camera import Camera
+from emmc_rig.progress import Watcher
+from emmc_rig.reconstruct.training import check_new_file, checkpoint_path
+from reconstruction.methods.unrolled import with_torch
+from reconstruction.training_patches import cut_patches
+from reconstruction.unrolled.weights import Architecture, NetworkWeights
+from simulators.random_worlds import random_world
+from simulators.raycaster import tabulated
+from simulators.scenes import rendered
+
+if TYPE_CHECKING:
+    from reconstruction.unrolled.learning import Learner
+
+WORLD_SIZE = 128, 160
+"""Rows and columns at which worlds are rendered: then their disparities are 5/8 of those quoted."""
+STEPS_A_WORLD, WORLDS = 8, 32
+"""Steps after which the oldest of the worlds at hand goes and a new one is rendered."""
+CROPS = 6
+NOISE = 0.001, 0.02
+"""Range from which the readings' deviation is drawn, log-uniformly; white is 1."""
+DARKEST = 0.3
+"""Least factor, drawn log-uniformly up to 1, on a world's light."""
+_CHECKPOINT_EVERY_S = 60.0
+
+
+@dataclass(frozen=True)
+class NetworkTraining:
+    """What to train, and where to write it. crop: rows and columns of what a step sees."""
+
+    out: Path
+    cameras: tuple[str, ...]
+    architecture: Architecture
+    steps: int
+    minutes: float | None = None
+    crop: int = 48
+    seed: int = 0
+    resume: bool = False
+
+    def purpose(self) -> dict[str, object]:
+        """Return what makes two trainings the same, but for their length."""
+        return {
+            "cameras": list(self.cameras),
+            "architecture": self.architecture.model_dump(mode="json"),
+            "crop": self.crop,
+            "seed": self.seed,
+        }
+
+
+@lru_cache(maxsize=2 * WORLDS)
+def _world(seed: int, number: int, views: tuple[int, int]) -> NDArray[np.float32]:
+    rng = np.random.default_rng([seed, 0, number])
+    return rendered(tabulated(random_world(rng)), views, WORLD_SIZE).light_field
+
+
+def drawn_masks(camera: Camera, rng: np.random.Generator) -> Camera:
+    """Return a camera with other random patterns of the same kinds; made ones stay as they are."""
+    masks = {
+        name: mask.model_copy(
+            update={"pattern": mask.pattern.model_copy(update={"seed": int(rng.integers(2**31))})}
+        )
+        if hasattr(mask.pattern, "seed")
+        else mask
+        for name, mask in camera.masks.items()
+    }
+    return camera.model_copy(update={"masks": masks})
+
+
+def _detail(picture: NDArray[np.float32]) -> float:
+    """Return the root mean square difference of neighbouring samples, over the brightness."""
+    across, down = np.diff(picture, axis=1), np.diff(picture, axis=0)
+    square = float(np.mean(np.square(across)) + np.mean(np.square(down)))
+    return square**0.5 / max(float(picture.mean()), 1e-3)
+
+
+def example(training: NetworkTraining, cameras: list[Camera], step: int):
+    """Return what the network sees in a step, and the true light field (view, colour, y, x)."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    from reconstruction.unrolled.network import captured
+
+    rng = np.random.default_rng([training.seed, 1, step])
+    number = step // STEPS_A_WORLD + int(rng.integers(WORLDS))
+    world = _world(training.seed, number, training.architecture.views)
+    # Of a few crops the one of most contrast: most of a world is even, which teaches little.
+    corners = rng.integers(np.array(WORLD_SIZE) - training.crop + 1, size=(CROPS, 2))
+    side = training.crop
+    middle = world[world.shape[0] // 2, world.shape[1] // 2]
+    corner = max(
+        corners, key=lambda at: _detail(middle[at[0] : at[0] + side, at[1] : at[1] + side])
+    )
+    symmetry = rng.integers(8 if world.shape[0] == world.shape[1] else 4, size=1)
+    (truth,) = cut_patches(world, corner[None], symmetry, (side, side))
+    light = np.exp(rng.uniform(np.log(DARKEST), 0))
+    truth = np.ascontiguousarray(light * truth[..., rng.permutation(3)], np.float32)
+    psi = drawn_masks(cameras[rng.integers(len(cameras))], rng).psi((side, side))
+    sigma = np.exp(rng.uniform(*np.log(NOISE)))
+    frames = psi.forward(truth)
+    frames += sigma * rng.standard_normal(frames.shape, dtype=np.float32)
+    usable = np.ones(frames.shape, bool)
+    capture = captured(psi, frames, np.full(frames.shape, sigma**2, np.float32), usable)
+    return capture, torch.from_numpy(truth).flatten(0, 1).permute(0, 3, 1, 2)
+
+
+def train_network(
+    training: NetworkTraining, watcher: Watcher, clock: Callable[[], float] = time.perf_counter
+) -> tuple[NetworkWeights, Learner]:
+    """Train, and write the weights to `training.out`.
+
+    A checkpoint is written every minute, and when training is interrupted or its minutes are over;
+    it goes when all steps are done. Raises AppError for wrong settings or files in the way,
+    StoppedError by Ctrl-C, ReconstructionError without PyTorch or for another checkpoint.
+    """
+    out, kept = training.out, checkpoint_path(training.out).with_suffix(".pt")
+    check_new_file(out, "a network's")
+    if kept.exists() != training.resume:
+        raise AppError(
+            f"{kept}: an earlier training stopped there; give --resume to go on, or delete it"
+            if kept.exists()
+            else f"{kept}: no checkpoint to resume from; train without --resume"
+        )
+    cameras = [find_camera(name) for name in training.cameras]
+    views = training.architecture.views
+    for camera, name in zip(cameras, training.cameras, strict=True):
+        if camera.views != views:
+            raise AppError(
+                f"--camera {name}: {camera.views[0]}x{camera.views[1]} views, the network has "
+                f"{views[0]}x{views[1]}"
+            )
+    learner = with_torch("learning").Learner(training.architecture, training.seed)
+    if training.resume:
+        learner.load(kept, training.purpose())
+    started = saved = clock()
+    watcher.begin("learning", training.steps)
+    for _ in range(learner.steps):
+        watcher.step("resumed")
+    try:
+        while learner.steps < training.steps:
+            watcher.step(f"{learner.step(*example(training, cameras, learner.steps)):.1f} dB")
+            if training.minutes is not None and clock() - started > 60 * training.minutes:
+                break
+            if clock() - saved > _CHECKPOINT_EVERY_S:
+                learner.save(kept, training.purpose())
+                saved = clock()
+    except KeyboardInterrupt:
+        learner.save(kept, training.purpose())
+        raise StoppedError(
+            f"stopped by Ctrl-C after step {learner.steps} of {training.steps}, which {kept} "
+            "keeps; the same command with --resume goes on"
+        ) from None
+    provenance = {
+        **training.purpose(),
+        "steps": learner.steps,
+        "mean_psnr_db": [
+            float(np.mean(part)) for part in np.array_split(learner.losses_db, 20) if len(part)
+        ],
+        "seconds": clock() - started,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    weights = learner.weights(json.dumps(provenance, indent=1))
+    with new_file(out) as written:
+        weights.save(written)
+    if learner.steps < training.steps:
+        learner.save(kept, training.purpose())
+    else:
+        kept.unlink(missing_ok=True)
+    return weights, learner

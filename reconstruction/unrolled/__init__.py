@@ -1,0 +1,1 @@
+"""An unrolled network: data steps by Psi itself, and between them a small learned denoiser."""

@@ -1,0 +1,117 @@
+"""A person who knows nothing but the README: `emmc-rig live --rig simulated`, click by click.
+
+With EMMC_PICTURES=FOLDER the pages are written there as pictures: docs/ shows them.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from browsers import MARKS, open_browser
+
+pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
+from selenium.common.exceptions import StaleElementReferenceException
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+pytestmark = MARKS
+PATIENCE_S = 120
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
+WIDTHS = {"desktop": 1600, "phone": 390}
+
+
+def pictured(driver, name):
+    """Write pictures of a page where the documentation wants them."""
+    folder = os.environ.get("EMMC_PICTURES")
+    for size, width in WIDTHS.items() if folder else ():
+        at = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at)
+        # Two frames of the browser: the page is laid out and painted anew.
+        driver.execute_async_script(
+            "const end = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(end))"
+        )
+        seen = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), 1)
+        file = Path(str(folder)) / f"{name}-{size}.webp"
+        assert cv2.imwrite(str(file), seen, [cv2.IMWRITE_WEBP_QUALITY, 60])
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
+    plan = tmp_path / "plan.yaml"
+    made = subprocess.run(
+        [*PROGRAM, "capture", "--new", "rgbw-bayer-1shot"], cwd=tmp_path, check=True
+    )
+    assert made.returncode == 0
+    before = plan.read_text()
+    command = [*PROGRAM, "live", "--rig", "simulated", "--plan", "plan.yaml"]
+    environment = {**os.environ, "EMMC_SIZE": "48x64"}
+    with (
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+        ) as running,
+        open_browser(tmp_path / "profile") as driver,
+    ):
+        try:
+            assert running.stdout is not None
+            driver.get(running.stdout.readline().strip())
+            patient = WebDriverWait(
+                driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException]
+            )
+
+            def wait(holds):
+                patient.until(lambda _: holds())
+
+            def text(css):
+                return driver.find_element(By.CSS_SELECTOR, css).text
+
+            def click(css):
+                def clicked():
+                    one = driver.find_element(By.CSS_SELECTOR, css)
+                    able = one.is_enabled()
+                    if able:
+                        one.click()
+                    return able
+
+                wait(clicked)
+
+            def done(step):
+                found = driver.find_element(By.CSS_SELECTOR, f"#steps li:nth-child({step})")
+                return "done" in (found.get_attribute("class") or "")
+
+            # The page is dark, and says what to do about it; so do its steps.
+            wait(lambda: "away from the centre" in text("#hint"))
+            click("#steps li:nth-child(2) button")
+            wait(lambda: done(2))
+            click("#steps li:nth-child(3) button")
+            click("#steps li:nth-child(1) button")
+            wait(lambda: done(1))
+            wait(lambda: done(3))
+            assert re.search(r"rotation -?\d\.\d\d . \d\.\d\d", text("#steps li:nth-child(3)"))
+            pictured(driver, "live")
+            click("#targets button:nth-child(1)")
+            assert "by hand" in text("#steps li:nth-child(4)")
+            click("#steps li:nth-child(1) button") if not done(1) else None
+            wait(lambda: done(1))
+            click("#steps li:nth-child(5) button")
+            wait(lambda: "+  - exposure_s: " in text("#diff"))
+            click("#save")
+            wait(lambda: "wrote plan.yaml" in text("#saved"))
+            click("[data-show=views]")
+            wait(lambda: "adaptive: " in text("#field-stage"))
+            assert "as `reconstruct`" in text("#field-stage")
+            assert re.search("trust|doubt|do not use", text("#field-stage"))
+            pictured(driver, "light-field")
+            assert driver.get_log("browser") == []
+        finally:
+            running.send_signal(signal.SIGINT)
+    assert running.wait(PATIENCE_S) == 0
+    found = yaml.safe_load(plan.read_text())["shots"][0]["exposure_s"]
+    assert 1e-4 < found < 10
+    assert plan.read_text() == before.replace("  - exposure_s: auto", f"  - exposure_s: {found}")

@@ -1,0 +1,62 @@
+"""An option that a command's mode would ignore is refused, in one line, before anything is done."""
+
+import pytest
+import typer
+from programs import program
+
+from emmc_rig import cli
+from emmc_rig.commands.modes import MODES
+
+COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
+VALUES = {"size": "24x32", "repeats": "1", "seed": "1", "rays": "16", "target": "0.1", "tile": "8"}
+
+
+def typed(parameter):
+    """Return a parameter with a value, as it is typed."""
+    if parameter.param_type_name == "argument":
+        return ["nowhere"]
+    name = max(parameter.opts, key=len)
+    return [name] if parameter.is_flag else [name, VALUES.get(parameter.name, "1")]
+
+
+CASES = [
+    (command, mode, parameter)
+    for command, modes in MODES.items()
+    for mode, used in modes.items()
+    for parameter in COMMANDS[command].params
+    if parameter.name not in {mode, "help", *used}
+]
+
+
+def test_every_mode_and_what_it_takes_is_a_parameter_of_its_command():
+    for command, modes in MODES.items():
+        names = {parameter.name for parameter in COMMANDS[command].params}
+        assert names.issuperset(modes)
+        assert names.issuperset(set().union(*modes.values()))
+
+
+@pytest.mark.parametrize("command", MODES)
+def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    earlier: set[str] = set()
+    for mode in MODES[command]:
+        own = next(one for one in COMMANDS[command].params if one.name == mode)
+        earlier.add(mode)
+        for name, other, parameter in CASES:
+            if (name, other) != (command, mode) or parameter.name in earlier:
+                continue
+            code, _, err = program(command, *typed(own), *typed(parameter))
+            assert code == 2, (mode, parameter.name, err)
+            assert "no effect" in err.replace("\n", " ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_of_the_simulated_rig_are_refused_on_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.yaml").write_text("stage: simulated\ncamera: folder:.\n")
+    (tmp_path / "plan.yaml").write_text("camera: rgbw-mono\nshots: [{}]\n")
+    code, _, err = program("capture", "plan.yaml", "--rig", "rig.yaml", "--seed", "3")
+    assert code == 2
+    assert "--seed" in err
+    code, _, err = program("live", "--camera", "simulated", "--scene", "near-planar")
+    assert code == 2

@@ -1,0 +1,183 @@
+"""The page of a running capture, and what it does to it: pause, retake, edit the plan, finish."""
+
+import json
+import threading
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import emmc_rig as emmc
+from emmc_rig.capture.command import capture_session
+from emmc_rig.capture.control import Control
+from emmc_rig.capture.sequencer import ALL_TAKEN
+from emmc_rig.errors import AppError
+from emmc_rig.live.session_page import SessionPage
+from emmc_rig.session.session import Session
+
+PLAN = {
+    "camera": "rgbw-bayer-2shots",
+    "shots": [{"exposure_s": "auto"}, {"exposure_s": 0.02}],
+    "whiteboards": {"views": [[2, 2]], "repeats": 1, "references": 2},
+    "darks": {"repeats": 2},
+}
+
+
+def nobody(what):
+    raise AssertionError(f"asked to {what}")
+
+
+@pytest.fixture
+def plan(tmp_path):
+    path = tmp_path / "plan.yaml"
+    path.write_text("# mine\n" + yaml.safe_dump(PLAN))
+    return path
+
+
+def rig(size=(24, 32)):
+    return emmc.rig("simulated", scene="near-planar", size=size, rays=16).description
+
+
+class Acting(SessionPage):
+    """A page on which somebody acts whenever the capture waits; each action once, then finish."""
+
+    def __init__(self, folder, *actions):
+        self.control = Control(stays=True)
+        super().__init__(folder, self.control, computes=False)
+        self.todo = list(actions)
+        self.reasons = []
+
+    def paused(self, reason):
+        super().paused(reason)
+        self.reasons.append(reason)
+        if self.todo:
+            self.todo.pop(0)(self)
+        else:
+            self.actions["stop"]()
+
+    def run(self, plan):
+        return capture_session(plan, rig(), None, None, self, nobody, control=self.control)
+
+
+def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_whole(plan):
+    page = Acting(
+        plan.with_name("plan-session"), lambda page: page.actions["retake"](["shot-1-e0-r0"])
+    )
+    session, outcome = page.run(plan)
+    assert outcome.complete
+    lines = [e for e in session.journal.entries if e.get("id") == "shot-1-e0-r0"]
+    assert [one["kind"] for one in lines] == ["frame", "discarded", "frame"]
+    assert page.reasons == [ALL_TAKEN, ALL_TAKEN]
+    state = page.state()
+    assert state["done"] == state["planned"] == len(session.needed)
+    assert Session(session.folder).is_complete
+
+
+def test_an_edited_plan_holds_from_the_next_frame_on_and_is_written_to_the_users_file(plan):
+    text = plan.read_text()
+    edited = text.replace("repeats: 2", "repeats: 3")
+    said = []
+
+    def edit(page):
+        said.append(page.actions["preview"](edited)["changes"])
+        page.actions["amend"](edited)
+
+    page = Acting(plan.with_name("plan-session"), edit)
+    session, outcome = page.run(plan)
+    assert outcome.complete
+    assert session.amendments == 1
+    assert sum(frame.kind == "dark" for frame in session.needed) == 3
+    assert "darks.repeats is 3, not 2" in said[0]
+    assert plan.read_text() == edited
+
+
+def test_an_edit_that_frames_contradict_changes_nothing_and_the_capture_goes_on(plan):
+    text = plan.read_text()
+
+    def refused(page):
+        with pytest.raises(AppError, match="gain"):
+            page.actions["preview"](text.replace("exposure_s: 0.02", "gain: 2"))
+        with pytest.raises(AppError, match="exposure"):
+            page.actions["amend"]("camera: rgbw-bayer-2shots\nshots: [{exposure: 1}]\n")
+        page.actions["retake"](["shot-0-e0-r0"])
+
+    def changed_meanwhile(page):
+        plan.write_text(text + "# and another editor\n")
+        page.actions["amend"](text.replace("repeats: 2", "repeats: 3"))
+
+    page = Acting(plan.with_name("plan-session"), refused, changed_meanwhile)
+    session, outcome = page.run(plan)
+    assert outcome.complete
+    assert session.amendments == 0
+    said = page.state()["messages"]
+    assert any("changed meanwhile" in line for line in said)
+    assert plan.read_text() == text + "# and another editor\n"
+
+
+def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan):
+    page = Acting(plan.with_name("plan-session"))
+    session, _ = page.run(plan)
+    state = page.state()
+    json.dumps(state, allow_nan=False)
+    shown = {one["id"]: one for one in state["frames"]}
+    assert set(shown) == set(session.stored)
+    assert all(one["stored"] for one in state["frames"])
+    entry = session.stored["shot-1-e0-r0"]
+    span = entry["white_level_dn"] - np.mean(entry["black_level_dn"])
+    assert shown["shot-1-e0-r0"]["level"] == pytest.approx(entry["figures"]["bright_dn"] / span)
+    assert state["verdict"]["level"] == "doubt"
+    assert state["end"]["complete"]
+    for name in ("shot-0-e0-r0", "shot-1-e0-r0"):
+        wanted = page.pictures["frame.jpg"]({"id": name})
+        assert wanted is not None
+        small = cv2.imdecode(np.frombuffer(wanted.make(), np.uint8), 1)
+        assert small is not None
+    with pytest.raises(AppError, match="no frame"):
+        page.pictures["frame.jpg"]({"id": "../plan.yaml"})
+    for ids, why in (
+        (["shot-9"], "not on the disk"),
+        (["meter-shot-0"], "exposed by it"),
+        ([], "choose"),
+    ):
+        with pytest.raises(AppError, match=why):
+            page.actions["retake"](ids)
+
+
+def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
+    folder = plan.with_name("plan-session")
+    Acting(folder).run(plan)
+    page = Acting(folder)
+    session, _ = page.run(folder)
+    assert {one["id"] for one in page.state()["frames"]} == set(session.stored)
+    wanted = page.pictures["frame.jpg"]({"id": "shot-0-e0-r0"})
+    assert wanted is not None
+    assert wanted.make()[:2] == b"\xff\xd8"
+
+
+def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump({**PLAN, "whiteboards": {"repeats": 1, "references": 2}}))
+    shown = threading.Event()
+
+    class Waiting(Acting):
+        def light_field(self, shots, result):
+            super().light_field(shots, result)
+            if len(shots) == 2:
+                shown.set()
+
+    page = Waiting(tmp_path / "plan-session", lambda page: shown.wait(60) and page.control.stop())
+    page._computes = True
+    page.start()
+    try:
+        capture_session(path, rig((32, 40)), None, None, page, nobody, control=page.control)
+    finally:
+        page.close()
+    told = page.state()["light_field"]
+    assert told["shots"] == [2, 2]
+    assert "states" in told["stage"]
+    assert told["pictures"]["views"] == [5, 5]
+    wanted = page.pictures["views.jpg"]({})
+    assert wanted is not None
+    assert wanted.make()[:2] == b"\xff\xd8"
+    assert page.state()["ended"]
