@@ -87,14 +87,18 @@ def histogram_text(counts: dict[str, NDArray[np.int64]]) -> Text:
     return text
 
 
-def white_balance(whiteboard: RawFrame) -> tuple[float, float, float]:
+Balance = tuple[float, float, float]
+AS_READ: Balance = (1.0, 1.0, 1.0)
+
+
+def white_balance(whiteboard: RawFrame) -> Balance:
     """Return what blue, green and red are multiplied by to make a whiteboard grey; green by 1.
 
     A colour that reads nothing stays as it is. 1, 1, 1 for a mosaic that is not Bayer.
     """
     planes = colour_planes(whiteboard)
     if "grey" in planes:
-        return 1.0, 1.0, 1.0
+        return AS_READ
     black = float(whiteboard.black_level_dn.mean())
     light = {
         name: float(np.mean([part.mean() for part in planes[name]])) - black for name in planes
@@ -105,9 +109,7 @@ def white_balance(whiteboard: RawFrame) -> tuple[float, float, float]:
     return blue, 1.0, red
 
 
-def preview(
-    frame: RawFrame, balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> NDArray[np.uint8]:
+def preview(frame: RawFrame, balance: Balance = AS_READ) -> NDArray[np.uint8]:
     """Return a picture of the frame, (y, x) or (y, x, BGR), brightness as exposed, sRGB gamma.
 
     A Bayer tile becomes one pixel, its greens averaged. balance: see `white_balance`.

@@ -19,7 +19,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.frame_view import preview, thinned, white_balance
+from emmc_rig.pages.frame_view import AS_READ, Balance, preview, thinned, white_balance
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -51,8 +51,6 @@ MOST_PICTURES = 200
 QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
 BOARDS = ("reference", "open")
-Balance = tuple[float, float, float]
-NO_BALANCE: Balance = (1.0, 1.0, 1.0)
 """Kinds of frames that show a whiteboard through the whole aperture."""
 HEADINGS = {
     "dark": "Darks",
@@ -212,7 +210,7 @@ def _balance(session: Session) -> Balance:
         if entry and planned.kind in BOARDS and planned.bench.lamp == "white":
             with suppress(AppError, DriverError):
                 return white_balance(decode_frame(session.read(planned.id), entry))
-    return NO_BALANCE
+    return AS_READ
 
 
 def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[str, object]:
@@ -221,18 +219,18 @@ def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[
     if entry is None:
         return {"id": planned.id, "why": "not captured"}
     try:
-        picture = data_address(stored_jpeg(session, planned.id, balance), ".jpg")
-        return {**entry, "why": "", "picture": picture}
+        picture = stored_jpeg(session, planned.id, balance)
+        return {**entry, "why": "", "picture": data_address(picture, ".jpg")}
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
 
-def stored_jpeg(session: Session, name: str, balance: Balance = NO_BALANCE) -> bytes:
+def stored_jpeg(session: Session, name: str, balance: Balance = AS_READ) -> bytes:
     """Return a small picture of a stored frame; raises AppError or a `DriverError`."""
     return small_jpeg(decode_frame(session.read(name), session.stored[name]), balance)
 
 
-def small_jpeg(frame: RawFrame, balance: Balance = NO_BALANCE) -> bytes:
+def small_jpeg(frame: RawFrame, balance: Balance = AS_READ) -> bytes:
     """Return a small picture of a frame, of whole colour tiles evenly spread over it."""
     picture = preview(replace(frame, mosaic=thinned(frame.mosaic, PICTURE_PIXELS)), balance)
     scale = LONGEST_PX / max(picture.shape[:2])
