@@ -45,14 +45,18 @@ def from_patches(positions, patches, weights, shape):
 
     The paper's P and its weights: what covers a sample is averaged, as each patch weighs.
     """
-    total, weight = np.zeros(shape, np.float32), np.zeros(shape[2:4], np.float32)
+    total: Array = np.zeros(shape, np.float32)
+    weight: Array = np.zeros(shape[2:4], np.float32)
     for (y, x), patch, share in zip(
         positions, patches, weights or [1.0] * len(patches), strict=True
     ):
         place = np.s_[y : y + patch.shape[2], x : x + patch.shape[3]]
         weight[place] += share
-        total[(slice(None), slice(None), *place)] += np.float32(share)[..., None] * patch
-    return PatchTerm(total / np.where(weight > 0, weight, 1)[..., None], weight)
+        total[(slice(None), slice(None), *place)] += (
+            np.asarray(share, np.float32)[..., None] * patch
+        )
+    target = total / np.where(weight > 0, weight, 1)[..., None]
+    return PatchTerm(np.asarray(target, np.float32), np.asarray(weight, np.float32))
 
 
 @cache

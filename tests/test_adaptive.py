@@ -93,8 +93,8 @@ def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_ps
     disparities = np.linspace(-2, 2, 5)
     one = ((0.04, 0.1),)
     long, short, both = (
-        patch_evidence(*given, *where, disparities, TexturePrior(*lengths, kinds=one))
-        for lengths in ((4.0,), (1.0,), (4.0, (1.0,)))
+        patch_evidence(*given, *where, disparities, TexturePrior(length, finer, kinds=one))
+        for length, finer in ((4.0, ()), (1.0, ()), (4.0, (1.0,)))
     )
     each = [found.log_likelihood.astype(np.float64) for found in (long, short)]
     np.testing.assert_allclose(

@@ -149,7 +149,7 @@ def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
             assert all(part.poll() is None for part in parts)
             time.sleep(0.05)
         with opened_pool(1, json.loads(place.read_text())["address"]) as pool:
-            monkeypatch.setattr(pool._client, "_timeout", 0.5)
+            monkeypatch.setattr(vars(pool)["_client"], "_timeout", 0.5)
             done = pool.run(time.sleep, [0.0, 600.0])
             assert next(done)[0] == 0.0
             parts[0].kill()

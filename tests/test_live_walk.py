@@ -38,6 +38,7 @@ def pictured(driver, name):
             "const end = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(end))"
         )
         seen = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), 1)
+        assert seen is not None
         file = Path(str(folder)) / f"{name}-{size}.webp"
         assert cv2.imwrite(str(file), seen, [cv2.IMWRITE_WEBP_QUALITY, 60])
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

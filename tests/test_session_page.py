@@ -57,7 +57,9 @@ class Acting(SessionPage):
             self.actions["stop"]()
 
     def run(self, plan):
-        return capture_session(plan, rig(), None, None, self, nobody, control=self.control)
+        done = capture_session(plan, rig(), None, None, self, nobody, control=self.control)
+        assert done is not None
+        return done
 
 
 def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_whole(plan):

@@ -67,7 +67,7 @@ def decided(session):
 @pytest.fixture(scope="module", autouse=True)
 def _judged_once():
     """The rig's frames are the same each time, so that the same shots are judged but once."""
-    judge, known = Until._judged, {}
+    judge, known = Until._assessed, {}
 
     def remembered(self, shots, target_db):
         key = shots, target_db
@@ -76,7 +76,7 @@ def _judged_once():
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Until, "_judged", remembered)
+        patch.setattr(Until, "_assessed", remembered)
         yield
 
 
