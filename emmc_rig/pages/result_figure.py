@@ -33,6 +33,8 @@ GAP_IN, LABEL_IN, BAR_IN, TITLE_IN, EPI_IN = 0.06, 0.2, 0.45, 0.34, 0.3
 FRAMES = ("#ffb000", "#00beff", "#ff5d8f", "#7ed957")
 """Colours of the close-ups' frames, in order."""
 CLOSE_UP_SHARE = 0.16
+LEAST_RANGE_PX = 0.1
+"""Of a scale of disparities, where a result is one plane."""
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,8 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
     disparities = [one.disparity for one in results]
     top = round_up(_ends([*errors, *deviations])[1])
     low, high = _ends(disparities)
+    if high - low < LEAST_RANGE_PX:
+        low, high = low - LEAST_RANGE_PX / 2, high + LEAST_RANGE_PX / 2
     maps = [
         _Map("error", errors, 0, top, "magma"),
         _Map("stated standard deviation", deviations, 0, top, "magma"),
@@ -269,7 +273,7 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
 
 
 def _ends(maps: Sequence[Array | None]) -> tuple[float, float]:
-    """Return what 1 and 99 % of the finite values lie below; 0 and 1 without any."""
+    """Return what 1 and 99 % of the finite values lie below; 0 and 1 where there is none."""
     good = [values[np.isfinite(values)] for values in maps if values is not None]
     if not any(values.size for values in good):
         return 0.0, 1.0
