@@ -68,7 +68,7 @@ def capture():
     from emmc_rig.model.camera import build_imaging_matrix
 
     psi = build_imaging_matrix(find_camera("scenario-ii-cfa"), SIZE)
-    truth = render("near-planar", size=SIZE).light_field.astype(np.float32)
+    truth = render("deep-occlusions", size=SIZE).light_field.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 0.004, psi.frames_shape)
     frames = (psi.forward(truth) + noise).astype(np.float32)
     return psi, Frames(frames, np.full(frames.shape, 0.004), np.ones(frames.shape, bool)), truth

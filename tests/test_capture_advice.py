@@ -47,7 +47,7 @@ SCANNED = (
     HOUSE / "rig" / "rig_config.py",
 )
 FOLDERS, WRITING_A_PLAN = HOUSE / "files" / "folders.py", ("new_file", "_free")
-NO_CAPTURE = ("direct.py", "simulate.py", "enough.py")
+NO_CAPTURE = ("direct.py", "simulate.py", "assessment.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (
     ": is no list of frames; restore it from a copy",  # nor then would its SHA-256 be the journal's

@@ -216,7 +216,9 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         told = until(watch, lambda state: state["trouble"]["stage"])
         assert "home" in told["trouble"]["stage"]
         watch.centre()
-        lit = until(watch, lambda state: not state["busy"] and not state["trouble"]["stage"])
+        lit = until(
+            watch, lambda state: state["axes"]["mask_x"]["position_um"] and not state["busy"]
+        )
         place_um = lit["axes"]["mask_x"]["position_um"]
         assert place_um == pytest.approx(rig.zero_um["mask_x"], abs=0.5)
         until(watch, lambda state: state["frame"] > lit["frame"] + 1)
@@ -561,7 +563,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
         (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
         (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),
-        (("--rig", "simulated", "--method", "tv"), 2, "needs --psi"),
+        (("--camera", "simulated", "--method", "tv"), 2, "needs --psi"),
         (("--rig", "simulated", "--size", "32x48", "--psi", "nowhere"), 1, "no Psi"),
     ],
 )

@@ -14,7 +14,7 @@ from typer.core import TyperCommand
 TIMED = {"camera", "size", "repeats", "out"}
 STUDIED = {"scene", "camera", "size", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
-    "calibrate": {"drift": {"known", "out"}, "session": {"route", "out"}},
+    "calibrate": {"drift": {"known", "out"}, "session": {"route", "sensor", "out"}},
     "capture": {"schema": set(), "new": {"out"}},
     "chart": {
         "solvers": {"camera", "dictionary", "out"},
@@ -24,6 +24,7 @@ MODES: dict[str, dict[str, set[str]]] = {
         "live": STUDIED,
         "stated": STUDIED,
         "ablation": STUDIED | {"seed"},
+        "constants": STUDIED | {"seed"},
         "next_shot": STUDIED | {"seed", "until"},
     },
     "export": {"list_formats": set()},

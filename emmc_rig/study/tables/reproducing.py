@@ -68,7 +68,7 @@ def tables_page(
 
 def _head(findings: Sequence[Finding]) -> Head | None:
     """Return how many of the paper's findings hold; None where none was measured."""
-    measured = [one for one in findings if one.judged is not None]
+    measured = [one for one in findings if one.spread is not None]
     broken = [one.claim.says for one in measured if one.verdict != "holds"]
     if not measured:
         return None
