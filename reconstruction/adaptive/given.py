@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import darkness
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs, checked_noise
 
 Array = NDArray[np.floating]
+PASSED = 0.5
+"""Share of the light that masks pass for which the settings were chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +54,14 @@ def checked(
     noise_sigma: float | Array,
     usable: NDArray[np.bool_] | None,
 ) -> Given:
-    """Return the inputs of a method, brought to masks of usual darkness.
+    """Return the inputs of a method, as if the masks passed half the light.
 
     Raises ReconstructionError for inputs that do not fit each other.
     """
     typical, noise = checked_noise(psi, noise_sigma, usable)
     frames, usable = checked_inputs(psi, frames, typical, usable)
-    return Given(psi, frames, typical, noise, usable).over(darkness(psi), of_psi=True)
+    passed = max(psi.light_efficiency(), 1e-12)
+    return Given(psi, frames, typical, noise, usable).over(passed / PASSED, of_psi=True)
 
 
 def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:

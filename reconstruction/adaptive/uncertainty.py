@@ -134,17 +134,18 @@ def deviation(
     square = np.square(residual[held], dtype=np.float64)
     parts = _parts(scene, scale, float(np.median(allowed)), spread)
     of_readings = _of_readings(scene, parts, held)
+    least = 1e-6 * float(square.mean()) + 1e-30
 
     def predicted(logs: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.append(1, np.exp(logs)) @ of_readings
 
     def surprise(logs: NDArray[np.float64]) -> float:
-        variance = allowed + predicted(logs) + 1e-12
+        variance = allowed + predicted(logs) + least
         tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
         return float(np.sum(np.log(variance) + tails))
 
     logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
-    over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), 1e-20)
+    over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), least)
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
     blur, apart = (float(one) for one in np.exp(logs))
     weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
