@@ -10,8 +10,8 @@ from rich.console import Console
 
 from emmc_rig.capture.checks import figures
 from emmc_rig.capture.control import Control
-from emmc_rig.capture.display import CaptureDisplay
 from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
