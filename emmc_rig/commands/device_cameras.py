@@ -250,8 +250,14 @@ def _followed(device: Any, progress: Quiet) -> Iterator[None]:
     if not hasattr(device, "on_progress"):
         yield
         return
-    device.on_progress = lambda done, size: progress.at(done // 1_000_000, size // 1_000_000)
+    before = device.on_progress
+
+    def follow(done: int, size: int) -> None:
+        before(done, size)
+        progress.at(done // 1_000_000, size // 1_000_000)
+
+    device.on_progress = follow
     try:
         yield
     finally:
-        device.on_progress = lambda done, size: None
+        device.on_progress = before

@@ -83,6 +83,8 @@ def scale(
             )
             if not (yes or typer.confirm(question, err=True)):
                 raise AppError("nothing was moved: clear the way, then answer y")
+            with shown_progress("home"):
+                opened.home([axis])
             if camera is None:
                 steps, readings = measure(opened, axis, counts, places, _asked)
             else:
@@ -114,10 +116,9 @@ def measure(
 ) -> tuple[list[float], list[float]]:
     """Return where the axis counted to be and where it was read, at places over the distance.
 
-    Homes the axis; the places lie about the middle of its travel, and every one is approached
+    The axis is homed; the places lie about the middle of its travel, and every one is approached
     from below. The stage's unit is the count.
     """
-    stage.home([axis])
     low, high = stage.limits_um(axis)
     if counts > high - low:
         raise AppError(f"{axis} has {high - low:.0f} counts of travel: move less than {counts}")
