@@ -243,7 +243,8 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert not list(tmp_path.rglob(".*"))
 
 
-AT_ONCE = {"capture --new", "devices live", "devices serve"}
+AT_ONCE = {"capture --new", "devices live", "devices scale", "devices serve"}
+"""Done at once, shown by what they print; `devices scale` is given no stage here."""
 
 
 @pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed not in AT_ONCE])
