@@ -77,7 +77,8 @@ def show_table(heads: Sequence[Any], rows: Iterable[Sequence[Any]], title: str =
     """Print a table to standard output. heads: names, or columns of rich."""
     if json_wanted.get():
         names = [str(getattr(head, "header", head)) for head in heads]
-        emit("table", title=title, heads=names, rows=[list(map(str, row)) for row in rows])
+        plain = [[Text.from_markup(str(cell)).plain for cell in row] for row in rows]
+        emit("table", title=title, heads=names, rows=plain)
         return
     table = Table(*heads, title=title or None, box=SIMPLE)
     for row in rows:

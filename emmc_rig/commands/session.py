@@ -32,6 +32,7 @@ def list_sessions(
     psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
 ) -> None:
     """List the sessions in a folder and below it: state, frames, camera, verdict, PSNR stated."""
+    from rich.markup import escape
     from rich.table import Column
 
     from emmc_rig.commands.verdict import VERDICT_COLOURS
@@ -46,7 +47,6 @@ def list_sessions(
             raise typer.BadParameter(f"{option} {day}: write a day as 2026-11-22")
     least_db = None if psnr is None else parse_psnr(psnr, "--psnr")
     wanted = Wanted(camera, since, before, verdict, least_db)
-    heads = ("session", "state", "frames", "size", "begun", "camera", "verdict", "dB", "title")
     there, found = 0, []
     with shown_progress("read sessions") as progress:
         for one in sessions_in(folder):
@@ -63,13 +63,15 @@ def list_sessions(
         # Its path from here tells sessions of one name in several folders apart.
         inside = os.path.relpath(one.folder, folder)
         name = one.name if inside == "." else inside
+        about = ", ".join(dict.fromkeys(part for part in (one.title, one.camera) if part))
         stated = "" if one.stated_db is None else f"{one.stated_db:.1f}"
         frames, size = f"{one.stored}/{one.planned}", shown_bytes(one.bytes)
         rows.append(
-            (name, one.state, frames, size, one.created[:16], one.camera, one.verdict, stated,
-             one.title)
+            (f"{escape(name)}\n[dim]{escape(about)}[/]", one.state, frames, size,
+             one.created[:10], one.verdict, stated)
         )  # fmt: skip
-    show_table([Column(head, overflow="fold") for head in heads], rows)
+    heads = (Column(head, no_wrap=True) for head in ("state", "frames", "size", "begun", "verdict"))
+    show_table((Column("session", overflow="fold"), *heads, "dB"), rows)
     give_result(sessions=[{**asdict(one), "folder": str(one.folder)} for one in found])
 
 

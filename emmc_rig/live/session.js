@@ -68,7 +68,7 @@ function drawFrames() {
     const key = `frame.jpg?id=${encodeURIComponent(one.id)}&n=${one.number}`;
     if (tile.firstChild.getAttribute("src") !== key) tile.firstChild.src = key;
     const saturated = one.saturated > 0 ? `, ${(100 * one.saturated).toFixed(2)} % saturated` : "";
-    const words = `${Math.round(100 * one.level)} % of white${saturated}, ${Number((1e3 * one.exposure_s).toPrecision(3))} ms`;
+    const words = `${Math.round(100 * one.level)} % of white${saturated}, ${Number(one.exposure_s.toPrecision(3))} s`;
     if (tile.lastChild.textContent !== words) tile.lastChild.textContent = words;
     tile.lastChild.classList.toggle("bad", one.saturated > 0.001);
     tile.classList.toggle("due", !one.stored);
