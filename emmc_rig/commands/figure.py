@@ -52,7 +52,7 @@ def figure(
             folder, {"results": results, "truth": truth, "caption": drawn.caption, **drawn.measured}
         )
     typer.echo(drawn.caption)
-    typer.echo(f"wrote {out / 'figure.pdf'}, .svg, .png and caption.txt")
+    typer.echo(f"wrote {out / 'figure.pdf'}, .svg, .png and .txt, the caption")
 
 
 def _pair(option: str, text: str) -> tuple[int, int]:
