@@ -25,7 +25,7 @@ from emmc_rig.version import __version__
 
 WIDTH_IN = 7.16
 """Of a figure across both columns of an IEEE page."""
-GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.06, 0.2, 0.45, 0.3
+EDGE_IN, GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.01, 0.06, 0.2, 0.45, 0.3
 TEXT_PT, LINE_IN = 7.5, 0.13
 LETTER_PT = 0.55 * TEXT_PT
 """Mean width of a letter of a title."""
@@ -134,11 +134,11 @@ class _Sheet:
             any(tile.bar for row in rows for tile in row.tiles[at : at + 1] if tile)
             for at in range(columns)
         ]
-        left = LABEL_IN if any(row.label for row in rows) else 0.0
-        room = width_in - left - (columns - 1) * GAP_IN - sum(bars) * BAR_IN
+        left = LABEL_IN if any(row.label for row in rows) else EDGE_IN
+        room = width_in - EDGE_IN - left - (columns - 1) * GAP_IN - sum(bars) * BAR_IN
         self.wide, self.width = room / columns, width_in
         heights = [self._heights(row) for row in rows]
-        self.height = sum(map(sum, heights)) + (len(rows) - 1) * 2 * GAP_IN
+        self.height = sum(map(sum, heights)) + (len(rows) - 1) * 2 * GAP_IN + EDGE_IN
         self.figure = figure
         figure.set_size_inches(self.width, self.height)
         y = 0.0
@@ -195,7 +195,7 @@ class _Sheet:
 
     def _tile(self, tile: Tile, x: float, y: float, title: float, tall: float) -> None:
         if tile.title:
-            self._text(x + self.wide / 2, y + title / 2, self._title(tile))
+            self._text(x + self.wide / 2, y + title - GAP_IN / 2, self._title(tile), va="bottom")
         y += title
         if tile.bar and tile.scale:
             self._bar(tile.scale, x + self.wide + GAP_IN, y, tall)
