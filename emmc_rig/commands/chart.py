@@ -57,6 +57,9 @@ def chart(
     live: Annotated[
         bool, typer.Option("--live", help="instead: the live page: stop, pictures, light field")
     ] = False,
+    pages: Annotated[
+        bool, typer.Option("--pages", help="instead: report and viewer in a headless Chromium")
+    ] = False,
     stated: Annotated[
         bool, typer.Option("--stated", help="instead: PSNR and deviation as stated, and as true")
     ] = False,
@@ -81,7 +84,8 @@ def chart(
     instead = {
         "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation,
         "constants": constants,
-        "next-shot": next_shot, "guard": guard, "live": live, "stated": stated,
+        "next-shot": next_shot, "guard": guard, "live": live, "pages": pages,
+        "stated": stated,
     }  # fmt: skip
     for name in (name for name, wanted in instead.items() if wanted):
         _benchmark(

@@ -54,7 +54,7 @@ def figure(
             folder, {"results": results, "truth": truth, "caption": drawn.caption, **drawn.measured}
         )
     tell(drawn.caption)
-    tell(f"wrote {out / 'figure.pdf'}, .svg, .png and caption.txt")
+    tell(f"wrote {out / 'figure.pdf'}, .svg, .png and .txt, the caption")
     give_result(out)
 
 

@@ -66,6 +66,7 @@ BENCHMARKS = {
     "solvers": Benchmark("benchmarks.sparse"),
     "peers": Benchmark("benchmarks.variational"),
     "live": Benchmark("benchmarks.live"),
+    "pages": Benchmark("benchmarks.pages"),
     "guard": Benchmark("guard", CFA),
     "stated": Benchmark("stated", CFA),
     "ablation": Benchmark("ablation", journal="ablation.jsonl"),
