@@ -104,7 +104,7 @@ def disparity_of(light_field: Array) -> NDArray[np.float32]:
 
     def gathered(*products: tuple[Array, Array]) -> Array:
         summed = sum(np.einsum("vuyx,vuyx->yx", one, other) for one, other in products)
-        return cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX))
+        return np.asarray(cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX)), np.float32)
 
     power = gathered((by_x, by_x), (by_y, by_y))
     product = gathered((by_u, by_x), (by_v, by_y))
