@@ -240,17 +240,19 @@ def test_a_checkpoint_is_written_now_and_then(scenes, tmp_path, monkeypatch):
 
 def test_a_real_interrupt_is_survived(scenes, tmp_path):
     command = [sys.executable, "-c", "from emmc_rig.cli import main; main()", "train"]
-    arguments = ["--scenes", scenes, "--out", "d.h5", *SMALL, "--iterations", 100_000]
+    arguments = ["--scenes", scenes, "--out", "d.h5", *SMALL, "--iterations", 100_000, "--json"]
     process = subprocess.Popen(
         [*command, *map(str, arguments)],
         cwd=tmp_path,
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if "learning" in line:
+    assert process.stdout is not None
+    for line in process.stdout:
+        event = json.loads(line)
+        if (event["event"], event.get("stage")) == ("step", "learning"):
             break
     time.sleep(1)
     process.send_signal(signal.SIGINT)
