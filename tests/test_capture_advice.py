@@ -58,6 +58,7 @@ GUARDS = (
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
     "give trigger or focus_um; without either",  # likewise
+    ": the stage has no such axis, only ",  # a rig is opened before a session is made
     "another program",  # a program that holds the lock and never says its name
 )
 """What other commands print, and what earlier checks keep a capture from."""
