@@ -59,6 +59,7 @@ GUARDS = (
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
     "give trigger or focus_um; without either",  # likewise
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
+    " is moved by plans: give its zero_um instead",  # likewise
     "another program",  # a program that holds the lock and never says its name
 )
 """What other commands print, and what earlier checks keep a capture from."""

@@ -495,3 +495,18 @@ def test_a_wrong_search_exits_with_2(run, arguments, said):
     code, _, err = run("session", *arguments)
     assert code == 2
     assert said in " ".join(err.replace("│", "").split())
+
+
+@pytest.mark.parametrize(
+    ("axis", "told"),
+    [("lens", "the stage has no such axis, only mask_x"), ("mask_x", "give its zero_um instead")],
+)
+def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, axis, told):
+    (tmp_path / "rig.yaml").write_text(
+        f"kind: simulated\nfocus_um: 9000\nstands_um: {{{axis}: 100}}\n"
+    )
+    plan_file(tmp_path)
+    code, _, err = run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
+    assert code == 1
+    assert told in one_line(err)
+    assert not (tmp_path / "plan-session").exists()
