@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
-from reconstruction.adaptive.labels import compatibility, posteriors
+from reconstruction.adaptive.labels import RARE_PX, compatibility, posteriors
 
 Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5
@@ -206,9 +206,12 @@ def fine(
             deciding[here] = _deciding(values)
     used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
     evidence, labels = evidence[..., used], labels[used]
+    # Large disparities average texture away: patches with hardly any fit them a little better.
+    rare = np.log1p(np.abs(labels) / RARE_PX).astype(np.float32)
+    likely = evidence - np.where(deciding[..., None], np.float32(0), rare)
     # Where patches overlap they count the same readings again.
     own = np.float32((patches.stride / side) ** 2)
-    chances = posteriors(evidence * own, compatibility(labels, slope_px * patches.stride, jump))
+    chances = posteriors(likely * own, compatibility(labels, slope_px * patches.stride, jump))
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
     return Volume(labels, centres, chances, evidence, kind, deciding, rough.at_end)
 
