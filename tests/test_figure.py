@@ -4,13 +4,16 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 from programs import program
 
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.pages.pictures import Piece
 from emmc_rig.pages.result_figure import FigureSettings, draw_results
+from emmc_rig.pages.tiles import FRAMES, CloseUp, Row, Tile, draw_tiles
 
 SIZE = (36, 48)
 
@@ -76,6 +79,20 @@ def test_a_close_up_shows_the_pixels_around_its_point_of_the_view_asked_for(resu
     np.testing.assert_array_equal(corner, whole[:8, :8])
 
 
+def test_a_tile_frames_its_piece_and_shows_it_enlarged():
+    whole = np.zeros((30, 40, 3), np.uint8)
+    whole[10:20, 10:20] = 200
+    piece = Piece(10, 10, 10)
+    figure = draw_tiles([Row([Tile("", whole, [CloseUp(piece.of(whole), FRAMES[0], piece)])])], 4)
+    picture, close_up = figure.axes
+    np.testing.assert_array_equal(close_up.images[0].get_array(), np.full((10, 10, 3), 200))
+    assert close_up.get_position().width == picture.get_position().width  # four times enlarged
+    (frame,) = picture.patches
+    assert isinstance(frame, Rectangle)
+    assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((9.5, 9.5), 10, 10)
+    assert frame.get_edgecolor() == close_up.spines["left"].get_edgecolor()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -105,7 +122,7 @@ def test_the_command_writes_vectors_with_their_fonts_and_the_caption_inside(tmp_
     assert b"/Type3" not in pdf
     assert "<text" not in svg
     assert "font-family" not in svg
-    caption = " ".join((out / "caption.txt").read_text().split())
+    caption = " ".join((out / "figure.txt").read_text().split())
     assert caption in " ".join(printed.split())
     assert "Close-ups of 20x20 pixels around (y, x) = (100, 80)." in caption
     assert re.sub(r"\s", "", caption)[:40] in re.sub(r"\s", "", svg)

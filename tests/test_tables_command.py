@@ -12,12 +12,11 @@ import pytest
 from rich.console import Console
 
 from emmc_rig.model.lightfield import save_hdf5
-from emmc_rig.pages.pictures import Piece, detailed_pieces
+from emmc_rig.pages.pictures import detailed_pieces
 from emmc_rig.progress import Silent
 from emmc_rig.study.tables import reproducing
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
 from emmc_rig.study.tables.cells import PARTS, cells_of, distinct
-from emmc_rig.study.tables.figures import Tile, composed
 from emmc_rig.study.tables.grids import MEAN
 from emmc_rig.study.tables.library import Cut
 from emmc_rig.study.tables.reproducing import COLUMNS, run_tables, shown
@@ -138,7 +137,8 @@ def test_figures_and_charts_are_pictures(whole):
     folder, _ = whole
     names = {path.name for path in (folder / "figures").iterdir()}
     figures = {f"figure{n}.png" for n in (5, 6, 7, 8, 9, 10)}
-    assert names == figures | {name.replace("png", "pdf") for name in figures} | {
+    beside = {name.replace("png", kind) for name in figures for kind in ("pdf", "svg", "txt")}
+    assert names == figures | beside | {
         "chart-shots.svg", "chart-noise.svg", "chart-colour.svg", "chart-masks.svg",
     }  # fmt: skip
     for name in figures:
@@ -146,6 +146,9 @@ def test_figures_and_charts_are_pictures(whole):
         assert picture is not None
         assert min(picture.shape[:2]) > 300
         assert picture.std() > 10
+        caption = (folder / "figures" / name).with_suffix(".txt").read_text()
+        assert PARTS[name.removesuffix(".png")].title in caption
+        assert "Scene " in caption
 
 
 def test_the_metrics_tell_the_findings(whole):
@@ -264,13 +267,3 @@ def test_the_most_telling_piece_is_where_the_texture_is():
     (piece,) = detailed_pieces(picture, 16)
     assert 26 <= piece.y <= 32
     assert 46 <= piece.x <= 52
-
-
-def test_a_tile_frames_its_piece_and_shows_it_enlarged():
-    whole = np.zeros((30, 40, 3), np.uint8)
-    whole[10:20, 10:20] = 200
-    piece = Piece(10, 10, 10)
-    drawn = composed(Tile("", whole, (piece.of(whole),), (piece,)), 80)
-    assert drawn.shape == (60 + 8 + 80, 80, 3)
-    assert (drawn[68:] == 200).all()
-    assert tuple(drawn[20, 30]) == (255, 176, 0)

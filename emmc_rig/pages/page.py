@@ -54,6 +54,22 @@ class Head:
     tone: str = ""
 
 
+def verdict_head(metrics: Mapping[str, object]) -> Head | None:
+    """Return whether to trust a light field and what to do next; None without a verdict."""
+    verdict = metrics.get("verdict")
+    if not isinstance(verdict, dict):
+        return None
+    level, reasons = verdict["level"], verdict["reasons"]
+    why = [reason["what"] for reason in reasons]
+    advice = str(metrics.get("advice") or "")
+    return Head(
+        level,
+        "; ".join(why) or "frames, Psi and light field agree",
+        [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
+        {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad"),
+    )
+
+
 def number(value: float | None, form: str) -> str:
     """Return a number by its format, a dash for None and for values that are not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)

@@ -28,7 +28,7 @@ from emmc_rig.pages.display import (
     three_colours,
 )
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
-from emmc_rig.pages.page import Card, Head, data_address, fragment
+from emmc_rig.pages.page import Card, data_address, fragment, verdict_head
 from emmc_rig.pages.psi_panels import psi_panels
 from emmc_rig.pages.viewer import viewer_data
 
@@ -116,7 +116,7 @@ def render(content: ReportContent) -> str:
         styles=("viewer.css",),
         heat=HEAT,
         warnings=_warnings(content),
-        summary=_verdict_head(content),
+        summary=verdict_head(content.metrics),
         cards=_cards(content),
         capture={
             "shots": frames.shape[0],
@@ -364,22 +364,6 @@ def _cards(content: ReportContent) -> list[Card]:
 def _cost_card(exact_db: object, cost_db: object) -> Card:
     with_exact = f"with the exact Psi: {_written(exact_db, '.2f', 'dB')}"
     return Card("Calibration costs", _written(cost_db, "z.2f", "dB"), with_exact)
-
-
-def _verdict_head(content: ReportContent) -> Head | None:
-    """Return whether to trust the light field and what to do next; None where nobody judged."""
-    verdict = content.metrics.get("verdict")
-    if not isinstance(verdict, dict):
-        return None
-    level, reasons = verdict["level"], verdict["reasons"]
-    why = [reason["what"] for reason in reasons]
-    advice = str(content.metrics.get("advice") or "")
-    return Head(
-        level,
-        "; ".join(why) or "frames, Psi and light field agree",
-        [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
-        {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad"),
-    )
 
 
 def _warnings(content: ReportContent) -> list[str]:

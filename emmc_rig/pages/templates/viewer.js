@@ -47,21 +47,23 @@ precision highp sampler2DArray;
 uniform sampler2DArray views, depths;
 uniform sampler2D overlay;
 uniform ivec2 grid;
-uniform vec2 size, range, position;  // position: (u, v), in view steps
+uniform vec2 size, shown, range, position;  // shown: pixels of the canvas; position: (u, v), in view steps
 uniform float focus, aperture, gamma, wipe, opacity;
 uniform bool compared;
 out vec4 colour;
 
 const float TOLERANCE = 0.25, LEAST = 1e-3;
+const float FLAT = 0.01, STILL = 0.002; // pixels: what is nearer around a place, and the last step, do not matter
 
 vec2 p;
 int first;  // layer of the first view: the truth's or the estimate's
 
 int layer(ivec2 view) { return view.y * grid.x + view.x; }
 vec3 seen(ivec2 view, vec2 at) { return texture(views, vec3((at + 0.5) / size, first + layer(view))).rgb; }
-float depthAt(ivec2 view, vec2 at) {
-  return mix(range.x, range.y, texture(depths, vec3((at + 0.5) / size, layer(view))).r);
+vec2 depthsAt(ivec2 view, vec2 at) { // there, and the nearest around
+  return mix(range.xx, range.yy, texture(depths, vec3((at + 0.5) / size, layer(view))).rg);
 }
+float depthAt(ivec2 view, vec2 at) { return depthsAt(view, at).r; }
 
 vec3 between(out float surface) {
   ivec2 corner = clamp(ivec2(floor(position)), ivec2(0), max(grid - 2, ivec2(0)));
@@ -72,14 +74,20 @@ vec3 between(out float surface) {
     vec2 away = vec2(view) - position;
     shares[k] = max((1.0 - abs(away.x)) * (1.0 - abs(away.y)), 0.0);
     if (shares[k] <= 0.0) continue;
-    float d = depthAt(view, p);
-    for (int guess = 0; guess < 3; guess++)
-      d = max(d, depthAt(view, p + mix(range.x, range.y, float(guess) * 0.5) * away));
-    for (int step = 0; step < 3; step++) d = depthAt(view, p + d * away);
-    missed[k] = abs(depthAt(view, p + d * away) - d);
-    found[k] = d;
-    colours[k] = seen(view, p + d * away);
-    nearest = max(nearest, d - missed[k]);
+    vec2 here = depthsAt(view, p);
+    float d = here.r, before = d;
+    if (here.g - d > FLAT)
+      for (int guess = 0; guess < 3; guess++)
+        d = max(d, depthAt(view, p + mix(range.x, range.y, float(guess) * 0.5) * away));
+    for (int step = 0; step < 4; step++) {
+      before = d;
+      d = depthAt(view, p + before * away);
+      if (abs(d - before) < STILL) break;
+    }
+    missed[k] = abs(d - before);
+    found[k] = before;
+    colours[k] = seen(view, p + before * away);
+    nearest = max(nearest, before - missed[k]);
   }
   vec3 total = vec3(0.0);
   float weights = 0.0;
@@ -97,7 +105,7 @@ vec3 between(out float surface) {
 }
 
 void main() {
-  p = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - 0.5;
+  p = vec2(gl_FragCoord.x, shown.y - gl_FragCoord.y) * (size / shown) - 0.5;
   first = compared && p.x + 0.5 < wipe * size.x ? grid.x * grid.y : 0;
   float surface = focus, weights = max(0.0, 1.0 - aperture);
   vec3 total = vec3(0.0);
@@ -123,6 +131,27 @@ void main() {
     colour.rgb = mix(colour.rgb, laid, opacity);
   }
 }`;
+
+// The largest code within a view step's shift of every pixel: by blocks, of nine in one square.
+function nearestAround(pixels) {
+  const side = Math.ceil(Math.max(Math.abs(data.disparity.low), Math.abs(data.disparity.high), 1)) + 1;
+  const across = Math.ceil(width / side), down = Math.ceil(height / side);
+  const blocks = new Uint8Array(across * down), around = new Uint8Array(across * down);
+  for (let y = 0, i = 0; y < height; y++)
+    for (let x = 0; x < width; x++, i += 4) {
+      const block = Math.floor(y / side) * across + Math.floor(x / side);
+      if (pixels[i] > blocks[block]) blocks[block] = pixels[i];
+    }
+  for (let y = 0; y < down; y++)
+    for (let x = 0; x < across; x++)
+      for (let j = Math.max(y - 1, 0); j <= Math.min(y + 1, down - 1); j++)
+        for (let i = Math.max(x - 1, 0); i <= Math.min(x + 1, across - 1); i++)
+          around[y * across + x] = Math.max(around[y * across + x], blocks[j * across + i]);
+  const all = new Uint8Array(width * height);
+  for (let y = 0, i = 0; y < height; y++)
+    for (let x = 0; x < width; x++, i++) all[i] = around[Math.floor(y / side) * across + Math.floor(x / side)];
+  return all;
+}
 
 function webgl(canvas) {
   const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
@@ -165,10 +194,13 @@ function webgl(canvas) {
   layers(0, gl.RGBA8, sources, (tile, layer) =>
     gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGBA, gl.UNSIGNED_BYTE, tile.data));
   // Half floats are filtered finer than bytes, and hold every code of a byte.
-  layers(1, gl.R16F, [depth], (tile, layer) => {
-    const codes = new Float32Array(width * height);
-    for (let i = 0; i < codes.length; i++) codes[i] = tile.data[4 * i] / 255;
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RED, gl.FLOAT, codes);
+  layers(1, gl.RG16F, [depth], (tile, layer) => {
+    const codes = new Float32Array(2 * width * height), nearest = nearestAround(tile.data);
+    for (let i = 0; i < width * height; i++) {
+      codes[2 * i] = tile.data[4 * i] / 255;
+      codes[2 * i + 1] = nearest[i] / 255;
+    }
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RG, gl.FLOAT, codes);
   });
   texture(2, gl.TEXTURE_2D);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
@@ -180,12 +212,15 @@ function webgl(canvas) {
   gl.uniform2f(at("range"), data.disparity.low, data.disparity.high);
   gl.uniform1f(at("gamma"), data.gamma);
   gl.uniform1i(at("compared"), atlases.truth ? 1 : 0);
-  const [position, focus, aperture, wipe, opacity] =
-    ["position", "focus", "aperture", "wipe", "opacity"].map(at);
-  gl.viewport(0, 0, width, height);
+  const [shown, position, focus, aperture, wipe, opacity] =
+    ["shown", "position", "focus", "aperture", "wipe", "opacity"].map(at);
   return {
     kind: "WebGL2",
     draw() {
+      const across = Math.ceil(width / detail), down = Math.ceil(height / detail);
+      if (canvas.width !== across) Object.assign(canvas, { width: across, height: down });
+      gl.viewport(0, 0, across, down);
+      gl.uniform2f(shown, across, down);
       gl.uniform2f(position, state.u, state.v);
       gl.uniform1f(focus, state.focus);
       gl.uniform1f(aperture, state.aperture);
@@ -247,13 +282,24 @@ function plain(canvas) {
   };
 }
 
-// Drawing: once per screen refresh, however many events asked for it.
+// Drawing: once per screen refresh, however many events asked for it. Where that is slower than
+// the hand, every second or fourth pixel is drawn while it moves, and all of them when it rests.
 
-let waiting = false;
+const SLOW_MS = 30, REST_MS = 150, COARSEST = 4;
+let detail = 1, moving = 1, slow = 0, waiting = false, resting = 0;
 function changed() {
   if (waiting) return;
   waiting = true;
-  requestAnimationFrame(() => { waiting = false; draw(); });
+  const asked = performance.now();
+  requestAnimationFrame((now) => {
+    waiting = false;
+    slow = now - asked > SLOW_MS ? slow + 1 : 0;
+    if (slow > 2 && moving < COARSEST) { moving *= 2; slow = 0; }
+    detail = moving;
+    draw();
+    clearTimeout(resting);
+    resting = setTimeout(() => { if (detail > 1) { detail = 1; draw(); } }, REST_MS);
+  });
 }
 
 function draw() {
@@ -507,6 +553,7 @@ function full() {
 function prepareControls() {
   picture.width = width;
   picture.height = height;
+  picture.style.aspectRatio = `${width} / ${height}`;
   byId("stage").style.maxWidth = `calc(80vh * ${width / height})`;
   byId("aperture").max = farthest;
   byId("focus").min = data.focus.low;
@@ -537,7 +584,7 @@ async function main() {
   stage.dataset.renderer = renderer.kind;
   stage.dataset.ready = "yes";
   // For tests: set a state, draw it now, and how long a drawing takes.
-  stage.show = (more) => { set(more); draw(); renderer.finish(); };
+  stage.show = (more, pixels = 1) => { set(more); detail = pixels; draw(); renderer.finish(); };
 }
 
 main().catch((error) => {

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
-from emmc_rig.pages.drawing import FAINT, INK, save_publication
-from emmc_rig.pages.pictures import Pictures, Piece, detailed_pieces, epipolar_lines, pictures_of
+from emmc_rig.pages.pictures import Pictures, detailed_pieces, epipolar_lines, pictures_of
+from emmc_rig.pages.tiles import (
+    FRAMES,
+    CloseUp,
+    PaperFigure,
+    Row,
+    Strip,
+    Tile,
+    caption_of,
+    draw_tiles,
+)
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (
@@ -29,135 +36,30 @@ from emmc_rig.study.tables.cells import (
     scenes_of,
 )
 from emmc_rig.study.tables.shots import Sensors, Shots, demosaiced_rggb
+from reconstruction.methods import METHODS
 
 Array = NDArray[np.floating]
 Codes = NDArray[np.uint8]
-TILE_PX, GAP_PX, MARGIN_PX, DPI = 400, 8, 16, 100
-TITLE_PX, HEAD_PX, NOTE_PX = 44, 44, 26
-FRAMES = ((255, 176, 0), (0, 190, 255))
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A picture (y, x, 3) of screen codes with its pieces, each from a picture of its own.
-
-    title: its first line is bold. boxed: pieces to frame in the whole picture.
-    """
-
-    title: str
-    whole: Codes
-    pieces: tuple[Codes, ...] = ()
-    boxed: tuple[Piece, ...] = ()
-
-
-def screen(picture: Array, curve: DisplayCurve) -> Codes:
-    """Return screen codes (y, x, 3) of a linear picture (y, x, 3) or (y, x)."""
-    return curve.encode(picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=-1))
-
-
-def composed(tile: Tile, width_px: int = TILE_PX) -> Codes:
-    """Return the tile as one picture of a width: the whole, the pieces in a row below."""
-    height, width = tile.whole.shape[:2]
-    scale = width_px / width
-    whole: NDArray = _resized(tile.whole, width_px, round(height * scale))
-    for piece, colour in zip(tile.boxed, FRAMES, strict=False):
-        corner = round(piece.x * scale), round(piece.y * scale)
-        other = round((piece.x + piece.side) * scale), round((piece.y + piece.side) * scale)
-        whole = cv2.rectangle(whole, corner, other, (0, 0, 0), 4)
-        whole = cv2.rectangle(whole, corner, other, colour, 2)
-    if not tile.pieces:
-        return np.asarray(whole, np.uint8)
-    each = (width_px - GAP_PX * (len(tile.pieces) - 1)) // len(tile.pieces)
-    row = np.full((each, width_px, 3), 255, np.uint8)
-    for i, piece in enumerate(tile.pieces):
-        left = i * (each + GAP_PX)
-        row[:, left : left + each] = cv2.resize(
-            piece, (each, each), interpolation=cv2.INTER_NEAREST_EXACT
-        )
-    gap = np.full((GAP_PX, width_px, 3), 255, np.uint8)
-    return np.concatenate([whole, gap, row]).astype(np.uint8)
-
-
-def _resized(picture: Codes, width: int, height: int) -> Codes:
-    smaller = width < picture.shape[1]
-    how = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST_EXACT
-    return cv2.resize(picture, (width, height), interpolation=how).astype(np.uint8)
-
-
-def write_mosaic(
-    path: Path,
-    title: str,
-    rows: Sequence[tuple[str, Sequence[Tile | None]]],
-    note: str = "",
-    tile_px: int = TILE_PX,
-) -> None:
-    """Write rows of tiles, each row under its heading if any, as PNG and beside it as PDF."""
-    columns = max(len(tiles) for _, tiles in rows)
-    pictures = [[t and composed(t, tile_px) for t in tiles] for _, tiles in rows]
-    heights = [max(p.shape[0] for p in line if p is not None) for line in pictures]
-    width = 2 * MARGIN_PX + columns * tile_px + (columns - 1) * MARGIN_PX
-    height = TITLE_PX + (NOTE_PX if note else 0) + MARGIN_PX
-    for (heading, _), tall in zip(rows, heights, strict=True):
-        height += (NOTE_PX if heading else 0) + HEAD_PX + tall + MARGIN_PX
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
-
-    def write(x: float, y: float, text: str, size: float, colour: str = INK, weight="normal"):
-        figure.text(
-            x / width, 1 - y / height, text, fontsize=size, color=colour, weight=weight,
-            va="top", ha="left",
-        )  # fmt: skip
-
-    write(MARGIN_PX, 12, title, 14, weight="bold")
-    y = TITLE_PX
-    if note:
-        write(MARGIN_PX, y - 4, note, 9.5, FAINT)
-        y += NOTE_PX
-    for (heading, tiles), line, tall in zip(rows, pictures, heights, strict=True):
-        if heading:
-            write(MARGIN_PX, y + 4, heading, 11.5, weight="bold")
-            y += NOTE_PX
-        for i, (tile, picture) in enumerate(zip(tiles, line, strict=True)):
-            if tile is None or picture is None:
-                continue
-            x = MARGIN_PX + i * (tile_px + MARGIN_PX)
-            first, _, second = tile.title.partition("\n")
-            write(x, y + 2, first, 10.5, weight="bold")
-            write(x, y + 22, second, 10, FAINT)
-            top = y + HEAD_PX
-            axes = figure.add_axes(
-                (
-                    x / width,
-                    1 - (top + picture.shape[0]) / height,
-                    tile_px / width,
-                    picture.shape[0] / height,
-                )
-            )
-            axes.imshow(picture, interpolation="none", aspect="auto")
-            axes.set_axis_off()
-        y += HEAD_PX + tall + MARGIN_PX
-    figure.savefig(path, format="png", dpi=DPI)
-    save_publication(figure, path.with_suffix(".pdf"), f"{title}. {note}")
-
-
 PIECE_SHARE, LEAST_PIECE_PX = 0.16, 28
-EPI_PX, EPI_ROW_PX = 80, 3
+EPI_PX = 80
+"""Of the pieces of Figure 7's lines."""
 MASK_CELLS = 24
 
 
-def draw_figures(folder: Path, run: TablesSweep, results: Mapping[Cell, dict]) -> dict[str, Path]:
-    """Write the chosen figures as PNG; return the files by part. Those without cells are left out.
+def draw_figures(
+    folder: Path, run: TablesSweep, results: Mapping[Cell, dict]
+) -> dict[str, PaperFigure]:
+    """Write the chosen figures as PDF, SVG, PNG and caption; return them by part.
 
-    folder: exists.
+    Those without cells are left out. folder: exists.
     """
-    written = {}
+    drawn = {}
     for part in run.parts:
         draw = _DRAW.get(part.name)
-        if draw is None or not all(cell in results for cell in cells_of(part, run.library.names)):
-            continue
-        path = folder / f"{part.name}.png"
-        draw(path, part, run, results)
-        written[part.name] = path
-    return written
+        if draw and all(cell in results for cell in cells_of(part, run.library.names)):
+            drawn[part.name] = draw(part, run, results)
+            drawn[part.name].save(folder, part.name)
+    return drawn
 
 
 def _name(capture: Capture) -> str:
@@ -175,8 +77,8 @@ class _Seen:
     """The scene that a figure shows: its light field, true pictures, screen curve and pieces."""
 
     def __init__(self, part: Part, run: TablesSweep, corner: bool = False, pieces: int = 1):
+        self.part, self.run = part, run
         self.scene = scenes_of(part, run.library.names)[0]
-        self.run = run
         self.truth = run.truth(Cell(self.scene, part.captures[0], ""))
         self.lines = epipolar_lines(self.truth)
         self.true = pictures_of(self.truth, self.lines)
@@ -199,20 +101,47 @@ class _Seen:
     def corner(self, title: str, pictures: Pictures) -> Tile:
         """Return the top-left view with the piece from it and from the centre view."""
         (piece,) = self.pieces
-        corner, centre = screen(pictures.corner, self.curve), screen(pictures.centre, self.curve)
-        return Tile(title, corner, (piece.of(corner), piece.of(centre)), (piece,))
+        corner, centre = (self.curve.encode(one) for one in (pictures.corner, pictures.centre))
+        return Tile(title, corner, [
+            CloseUp(piece.of(corner), FRAMES[0], piece), CloseUp(piece.of(centre), FRAMES[0]),
+        ])  # fmt: skip
 
     def centre(self, title: str, picture: Array) -> Tile:
         """Return the centre view with all pieces."""
-        codes = screen(picture, self.curve)
-        cut = tuple(piece.of(codes) for piece in self.pieces)
-        return Tile(title, codes, cut, tuple(self.pieces))
+        codes = self.curve.encode(picture)
+        framed = zip(self.pieces, FRAMES, strict=False)
+        return Tile(title, codes, [CloseUp(one.of(codes), colour, one) for one, colour in framed])
+
+    def drawn(
+        self,
+        rows: Sequence[Row],
+        *says: str,
+        curve: DisplayCurve | None = None,
+        pieces: bool = True,
+    ) -> PaperFigure:
+        """Return the figure with its caption; curve: of the pictures, if not the scene's."""
+        part, run, scene = self.part, self.run, self.scene
+        size = "x".join(str(n) for n in self.truth.shape[2:4])
+        learned = (
+            run.source.label(scene, part.captures[0].binning)
+            for method in part.pictured
+            if METHODS[method].needs_dictionary
+        )
+        sources = [
+            f"Scene {run.library.specs[scene]}, {size} pixels, seed {run.settings.seed}",
+            *(f"Dictionary {one}" for one in dict.fromkeys(learned)),
+        ]
+        caption = caption_of(
+            [f"{part.title}: {scene}.", *says], curve or self.curve,
+            self.pieces if pieces else [], sources,
+        )  # fmt: skip
+        return PaperFigure(draw_tiles(rows), caption)
 
 
-def _figure_5(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_5(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, sensors = _Seen(part, run, corner=True), Sensors(run.settings.seed)
     scene, truth, (piece,) = seen.scene, seen.truth, seen.pieces
-    tiles: list[Tile | None] = []
+    tiles = []
     # What reaches the sensor in the same total time, relative to one CFA shot.
     shown: list[tuple[str, Shots, Array, float]] = []
     for capture in part.captures:
@@ -229,20 +158,13 @@ def _figure_5(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, d
         if paper.known_as(scene) == "dragons" and caption:
             printed = paper.SENSOR_PSNR_DB.get(scenario)
             caption += f" (paper: {'over 50' if printed is None else f'{printed:.2f}'})"
-        tiles.append(
-            Tile(
-                f"{name}\n{caption}",
-                screen(picture * light, curve),
-                (_stretched(piece.of(picture)),),
-                (piece,),
-            )
-        )
-    write_mosaic(
-        path,
-        f"{part.title}: {scene}",
-        [("", tiles)],
+        close_up = CloseUp(_stretched(piece.of(picture)), FRAMES[0], piece)
+        tiles.append(Tile(f"{name}\n{caption}", curve.encode(picture * light), [close_up]))
+    return seen.drawn(
+        [Row(tiles)],
         "Above in true proportion of the light collected, below a piece with its contrast "
         "stretched. (i) and (iii) share the time among three shots; of (iii) the first is shown.",
+        curve=curve,
     )
 
 
@@ -259,67 +181,49 @@ def _as_picture(capture: Capture, shots: Shots) -> tuple[Array, float]:
     return frame[..., None] * seen, 1.0
 
 
-def _stretched(picture: Array) -> NDArray[np.uint8]:
+def _stretched(picture: Array) -> Codes:
     """Return screen codes from the darkest to the brightest percents."""
     low, high = np.percentile(picture[picture > 0] if (picture > 0).any() else picture, [1, 99])
     scaled = np.clip((picture - low) / max(float(high - low), 1e-6), 0, 1)
     return (np.sqrt(scaled) * 255 + 0.5).astype(np.uint8)
 
 
-def _figure_6(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_6(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, (method,), rows = _Seen(part, run, corner=True), part.methods, []
-    for noisy, heading in ((False, "Noise-free"), (True, "With sensor noise")):
+    for noisy, label in ((False, "noise-free"), (True, "with sensor noise")):
         captures = [capture for capture in part.captures if capture.noisy == noisy]
         tiles = [seen.corner(*seen.titled(capture, method, results)) for capture in captures]
-        rows.append((heading, [seen.corner("true\n", seen.true), *tiles]))
-    write_mosaic(
-        path,
-        f"{part.title}: {seen.scene}",
-        rows,
-        "Top-left view; below, the framed piece of it, and the same place in the centre view.",
-        tile_px=320,
+        rows.append(Row([seen.corner("true", seen.true), *tiles], label))
+    return seen.drawn(
+        rows, "Top-left view; below, the framed piece of it, and the same place in the centre view."
     )
 
 
-def _figure_7(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_7(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, (capture,) = _Seen(part, run), part.captures
-    scene, (y, x), true, curve = seen.scene, seen.lines, seen.true, seen.curve
+    (y, x), true, curve = seen.lines, seen.true, seen.curve
     length = min(EPI_PX, *true.centre.shape[:2])
     left, top = (_busiest(epi, length) for epi in (true.across, true.down))
 
-    def strips(pictures: Pictures, name: str) -> list[Tile | None]:
-        return [
-            Tile(
-                f"{name}\n{line}",
-                np.repeat(screen(epi[:, start : start + length], curve), EPI_ROW_PX, axis=0),
-            )
-            for epi, start, line in (
-                (pictures.across, left, f"row {y} (orange), all u downwards"),
-                (pictures.down, top, f"column {x} (blue), all v downwards"),
-            )
-        ]
+    def tile(title: str, pictures: Pictures) -> Tile:
+        across, down = (
+            curve.encode(epi[:, start : start + length])
+            for epi, start in ((pictures.across, left), (pictures.down, top))
+        )
+        return Tile(title, curve.encode(pictures.centre), (), [
+            Strip(across, ((y, left), (y, left + length - 1)), FRAMES[0]),
+            Strip(down, ((top, x), (top + length - 1, x)), FRAMES[1]),
+        ])  # fmt: skip
 
-    def marked(pictures: Pictures, name: str) -> Tile:
-        view = screen(pictures.centre, curve).copy()
-        thick = max(1, view.shape[1] // 300)
-        cv2.line(view, (left, y), (left + length - 1, y), FRAMES[0], thick)
-        cv2.line(view, (x, top), (x, top + length - 1), FRAMES[1], thick)
-        return Tile(f"{name}\ncentre view with the two lines", view)
-
-    shown = {"true": true}
+    tiles = [tile("true", true)]
     for method in part.methods:
-        cell = Cell(scene, capture, method)
-        shown[f"{METHOD_TITLES[method]}, {_db(results[cell], cell)}"] = seen.kept(cell)
-    named = list(shown.items())
-    write_mosaic(
-        path,
-        f"{part.title}: {scene}",
-        [
-            ("", [marked(pictures, name) for name, pictures in (named[0], named[2])]),
-            *(("", strips(pictures, name)) for name, pictures in named),
-        ],
-        "A point's slope is its disparity.",
-        tile_px=480,
+        cell = Cell(seen.scene, capture, method)
+        tiles.append(tile(f"{METHOD_TITLES[method]}\n{_db(results[cell], cell)}", seen.kept(cell)))
+    return seen.drawn(
+        [Row(tiles)],
+        f"Centre view with two lines; below, what all views have along them: row {y}, all u "
+        f"downwards, and column {x}, all v downwards. A point's slope is its disparity.",
+        pieces=False,
     )
 
 
@@ -331,43 +235,43 @@ def _busiest(epi: Array, width: int) -> int:
     return int(sums.argmax())
 
 
-def _figure_8(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_8(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, (method,) = _Seen(part, run, corner=True), part.pictured
-    scene, curve, (piece,) = seen.scene, seen.curve, seen.pieces
-    codes = screen(seen.true.corner, curve)
-    tiles: list[Tile | None] = [Tile("true\n", codes, (piece.of(codes),), (piece,))]
+    (piece,) = seen.pieces
+    codes = seen.curve.encode(seen.true.corner)
+    tiles = [Tile("true", codes, [CloseUp(piece.of(codes), FRAMES[0], piece)])]
     for capture in part.captures:
-        cell = Cell(scene, capture, method)
-        found = screen(seen.kept(cell).corner, curve)
+        cell = Cell(seen.scene, capture, method)
+        found = seen.curve.encode(seen.kept(cell).corner)
         cells = MASKS[capture.mask].draw(1, MASK_CELLS, MASK_CELLS, 1.0)[0]
         pattern = (cells * 255 + 0.5).astype(np.uint8)
-        title = f"{MASK_TITLES[capture.mask]}\n{results[cell]['psnr_db']:.2f} dB"
-        tiles.append(Tile(title, found, (pattern, piece.of(found)), (piece,)))
-    write_mosaic(
-        path,
-        f"{part.title}: {scene}, {METHOD_TITLES[method]}",
-        [("", tiles)],
-        f"Top-left view; below, {MASK_CELLS}x{MASK_CELLS} cells of the mask, and the framed piece.",
-        tile_px=320,
+        tiles.append(
+            Tile(f"{MASK_TITLES[capture.mask]}\n{results[cell]['psnr_db']:.2f} dB", found, [
+                CloseUp(pattern), CloseUp(piece.of(found), FRAMES[0], piece),
+            ])
+        )  # fmt: skip
+    return seen.drawn(
+        [Row(tiles)],
+        f"By {METHOD_TITLES[method]}. Top-left view; below, {MASK_CELLS}x{MASK_CELLS} cells of the "
+        "mask, and the framed piece.",
     )
 
 
-def _figure_9(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_9(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, rows = _Seen(part, run, pieces=2), []
     for method in part.methods:
-        tiles = [seen.centre("true\n", seen.true.centre)]
+        tiles = [seen.centre("true", seen.true.centre)]
         for capture in part.captures:
             title, pictures = seen.titled(capture, method, results)
             tiles.append(seen.centre(title, pictures.centre))
-        rows.append((METHOD_TITLES[method], tiles))
-    note = "Centre view, noise-free; below, the framed pieces."
-    write_mosaic(path, f"{part.title}: {seen.scene}", rows, note, tile_px=300)
+        rows.append(Row(tiles, METHOD_TITLES[method]))
+    return seen.drawn(rows, "Centre view, noise-free; below, the framed pieces.")
 
 
-def _figure_10(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> None:
+def _figure_10(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, (method,) = _Seen(part, run, pieces=2), part.methods
     truth, true = seen.truth, seen.true.centre
-    found: dict[bool, list[Tile | None]] = {False: [], True: []}
+    found: dict[bool, list[Tile]] = {False: [], True: []}
     for capture in part.captures:
         title, pictures = seen.titled(capture, method, results)
         several = capture.shots > (3 if capture.scenario == "i" else 1)
@@ -375,14 +279,15 @@ def _figure_10(path: Path, part: Part, run: TablesSweep, results: Mapping[Cell, 
     small = truth[2, 2].reshape(truth.shape[2] // 2, 2, truth.shape[3] // 2, 2, 3).mean((1, 3))
     large = cv2.resize(small, true.shape[1::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     rows = [
-        ("One image", [seen.centre("true\n", true), *found[False]]),
-        ("Four images", [seen.centre("true, at the pixels' size\n", large), *found[True]]),
+        Row([seen.centre("true", true), *found[False]], "one image"),
+        Row([seen.centre("true, at the pixels' size", large), *found[True]], "four images"),
     ]
-    note = "Centre view, noise-free, one pixel sums 2x2 samples; below, the framed pieces."
-    write_mosaic(path, f"{part.title}: {seen.scene}", rows, note, tile_px=340)
+    return seen.drawn(
+        rows, "Centre view, noise-free, one pixel sums 2x2 samples; below, the framed pieces."
+    )
 
 
-_DRAW: dict[str, Callable[[Path, Part, TablesSweep, Mapping[Cell, dict]], None]] = {
+_DRAW: dict[str, Callable[[Part, TablesSweep, Mapping[Cell, dict]], PaperFigure]] = {
     "figure5": _figure_5,
     "figure6": _figure_6,
     "figure7": _figure_7,

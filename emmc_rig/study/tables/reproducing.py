@@ -14,7 +14,17 @@ from rich.text import Text
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.page import Head, Section, embedded, fragment, framed, provenance_section
+from emmc_rig.pages.drawing import webp_of
+from emmc_rig.pages.page import (
+    Head,
+    Section,
+    data_address,
+    embedded,
+    fragment,
+    framed,
+    provenance_section,
+)
+from emmc_rig.pages.tiles import PaperFigure
 from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import csv_text, provenance, sweep_folder
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
@@ -46,7 +56,7 @@ def tables_page(
     grids: Sequence[Grid],
     findings: Sequence[Finding],
     charts: Mapping[str, Path],
-    figures: Mapping[str, Path],
+    figures: Mapping[str, PaperFigure],
     provenance: Mapping[str, str],
 ) -> str:
     """Return the page. about: sentences under the title. charts: by title. figures: by part."""
@@ -58,8 +68,10 @@ def tables_page(
     for grid in grids:
         body = fragment("tables_grid.html", grid=grid, titles=METHOD_TITLES)
         sections.append(_section(grid.name, grid.title, body))
-    for name, path in figures.items():
-        body = fragment("tables_figure.html", alt=ALTS[name], picture=embedded(path))
+    for name, drawn in figures.items():
+        picture = data_address(webp_of(drawn.figure), ".webp")
+        caption = drawn.caption.removeprefix(f"{PARTS[name].title}: ")
+        body = fragment("tables_figure.html", alt=ALTS[name], picture=picture, caption=caption)
         sections.append(_section(f"{name}-picture", PARTS[name].title, body))
     sections.append(provenance_section(provenance))
     title = "The paper's tables and figures, reproduced"
