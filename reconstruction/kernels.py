@@ -233,6 +233,14 @@ def _dual_rows(steps, ahead, below, has_below, dual, base):
                             old[x] = (one - relax) * old[x] + size[x] * new[x]
 
 
+@njit(cache=True)
+def _copy(source, target):
+    """Copy a whole array: an assignment compiles for seconds, for its message of shapes."""
+    values, places = source.reshape(-1), target.reshape(-1)
+    for i in range(values.size):
+        places[i] = values[i]
+
+
 @njit(cache=True, nogil=True, fastmath=True)
 def _sweep_band(data, steps, light_field, dual, begin, end, moved, first, last):
     """Do the rows of pixels from begin to end, but for the dual step of the last one.
@@ -244,12 +252,12 @@ def _sweep_band(data, steps, light_field, dual, begin, end, moved, first, last):
         ahead = ring[row % 2]
         _primal_rows(data, steps, light_field, dual, row, ahead, moved)
         if row == begin:
-            first[:] = ahead
+            _copy(ahead, first)
         else:
             # A constant True would be a type of its own, and compiled once more.
             below = row > begin
             _dual_rows(steps, ring[(row - 1) % 2], ahead, below, dual, (row - 1) * data.binning)
-    last[:] = ring[(end - 1) % 2]
+    _copy(ring[(end - 1) % 2], last)
 
 
 def sweep(

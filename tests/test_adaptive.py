@@ -1,5 +1,7 @@
 """Adaptive reconstruction: its parts against dense algebra and SciPy, the whole when planted."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import OPPONENT, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive import assembly
+from reconstruction.adaptive import assembly, method
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.labels import compatibility, posteriors
@@ -269,6 +271,15 @@ def test_a_mask_that_treats_all_views_alike_leaves_the_evidence_flat():
     found = reconstruct_adaptive(pinhole, pinhole.forward(truth), 0.003, quick())
     assert found.status == "doubtful"
     assert "evidence is flat" in found.advice
+
+
+def test_weak_textures_that_prefer_no_disparity_do_not_make_the_evidence_flat():
+    kind, one = np.full((4, 5), 1), np.zeros(1, np.float32)
+    kind[0] = 3
+    volume = Volume(np.zeros(1), (one, one), one[None, None], one[None, None], kind, kind == 3)
+    assert method._decided(volume) == 1
+    assert method._decided(replace(volume, decisive=kind < 0)) == 0
+    assert method._decided(replace(volume, kind=np.ones((4, 5), int))) is None
 
 
 def quick():

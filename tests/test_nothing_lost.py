@@ -46,6 +46,7 @@ WRITERS = {
     "chart --kernels": (*SIZE,),
     "chart --live": (*SIZE,),
     "chart --next-shot": (*SIZE,),
+    **({"chart --pages": (*SIZE,)} if shutil.which("chromedriver") else {}),
     "chart --peers": (*SIZE,),
     "chart --solvers": (),
     "chart --stated": (*SIZE,),

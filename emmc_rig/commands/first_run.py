@@ -1,8 +1,8 @@
-"""The first run on a machine compiles kernels: it says so, and a second process compiles ahead.
+"""The first run on a machine compiles kernels: it says so, and other processes compile ahead.
 
-Numba keeps what it compiled on the disk, so that what one process compiled another loads. The
-second process reconstructs a small light field through the same camera by the same method while
-this one still simulates the capture.
+Numba keeps what it compiled on the disk, so that what one process compiled another loads. One
+process reconstructs a small light field through the same camera by the same method while this one
+still simulates the capture; another by `tv`, whose step is a late part of most methods.
 """
 
 from __future__ import annotations
@@ -22,36 +22,43 @@ from emmc_rig.progress import Watcher
 SIZE = (48, 64)
 """Of the light field that is compiled for: no kernel depends on it."""
 SOLVING = "reconstruct"
-"""The stage before which the second process must be done."""
+"""The stage before which the other processes must be done."""
+STEP = "tv"
+"""The method of the step alone: a quarter of what `adaptive` compiles."""
 
 
 @dataclass
 class Compiling(event.Listener):
-    """A `Watcher` that starts the second process when the first kernel is compiled.
+    """A `Watcher` that starts the other processes when the first kernel is compiled.
 
-    arguments: of this module. watcher: is shown every stage.
+    method: and then the other arguments of this module. watcher: is shown every stage.
     """
 
     watcher: Watcher
+    method: str
     arguments: Sequence[str]
-    ahead: subprocess.Popen | None = field(default=None, init=False)
+    ahead: list[subprocess.Popen] = field(default_factory=list, init=False)
 
     def on_start(self, event: event.Event) -> None:
         """A kernel that the disk does not hold is about to be compiled."""
-        if self.ahead is None:
+        if not self.ahead:
             say("first run", "compiling kernels for this machine, once; later runs start at once")
-            command = [sys.executable, "-m", __name__, *self.arguments]
             quiet = subprocess.DEVNULL  # Ctrl-C reaches it too, and what fails there fails here
-            self.ahead = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+            for method in dict.fromkeys((self.method, STEP)):
+                command = [sys.executable, "-m", __name__, method, *self.arguments]
+                self.ahead.append(
+                    subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+                )
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing: the second process goes on."""
+        """Nothing: the other processes go on."""
 
     def begin(self, stage: str, steps: int | None) -> None:
         """Wait for the kernels before the stage that needs them."""
-        if stage == SOLVING and self.ahead is not None:
+        if stage == SOLVING and self.ahead:
             self.watcher.begin("compile", None)
-            self.ahead.wait()
+            for one in self.ahead:
+                one.wait()
         self.watcher.begin(stage, steps)
 
     def step(self, detail: str) -> None:
@@ -64,14 +71,14 @@ def compiled_ahead(
     watcher: Watcher, method: str, camera: str, shots: int | None
 ) -> Iterator[Watcher]:
     """Yield a watcher for a run that ends in a reconstruction by this method and camera."""
-    compiling = Compiling(watcher, (method, camera, *(() if shots is None else (str(shots),))))
+    compiling = Compiling(watcher, method, (camera, *(() if shots is None else (str(shots),))))
     with event.install_listener("numba:compile", compiling):
         try:
             yield compiling
         finally:
-            if compiling.ahead is not None:
-                compiling.ahead.kill()
-                compiling.ahead.wait()
+            for one in compiling.ahead:
+                one.kill()
+                one.wait()
 
 
 def compile_for(method: str, camera: str, shots: int | None) -> None:

@@ -13,9 +13,12 @@ from emmc_rig.pages.page import data_address
 
 Array = NDArray[np.floating]
 
-JPEG_QUALITY = 88
+JPEG_QUALITIES = (88, 78, 68, 58, 48, 38)
+"""Tried from the first until a picture is small enough; the last is taken in any case."""
 TILE_MULTIPLE_PX = 16  # a JPEG block never straddles two views
 SPRITE_PIXELS = 24_000_000  # canvases above this fail on small machines; larger views are reduced
+PART_PIXELS, PART_BYTES = 8_000_000, 1_300_000
+"""Of a light field that is part of a report, which stays below 8 MB."""
 HEAT = (
     (13, 16, 38),
     (62, 46, 128),
@@ -68,8 +71,10 @@ def png_of(image: NDArray[np.uint8]) -> str:
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
-def sprite(views: NDArray[np.uint8], quality: int) -> str:
+def sprite(views: NDArray[np.uint8], most_bytes: int) -> str:
     """All views of (v, u, y, x, c) in one JPEG, each padded to whole JPEG blocks.
+
+    most_bytes: the finest quality that stays below is taken.
 
     Colour is kept at full resolution: half-resolution chroma bleeds from view to view.
     """
@@ -81,20 +86,25 @@ def sprite(views: NDArray[np.uint8], quality: int) -> str:
     )
     if colours == 3:
         tiled = np.ascontiguousarray(tiled[..., ::-1])  # OpenCV's channel order
-    return _data_uri(
-        tiled,
-        ".jpg",
-        cv2.IMWRITE_JPEG_QUALITY,
-        quality,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-    )
+    address = ""
+    for quality in JPEG_QUALITIES:
+        address = _data_uri(
+            tiled,
+            ".jpg",
+            cv2.IMWRITE_JPEG_QUALITY,
+            quality,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+        )
+        if len(address) <= most_bytes * 4 / 3:
+            break
+    return address
 
 
-def reduced(views: Array) -> Array:
+def reduced(views: Array, most_pixels: int = SPRITE_PIXELS) -> Array:
     """Views small enough for one sprite; the same array when they already are."""
     rows, columns, height, width, colours = views.shape
-    shrink = math.sqrt(SPRITE_PIXELS / (rows * columns * height * width))
+    shrink = math.sqrt(most_pixels / (rows * columns * height * width))
     if shrink >= 1:
         return views
     size = (max(1, int(width * shrink)), max(1, int(height * shrink)))

@@ -17,7 +17,8 @@ from emmc_rig.files.formats import Export
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.display import (
     HEAT,
-    JPEG_QUALITY,
+    PART_BYTES,
+    PART_PIXELS,
     TILE_MULTIPLE_PX,
     DisplayCurve,
     finite,
@@ -33,7 +34,6 @@ from emmc_rig.pages.psi_panels import psi_panels
 from emmc_rig.pages.viewer import viewer_data
 
 Array = NDArray[np.floating]
-ERROR_JPEG_QUALITY = 72  # an error map is mostly noise, and noise is what costs bytes
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def render(content: ReportContent) -> str:
     curve = DisplayCurve.fitted_to(content.estimate if content.truth is None else content.truth)
     errors = None if content.truth is None else Errors.between(content.estimate, content.truth)
     rows, columns, height, width, _ = content.estimate.shape
-    shown = reduced(content.estimate)
+    shown = reduced(content.estimate, PART_PIXELS)
     frames = finite(content.frames)
     disparity, sigma, model, misfit = (
         content.maps.get(name) for name in ("disparity", "sigma", "model", "misfit")
@@ -129,7 +129,6 @@ def render(content: ReportContent) -> str:
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         shown={"height": shown.shape[2], "width": shown.shape[3]},
         curve=curve,
-        quality=JPEG_QUALITY,
         view_psnr=[] if errors is None else _view_psnr(errors),
         error_figures={} if errors is None else _error_figures(errors),
         psi=None if content.psi is None else psi_panels(content.psi, content.psi_std),
@@ -177,7 +176,7 @@ def _page_data(
         "gamma": curve.gamma,
         "disparity": _slider_range(content.disparity_range_px),
         "heat": HEAT,
-        "estimate": sprite(three_colours(curve.encode(estimate)), JPEG_QUALITY),
+        "estimate": sprite(three_colours(curve.encode(estimate)), PART_BYTES),
         "truth": None,
         "error": None,
         "shots": [
@@ -190,20 +189,20 @@ def _page_data(
         "cfaTile": None if content.cfa_tile is None else _cfa_colours(content.cfa_tile),
     }
     if content.truth is not None and errors is not None:
-        truth = reduced(content.truth)
-        data["truth"] = sprite(three_colours(curve.encode(truth)), JPEG_QUALITY)
+        truth = reduced(content.truth, PART_PIXELS)
+        data["truth"] = sprite(three_colours(curve.encode(truth)), PART_BYTES)
         data["error"] = _error_data(errors)
     return data
 
 
 def _error_data(errors: Errors) -> dict[str, object]:
     """Pictures of the error per view, and averaged over views, on one scale."""
-    views = reduced(errors.absolute[..., None])
+    views = reduced(errors.absolute[..., None], PART_PIXELS)
     scale = round_up(float(np.percentile(views, 99.5)))
     encode = DisplayCurve(1 / scale, 1.0).encode
     return {
         "scale": scale,
-        "views": sprite(encode(views), ERROR_JPEG_QUALITY),
+        "views": sprite(encode(views), PART_BYTES // 2),
         "mean": png_of(encode(views[..., 0].mean(axis=(0, 1)))),
     }
 

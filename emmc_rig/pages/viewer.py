@@ -24,6 +24,8 @@ from emmc_rig.model.files import write_text
 from emmc_rig.model.novel_view import centre_disparity, view_disparities
 from emmc_rig.pages.display import (
     HEAT,
+    PART_PIXELS,
+    SPRITE_PIXELS,
     TILE_MULTIPLE_PX,
     DisplayCurve,
     finite,
@@ -36,7 +38,7 @@ from emmc_rig.pages.display import (
 from emmc_rig.pages.page import fragment, verdict_head
 
 Array = NDArray[np.floating]
-JPEG_QUALITY = 84
+BYTES_PER_PIXEL = 0.36
 """Of the atlases: 25 views of 376x541, the truth and the maps stay below 6 MB."""
 DEPTH = (
     (48, 18, 59),
@@ -87,7 +89,7 @@ def viewer_data(content: Export, atlases: bool = True, lossless: bool = False) -
 
     Disparity is estimated where the light field comes without.
     """
-    shown = reduced(content.light_field)
+    shown = reduced(content.light_field, SPRITE_PIXELS if atlases else PART_PIXELS)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
     curve = DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
@@ -177,7 +179,7 @@ def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:
     return (
         png_of(np.ascontiguousarray(_tiled(codes)[..., ::-1]))
         if lossless
-        else sprite(codes, JPEG_QUALITY)
+        else sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3))
     )
 
 

@@ -30,7 +30,7 @@ from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 PROBES = 4
-"""Of the disparities, at which the kinds of texture are compared."""
+"""Of the disparities, at which the kinds of texture are compared. 2x -0.03, 0.5x -0.23 dB."""
 
 
 @dataclass(frozen=True)

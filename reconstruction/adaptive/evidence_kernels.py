@@ -309,7 +309,9 @@ def evidence(
                 if part != 1:
                     _mixed(tables[offsets[i, j]], meetings, flat_row)
                     for h in range(hypotheses):
-                        sums[h, min(part, 1), first] = row[h]
+                        # A loop: copying an array compiles for seconds, for its message of shapes.
+                        for lane in range(lanes):
+                            sums[h, min(part, 1), first, lane] = row[h, lane]
             first += 1
     blocks = m // TERMS
     tiles = np.zeros(blocks * (blocks + 1) // 2 * TERMS * TERMS * LANES, np.float32)

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 RARE_PX = 2.0
-"""Disparity that half as many objects have as have none."""
+"""Disparity that half as many objects have as have none. Without it undecided patches of a smooth
+scene agreed on -6.5 px; with it group A loses 0.00 to 0.03 dB on average. 2x -0.01, 0.5x 0.00 dB.
+"""
 
 
 def compatibility(

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.edges import dark_edges, faded
+from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Fits, Mean, averaged, fitted_models, with_rest
 from reconstruction.adaptive.given import checked, checked_disparity
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
@@ -44,6 +45,10 @@ from reconstruction.verdict.shadow import relief, shadow
 Array = NDArray[np.floating]
 UNDECIDED = 0.25
 """Share of deciding patches among the textured ones below which the evidence is called flat."""
+TEXTURED = 0.01
+"""Variance of a patch's texture, over its squared brightness, from which it counts as textured. On
+middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of weaker ones 0 to
+25 %, whatever the mask: with them antinous was doubted."""
 MOSTLY = 0.5
 """Share of the picture that total variation must explain better for a warning."""
 FAR_OFF = 8.0
@@ -175,7 +180,7 @@ def _explained(survey: Survey, fits: Fits, settings: AdaptiveSettings) -> float 
 
 def _decided(volume: search.Volume) -> float | None:
     """Return the share of the textured patches that prefer some disparity; None without any."""
-    textured = volume.kind > 0
+    textured = np.array([size >= TEXTURED for size, _ in TexturePrior().kinds])[volume.kind]
     return float(volume.decisive[textured].mean()) if textured.any() else None
 
 

@@ -26,7 +26,8 @@ STACK = 16
 REACH = 9
 """Blocks are searched within so many samples along each axis."""
 ALIKE = 4.0
-"""Mean square difference of blocks that are stacked, at most, over the noise's variance."""
+"""Mean square difference of blocks that are stacked, at most, over the noise's variance. 2x -0.03,
+0.5x +0.02 dB."""
 LANES = 16
 """Blocks searched side by side."""
 _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (

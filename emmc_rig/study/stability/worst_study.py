@@ -22,7 +22,7 @@ from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.settings import Settings
-from emmc_rig.pages.page import Section, fragment, framed, provenance_section
+from emmc_rig.pages.page import Head, Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
@@ -251,9 +251,33 @@ def run_worst(settings: WorstSettings, out: Path, watcher: Watcher) -> WorstOutc
         about = [
             "Every method under the worst perturbation of the noise's size, and small details."
         ]
-        write_text(new / PAGE, framed("The worst that can happen", about, CAVEATS, sections))
+        head = _head(noise, details)
+        page = framed("The worst that can happen", about, CAVEATS, sections, head=head)
+        write_text(new / PAGE, page)
         write_metrics(new, {"points": rows, "settings": settings.model_dump(mode="json")})
     return WorstOutcome(noise, details, folder / PAGE)
+
+
+def _head(noise: Mapping[Point, Mapping[str, float]], details: Mapping[Point, Shown]) -> Head:
+    """Return the method that loses least to the worst perturbation, and what each invents."""
+    losses: dict[str, float] = {}
+    for point, one in noise.items():
+        lost_db = one["noise_db"] - one["worst_db"]
+        losses[point.method] = max(losses.get(point.method, lost_db), lost_db)
+    best = min(losses, key=losses.__getitem__)
+    fates = [one.fate for point, one in details.items() if point.method == best]
+    invented = [
+        f"{point.method} invents it in {point.scene_name}: {point.label}"
+        for point, one in details.items()
+        if one.fate == "invented"
+    ]
+    return Head(
+        f"{best} loses least",
+        f"at most {losses[best]:.2f} dB to the worst perturbation of the noise's size; it keeps "
+        f"{fates.count('kept')} of {len(fates)} details",
+        invented or ["look at what is lost among the small details below"],
+        "watch" if invented else "",
+    )
 
 
 CAVEATS = (
