@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from threadpoolctl import threadpool_limits
 
 from calibration.boards import Board
 from calibration.errors import CalibrationError
@@ -266,6 +267,7 @@ def _posterior(
     return loss + 0.5 * float(np.sum(prior * (placement.vector() - centre) ** 2))
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # its threads wait on those of the kernels
 def fit_placement(
     boards: Sequence[Board],
     camera: Camera,

@@ -18,6 +18,7 @@ from emmc_rig.commands.export import export
 from emmc_rig.commands.figure import figure
 from emmc_rig.commands.live import live
 from emmc_rig.commands.modes import ModalCommand
+from emmc_rig.commands.output import say
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
@@ -38,8 +39,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(devices, name="devices")
-app.add_typer(session, name="session")
+for name, group in (("devices", devices), ("session", session)):
+    for member in group.registered_commands:
+        member.cls = ModalCommand
+    app.add_typer(group, name=name)
 for command in (
     capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart, train,
     tables, stability, design,
@@ -80,7 +83,6 @@ def main() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    from emmc_rig.commands.bars import say
 
     say("emmc-rig", message, "bold red")
     sys.exit(code)

@@ -145,4 +145,5 @@ class Preview:
     def light_field(self) -> NDArray[np.float32]:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
         found = np.ascontiguousarray(np.moveaxis(self._coarse.planar, -2, -1), dtype=np.float32)
-        return np.clip(found, 0, 1)
+        np.clip(found, 0, 1, out=found)
+        return found

@@ -4,6 +4,9 @@ import os
 import tempfile
 from pathlib import Path
 
+# As many processes as cores: threads of BLAS in each would wait on each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from programs import exit_code

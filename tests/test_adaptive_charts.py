@@ -74,7 +74,7 @@ def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp
         ("search.DECISIVE", 0.5),
         ("settings.texture.momentum", 0.5),
     }
-    assert all(cost.mean_db == cost.worst_db == 0 for cost in costs)
+    assert all(cost.mean_db == cost.error_db == cost.worst_db == 0 for cost in costs)
     assert search.DECISIVE == parsimony.DECISIVE == DECISIVE
     monkeypatch.setattr(constants, "reconstruct_adaptive", None)
     assert constants.constant_costs(given, tmp_path, Silent())[0] == costs

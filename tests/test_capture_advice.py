@@ -57,6 +57,7 @@ GUARDS = (
     "); resume it",
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
+    "give trigger or focus_um; without either",  # likewise
     "another program",  # a program that holds the lock and never says its name
 )
 """What other commands print, and what earlier checks keep a capture from."""

@@ -72,11 +72,9 @@ def capture(*arguments):
 
 def test_two_captures_of_one_plan_are_the_same_byte_for_byte(captured):
     _, err = capture(captured / "plan.yaml", "--out", captured / "again")
-    # Without a terminal there is a plain line for every frame.
-    lines = [line for line in err.splitlines() if "of white, saturated" in line]
-    assert len(lines) == 62
-    assert "\x1b" not in err
     assert "62 frames to take, about" in err
+    assert "saturated" not in err  # progress is for a terminal
+    assert "\x1b" not in err
     one, other = (contents(captured / name) for name in ("plan-session", "again"))
     assert one == other
 
@@ -468,7 +466,7 @@ def test_sessions_are_found_by_camera_date_verdict_and_psnr_below_a_folder(captu
         if code:
             assert "none of its 2 session(s) is such" in one_line(err)
             return []
-        return [json.loads(line)["name"] for line in out.splitlines()]
+        return [one["name"] for one in json.loads(out.splitlines()[-1])["sessions"]]
 
     assert listed() == listed("--camera", PLAN["camera"][:6].upper()) == ["one", "two"]
     assert listed("--verdict", "doubt") == listed("--psnr", "27dB") == ["one"]

@@ -152,7 +152,8 @@ def test_an_estimate_counts_exposures_moves_and_bytes():
 
 
 @pytest.mark.parametrize(
-    ("seconds", "shown"), [(12.4, "12 s"), (600, "10 min"), (7200 * 2, "4.0 h")]
+    ("seconds", "shown"),
+    [(12.4, "12 s"), (207.4, "3 min 27 s"), (600, "10 min"), (7200 * 2, "4.0 h")],
 )
 def test_durations_are_shown_for_people(seconds, shown):
     assert shown_seconds(seconds) == shown

@@ -196,7 +196,7 @@ def test_unknown_names_and_sizes_are_one_line(run):
 
 def test_solver_settings_that_make_no_sense_are_one_line(run):
     for option, value in (("--mu", -1), ("--mu", "nan"), ("--chroma-weight", 0)):
-        code, _, err = run("demo", *SMALL, option, value, "--out", "r")
+        code, _, err = run("demo", *SMALL, "--method", "tv", option, value, "--out", "r")
         assert code == 1
         assert option.strip("-").replace("-", "_") in one_line(err)
 

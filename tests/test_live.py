@@ -25,6 +25,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live import setup_page as page_module
 from emmc_rig.live import watch as watch_module
+from emmc_rig.live.driving import Driving
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
 from emmc_rig.live.server import application
 from emmc_rig.live.server import served as serving
@@ -323,6 +324,31 @@ def test_positions_are_shown_while_an_axis_moves():
             assert shown["busy"]
         watch.stop()
         until(watch, lambda state: not state["busy"])
+
+
+def test_whoever_sees_that_a_move_ended_sees_where_and_how():
+    stage, ended, published = SlowStage(), threading.Event(), []
+
+    def publish(**news):
+        published.append(news)
+        if news.get("busy") == "":
+            ended.set()
+
+    driving = Driving(stage, publish)  # pyright: ignore[reportArgumentType]
+    driving.start()
+    try:
+        driving.ask("jog", lambda moved: moved.move_by_um({}))
+        assert stage.moving.wait(PATIENCE_S)
+        stage.place_um = 0.9
+        stage.stopped.set()
+        assert ended.wait(PATIENCE_S)
+    finally:
+        driving.close()
+    (end,) = [news for news in published if news.get("busy") == ""]
+    assert end["axes"]["mask_x"]["position_um"] == 0.9
+    assert "mask_x" in end["stage"]
+    after = published[published.index(end) + 1 :]
+    assert all(news["axes"]["mask_x"]["position_um"] == 0.9 for news in after if "axes" in news)
 
 
 def test_a_stop_that_the_stage_refuses_is_trouble():

@@ -5,7 +5,7 @@ import typer
 from programs import program
 
 from emmc_rig import cli
-from emmc_rig.commands.modes import MODES
+from emmc_rig.commands.modes import MODES, NEEDS
 
 COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
 VALUES = {"size": "24x32", "repeats": "1", "seed": "1", "rays": "16", "target": "0.1", "tile": "8"}
@@ -24,7 +24,7 @@ CASES = [
     for command, modes in MODES.items()
     for mode, used in modes.items()
     for parameter in COMMANDS[command].params
-    if parameter.name not in {mode, "help", *used}
+    if parameter.name not in {mode, "help", "json", *used}
 ]
 
 
@@ -45,10 +45,42 @@ def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
         for name, other, parameter in CASES:
             if (name, other) != (command, mode) or parameter.name in earlier:
                 continue
-            code, _, err = program(command, *typed(own), *typed(parameter))
+            out = ["--out", "new.h5"] if command == "train" else []
+            code, _, err = program(command, *typed(own), *typed(parameter), *out)
             assert code == 2, (mode, parameter.name, err)
             assert "no effect" in err.replace("\n", " ")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "name"), [(command, name) for command, names in NEEDS.items() for name in names]
+)
+def test_an_option_without_the_one_that_it_needs_is_refused(command, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own = next(one for one in COMMANDS[command].params if one.name == name)
+    out = ["--out", "new.h5"] if command == "train" else []
+    code, _, err = program(command, *typed(own), *out)
+    assert code == 2
+    assert "no effect without" in err.replace("\n", " ")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("option", ["--mu", "--chroma-weight"])
+def test_settings_of_a_method_are_refused_on_another(option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = program("demo", "--method", "adaptive", option, "1")
+    assert code == 2
+    assert option in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_is_refused_where_the_live_page_shows_a_real_rig(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.yaml").write_text("stage: simulated\ncamera: folder:.\n")
+    for option in ("--scene", "--size"):
+        code, _, err = program("live", "--rig", "rig.yaml", option, "24x32")
+        assert code == 2
+        assert option in err
 
 
 def test_options_of_the_simulated_rig_are_refused_on_another(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from placed import files_of, listed
 from programs import program
 
 from emmc_rig import cli
+from emmc_rig.commands import output
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import save_hdf5
 
@@ -241,6 +242,33 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert Path("w/thesis.txt").read_text() == "years of work"
     assert json.loads(Path("w/metrics.json").read_text()) != first
     assert not list(tmp_path.rglob(".*"))
+
+
+AT_ONCE = {"capture --new", "devices live", "devices scale", "devices serve"}
+"""Done at once, shown by what they print; `devices scale` is given no stage here."""
+
+
+@pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed not in AT_ONCE])
+def test_every_command_states_its_stage_before_its_work_begins(world, tmp_path, monkeypatch, typed):
+    """The first event of --json is a stage; there the test stops it."""
+    monkeypatch.chdir(world)
+    print_event, events = output.emit, []
+
+    def stop(event, **facts):
+        print_event(event, **facts)
+        events.append(event)
+        if event == "stage":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("emmc_rig.commands.output.emit", stop)
+    monkeypatch.setattr("emmc_rig.commands.capture.emit", stop)
+    out = tmp_path / ("new.h5" if typed in ONE_FILE else "new")
+    before = files_of(world)
+    code, err = called(typed, "--json", *(() if typed == "session bench" else ("--out", out)))
+    assert events[-1] == "stage", err
+    assert not {"result", "error"} & set(events)
+    assert code == 130
+    assert files_of(world) == before
 
 
 def test_a_plan_in_a_session_begins_no_session_inside_it(world, monkeypatch):

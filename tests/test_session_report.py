@@ -1,6 +1,9 @@
 """What a session shows of itself: timeline, contact sheet, terminal, and what it costs."""
 
 import io
+import json
+import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +13,8 @@ from rich.console import Console
 
 from emmc_rig.capture.checks import figures
 from emmc_rig.capture.control import Control
-from emmc_rig.capture.display import CaptureDisplay
 from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
@@ -78,6 +81,25 @@ def test_a_contact_sheet_of_few_pictures_says_so(captured):
     page = sheet(captured, pictures=4)
     assert page.count("<img ") == 4
     assert "of 4 are shown" in page
+
+
+def test_the_timeline_comes_first_and_most_pictures_of_a_kind_are_folded(captured, monkeypatch):
+    monkeypatch.setattr("emmc_rig.pages.session_sheet.FIRST_PICTURES", 1)
+    page = sheet(captured)
+    assert page.index('id="timeline"') < page.index('id="events"') < page.index("<img ")
+    folded = [int(count) for count in re.findall(r"<summary>(\d+) more</summary>", page)]
+    kinds = Counter(frame.kind for frame in captured.needed)
+    assert sorted(folded) == sorted(count - 1 for count in kinds.values() if count > 1)
+    assert page.count("<img ") == len(captured.needed)
+
+
+def test_the_report_of_a_reconstructed_session_has_its_verdict(captured):
+    assert "Light field" not in sheet(captured)
+    (captured.folder / "reconstruction").mkdir()
+    told = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
+    (captured.folder / "reconstruction/metrics.json").write_text(json.dumps(told))
+    page = sheet(captured)
+    assert page.index("doubt") < page.index("27.5 dB stated") < page.index("<img ")
 
 
 def test_a_page_shows_names_as_text(captured):

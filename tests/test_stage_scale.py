@@ -179,6 +179,7 @@ def test_settings_behind_a_port_are_those_of_a_file(tmp_path):
 def test_a_ruler_measures_the_step_that_nobody_knew():
     device = chain(COARSE)
     opened = stage(device, in_microsteps=True)
+    opened.home(["x"])
     steps, readings = measure(opened, "x", 20_000, 5, lambda _: device.position_um(1, 1) + 77.0)
     assert max(steps) - min(steps) == pytest.approx(20_000, abs=1)
     found = fit_step_length(steps, readings)
@@ -203,6 +204,7 @@ def test_the_shadow_of_the_mask_measures_the_step_in_the_cameras_frames():
     counted = ZaberStage(
         rig.chain.transport(), STAGE_AXES, clock=rig.clock, settings=SLOPPY, in_microsteps=True
     )
+    counted.home(["mask_x"])
     mask, sensor = camera.masks["mask"], camera.sensor
     um_per_pixel = sensor.sample_pitch_um * sensor.binning
     um_per_pixel *= 1 - mask.distance_mm / camera.lens.distance_mm

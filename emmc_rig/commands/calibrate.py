@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import SIZE_VARIABLE
+from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
@@ -59,8 +60,8 @@ def calibrate(
         bool,
         typer.Option(
             "--few",
-            help="with --plan: about ten whiteboards, parts of the aperture instead of every view; "
-            "for masks that are as designed",
+            help="about ten whiteboards, parts of the aperture instead of every view; for masks "
+            "that are as designed",
         ),
     ] = False,
     leave_out: Annotated[
@@ -100,7 +101,6 @@ def calibrate(
     from emmc_rig.calibrate.board_plan import write_plan
     from emmc_rig.calibrate.settings import CalibrateSettings
     from emmc_rig.calibrate.simulated import run_calibrate
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
@@ -111,12 +111,8 @@ def calibrate(
         _judge_drift(known, drift, out or Path("emmc-drift"))
         return
     if session is not None:
-        if plan or check is not None or stage:
-            raise typer.BadParameter("--plan, --check and --stage are for the simulated bench")
         _calibrate_session(session, route, out, sensor)
         return
-    if sensor:
-        raise typer.BadParameter("--sensor is for a session; see --check sensor")
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
     shape = parse_size(size)
@@ -136,67 +132,68 @@ def calibrate(
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
     if check is not None:
-        from emmc_rig.commands.bars import show_table
         from emmc_rig.study.checks.check_sweep import run_checks
 
         out = out or Path("emmc-checks")
-        with shown_bars() as bars:
+        with shown_progress() as bars:
             metrics = run_checks(settings, check, out, bars)
         names = ("what", "measured", "asked", "verdict")
         rows = [tuple(row[name] for name in names) for row in metrics["rows"]]
         show_table(("target", "measured", "asked", ""), rows)
-        typer.echo(f"read {out / 'metrics.json'}")
+        tell(f"read {out / 'metrics.json'}")
+        give_result(out)
         missed = [row["what"] for row in metrics["rows"] if row["verdict"] == "missed"]
         if missed:
             raise AppError(f"{len(missed)} of {len(metrics['rows'])} missed: {'; '.join(missed)}")
         return
     if plan:
         out = out or Path("emmc-calibration")
-        with result_folder(out, "calibrate --plan") as folder:
+        with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
             metrics = write_plan(settings, folder)
-        typer.echo(
+        tell(
             f"{metrics['frames']} frames for a relative error of Psi of "
             f"{metrics['expected_relative_error']:.2%}, the model's own included"
         )
-        typer.echo(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
+        tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
+        give_result(out)
         return
     out = out or Path("emmc-bench")
-    with result_folder(out, "calibrate") as folder, shown_bars() as bars:
+    with result_folder(out, "calibrate") as folder, shown_progress() as bars:
         metrics = run_calibrate(settings, folder, bars)
     chosen = metrics["chosen"]
-    typer.echo(
+    tell(
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
         f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
         f"(the design is off by {metrics['design_relative_error']:.0%})"
     )
     _tell_findings(metrics)
-    typer.echo(f"open {out / 'report.html'}")
+    tell(f"open {out / 'report.html'}")
+    give_result(out)
 
 
 def _tell_findings(metrics: dict) -> None:
     for line in metrics["findings"]:
-        typer.echo(f"found: {line}")
+        tell(f"found: {line}")
     for line in metrics["unwatched"]:
-        typer.echo(line)
+        tell(line)
     for line in metrics["advice"]:
-        typer.echo(f"measure again: {line}")
+        tell(f"measure again: {line}")
 
 
 def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -> None:
     import emmc_rig as emmc
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.folders import result_folder
     from emmc_rig.session.session import CALIBRATION
 
     captured, place = emmc.Session(path), path / CALIBRATION
     out = out or place
-    with result_folder(out, "calibrate", belongs_to=place) as folder, shown_bars() as bars:
+    with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
         calibration = emmc.calibrate(captured, route, sensor=sensor, watcher=bars)
         calibration.write(folder)
     metrics = calibration.metrics
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
-    typer.echo(
+    tell(
         f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
@@ -204,17 +201,19 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -
     if calibration.sensor is not None:
         for name, value, deviation, unit in calibration.sensor.rows():
             spread = "" if deviation is None else f" +- {deviation:.2g}"
-            typer.echo(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
-    typer.echo(f"open {out / 'report.html'}")
+            tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
+    tell(f"open {out / 'report.html'}")
+    give_result(out)
 
 
 def _judge_drift(known: Path, frames: Path, out: Path) -> None:
     from emmc_rig.calibrate.drift import run_drift
     from emmc_rig.files.folders import result_folder
 
-    with result_folder(out, "calibrate --drift") as folder:
+    with result_folder(out, "calibrate --drift") as folder, shown_progress("fit the drift"):
         metrics = run_drift(known, frames, folder)
-    typer.echo(metrics["words"])
+    tell(metrics["words"])
     for kind, value in metrics["values"].items():
-        typer.echo(f"    {kind} {value:+.4g} +- {metrics['deviations'][kind]:.2g}")
-    typer.echo(f"use {out / 'psi.h5'}")
+        tell(f"    {kind} {value:+.4g} +- {metrics['deviations'][kind]:.2g}")
+    tell(f"use {out / 'psi.h5'}")
+    give_result(out)

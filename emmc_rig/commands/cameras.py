@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
 
 def _shown(value: object) -> str:
@@ -22,7 +25,6 @@ def cameras(
 ) -> None:
     """List the cameras known, or draw one: masks, weights, sampling, condition."""
     import emmc_rig as emmc
-    from emmc_rig.commands.bars import show_table
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics
     from emmc_rig.pages.camera_sheet import (
@@ -32,19 +34,21 @@ def cameras(
     )
 
     if name is None:
+        shown = camera_rows()
         show_table(
             ("camera", "sensor", "shots", "masks", "sampling", "light"),
             [
                 (f"[bold]{row.name}[/]\n{row.title}", row.sensor, str(row.shots), str(row.masks),
                  row.sampling_rate, f"{row.light_percent:.0f} %")
-                for row in camera_rows()
+                for row in shown
             ],
         )  # fmt: skip
+        give_result(cameras=[asdict(row) for row in shown])
         return
     camera = emmc.camera(name)
-    figures = camera_figures(camera)
     folder_name = out or Path(f"camera-{Path(name).stem}")
-    with result_folder(folder_name, "cameras") as folder:
+    with result_folder(folder_name, "cameras") as folder, shown_progress("draw"):
+        figures = camera_figures(camera)
         draw_camera(camera, folder / "camera.png")
         write_metrics(folder, figures)
     rows = []
@@ -56,4 +60,5 @@ def cameras(
         else:
             rows.append((key, _shown(value)))
     show_table(("figure", "value"), rows, camera.title)
-    typer.echo(f"open {folder_name / 'camera.png'}")
+    tell(f"open {folder_name / 'camera.png'}")
+    give_result(folder_name)

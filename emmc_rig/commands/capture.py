@@ -14,6 +14,7 @@ from rich.console import Console
 
 from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.output import emit, give_result, json_wanted, say, tell
 from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import AppError
 
@@ -62,9 +63,6 @@ def capture(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
     ] = False,
-    json_lines: Annotated[
-        bool, typer.Option("--json", help="print what happens as lines of JSON, and nothing else")
-    ] = False,
     page: Annotated[
         bool, typer.Option("--page", help="show the running capture on a local page")
     ] = False,
@@ -83,7 +81,7 @@ def capture(
     from emmc_rig.capture.plan import schema_text
 
     if schema:
-        typer.echo(schema_text(), nl=False)
+        tell(schema_text().removesuffix("\n"))
         return
     if new is not None:
         _write_plan(new, out or Path("plan.yaml"))
@@ -107,7 +105,7 @@ def capture(
     if dry_run and (page or steer):
         refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
     shown = None if not (page or steer) else "steers" if steer else "shows"
-    _run(plan, chosen, until_db, dry_run, json_lines, out, shown)
+    _run(plan, chosen, until_db, dry_run, out, shown)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -116,7 +114,7 @@ def _write_plan(name: str, path: Path) -> None:
     from emmc_rig.files.cameras import find_camera
 
     write_new(path, new_plan(name, find_camera(name)))
-    typer.echo(f"wrote {path}; edit it, then: emmc-rig capture {path} --rig simulated")
+    tell(f"wrote {path}; edit it, then: emmc-rig capture {path} --rig simulated")
 
 
 def _run(
@@ -124,24 +122,22 @@ def _run(
     rig: Mapping[str, Any] | None,
     until_db: float | None,
     dry_run: bool,
-    json_lines: bool,
     out: Path | None,
     page: Literal["shows", "steers"] | None,
 ) -> None:
     from emmc_rig.capture.command import asked_folder, capture_session
     from emmc_rig.capture.control import Control
-    from emmc_rig.capture.display import CaptureDisplay
     from emmc_rig.capture.estimate import Estimate
     from emmc_rig.capture.events import EventWatcher
+    from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.session.decisions import decided_words, ended
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.session import REPORT
 
-    console = Console(stderr=True, quiet=json_lines)
     control = Control(stays=page == "steers")
-    display = CaptureDisplay(console, control)
-    watcher: CaptureWatcher = EventWatcher(_print_line) if json_lines else display
+    display = CaptureDisplay(Console(stderr=True, quiet=json_wanted.get()), control)
+    watcher: CaptureWatcher = EventWatcher(_print_line) if json_wanted.get() else display
 
     def ask(what: str) -> None:
         if not sys.stdin.isatty():
@@ -173,21 +169,24 @@ def _run(
             folder = asked_folder(plan, out)
             watcher = open_things.enter_context(_page(folder, control, watcher, page, until_db))
         open_things.enter_context(display.shown())
+        if json_wanted.get():
+            emit("stage", stage="open the rig", steps=None)
         captured = capture_session(plan, rig, out, until_db, watcher, ask, agreed, control)
-    if captured is None or json_lines:
+    if captured is None:
         return
     session, outcome = captured
     retried = f", {outcome.retries} retries" if outcome.retries else ""
-    typer.echo(
+    tell(
         f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "
         f"{shown_seconds(outcome.seconds)}{retried}; in {session.folder}"
     )
     last = ended(session.journal.entries)
     if last is not None:
-        typer.echo(decided_words(last))
+        tell(decided_words(last))
     for reason in exposure_reasons(shot_exposures(session)):
         show_reason(**asdict(reason))
-    typer.echo(f"open {session.folder / REPORT}")
+    tell(f"open {session.folder / REPORT}")
+    give_result(out=session.folder, frames=len(session.needed), **asdict(outcome))
 
 
 @contextmanager
@@ -208,7 +207,7 @@ def _page(
     page, token = SessionPage(folder, control, other, until_db is None), new_token()
     to_act = "start `emmc-rig capture` with --steer"
     with served(application(page, token, does == "shows", to_act=to_act)) as port:
-        typer.echo(f"http://127.0.0.1:{port}/{token}/", err=True)
+        say("page", f"http://127.0.0.1:{port}/{token}/", "cyan")
         page.start()
         try:
             yield page

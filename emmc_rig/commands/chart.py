@@ -14,6 +14,7 @@ from emmc_rig.commands.options import (
     SeedOption,
     SizeOption,
 )
+from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
 if TYPE_CHECKING:
     from emmc_rig.study.chart.points import ChartSettings
@@ -102,12 +103,12 @@ def chart(
 
 
 def _benchmark(name: str, out: Path, camera: str | None, **asked: Any) -> None:
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.errors import AppError
     from emmc_rig.study.benchmarks.running import run_benchmark
 
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         metrics = run_benchmark(name, out, bars, camera, **asked)
+    give_result(out)
     if fallen := metrics.get("fell"):
         raise AppError(
             f"{len(fallen)} figure(s) fell: {'; '.join(fallen)}: fix the method, or store "
@@ -116,10 +117,9 @@ def _benchmark(name: str, out: Path, camera: str | None, **asked: Any) -> None:
 
 
 def _chart_methods(settings: ChartSettings, place: Path) -> None:
-    from emmc_rig.commands.bars import say, show_table, shown_bars
     from emmc_rig.study.chart.charting import run_chart
 
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         outcome = run_chart(settings, place, bars)
     for one in outcome.shown():
         rows = [
@@ -139,4 +139,5 @@ def _chart_methods(settings: ChartSettings, place: Path) -> None:
         show_table(("growth", "against", "exponent", "expected"), rows)
     for line in outcome.left_out:
         say("left out", line)
-    typer.echo(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")
+    tell(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")
+    give_result(place)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
+from contextlib import nullcontext, redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.output import give_result, json_wanted
 from emmc_rig.errors import AppError
 
 SUITES = {"stage": "stages.py", "camera": "cameras.py"}
@@ -42,19 +45,21 @@ def conform(
             f"Every axis of {device} will be homed and moved through the middle of its travel. "
             "Is the way free?"
         )
-        if not typer.confirm(question):
+        if not typer.confirm(question, err=True):
             raise AppError("nothing was moved")
     from emmc_rig import conformance
 
     here = Path(conformance.__file__).parent
-    code = pytest.main(
-        [
-            *(str(here / SUITES[suite]) for suite in suites),
-            *("-p", "emmc_rig.conformance.named", "--device", device),
-            *("-c", os.devnull, "--rootdir", str(here), "-p", "no:cacheprovider"),
-            *("--import-mode=importlib", "-v", "--no-header", "--tb=short"),
-        ]
-    )
+    with redirect_stdout(sys.stderr) if json_wanted.get() else nullcontext():
+        code = pytest.main(
+            [
+                *(str(here / SUITES[suite]) for suite in suites),
+                *("-p", "emmc_rig.conformance.named", "--device", device),
+                *("-c", os.devnull, "--rootdir", str(here), "-p", "no:cacheprovider"),
+                *("--import-mode=importlib", "-v", "--no-header", "--tb=short"),
+            ]
+        )
+    give_result(device=device, conforms=code == pytest.ExitCode.OK)
     if code != pytest.ExitCode.OK:
         raise AppError(f"{device} does not do what every {' and '.join(suites)} must do: see above")
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
     DEFAULT_SCENE,
@@ -18,11 +19,13 @@ from emmc_rig.commands.options import (
     ShotsOption,
     SizeOption,
 )
+from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 from emmc_rig.errors import AppError
 
 
 def demo(
+    context: typer.Context,
     scene: SceneOption = DEFAULT_SCENE,
     camera: CameraOption = DEFAULT_CAMERA,
     shots: ShotsOption = None,
@@ -46,15 +49,16 @@ def demo(
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     import emmc_rig as emmc
-    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.commands.first_run import compiled_ahead
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
     from emmc_rig.model.settings import validated
-    from reconstruction.methods import DEFAULT_METHOD, MethodSettings
+    from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 
     method = method or DEFAULT_METHOD
+    if find_method(method).part != "tv":
+        refuse(context, given_names(context) & {"mu", "chroma_weight"}, f"on --method {method}")
     described = emmc.camera(camera, shots)
     chosen = {"tv": {"mu": mu, "chroma_weight": chroma_weight}}
     solver = validated(MethodSettings, chosen, "solver settings", AppError)
@@ -73,16 +77,17 @@ def demo(
         say("warning", warning)
     with (
         result_folder(out, "demo") as folder,
-        shown_bars() as bars,
+        shown_progress() as bars,
         compiled_ahead(bars, method, camera, shots) as watcher,
     ):
         metrics = run_demo(settings, folder, watcher)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
-    typer.echo(
+    tell(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
         f"copied centre view; SSIM {metrics['ssim']:.3f}; Psi to "
         f"{metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    typer.echo(f"open {out / 'report.html'}")
+    tell(f"open {out / 'report.html'}")
     show_verdict(metrics["verdict"])
+    give_result(out)

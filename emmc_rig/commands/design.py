@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from emmc_rig.commands.options import ScenesOption, SeedOption, SizeOption
+from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +34,6 @@ def design(
     ] = None,
 ) -> None:
     """Choose the mask to order: by theory, confirmed by simulation; a camera and a mask file."""
-    from emmc_rig.commands.bars import say, shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.design.bench import load_bench
     from emmc_rig.study.design.designing import run_check, run_design
@@ -41,33 +41,34 @@ def design(
     described = load_bench(bench)
     sides = parse_size(size)
     if check:
-        with shown_bars() as bars:
+        with shown_progress() as bars:
             place = out or Path("emmc-design-check")
             checked = run_check(described, scene or [], sides, seed, place, bars)
         _show(checked.simulated)
         ranks = ", ".join(f"{name} {rank:+.2f}" for name, rank in checked.ranks.items())
-        typer.echo(f"rank correlation of theory with simulation: {ranks}")
-        typer.echo(f"open {checked.page}")
+        tell(f"rank correlation of theory with simulation: {ranks}")
+        tell(f"open {checked.page}")
+        give_result(place)
         return
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         place = out or Path("emmc-design")
         designed = run_design(described, scene or [], sides, seed, place, bars)
     best = designed.found.expected
     loss_db = designed.found.ideal_db - best.psnr_db
-    typer.echo(designed.found.winner.label)
-    typer.echo(
+    tell(designed.found.winner.label)
+    tell(
         f"expected {best.psnr_db:.2f} dB, {best.light:.0%} of the light, Fresnel number "
         f"{best.fresnel:.2g}: diffraction costs {loss_db:.2f} dB"
     )
     _show(designed.simulated)
-    typer.echo(designed.verdict)
+    tell(designed.verdict)
     for line in designed.left_out:
         say("left out", line)
-    typer.echo(f"open {designed.page}")
+    tell(f"open {designed.page}")
+    give_result(place)
 
 
 def _show(found: Sequence[Simulated]) -> None:
-    from emmc_rig.commands.bars import show_table
     from emmc_rig.study.design.design_page import simulated_table
 
     heads, rows = simulated_table(found)

@@ -10,14 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
-from rich.table import Table
 from rich.text import Text
 
 from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.commands.output import (
+    Quiet,
+    give_result,
+    json_wanted,
+    show_table,
+    shown_progress,
+    tell,
+)
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file, refuse_inside_session
 
@@ -63,11 +68,10 @@ def register(app: typer.Typer) -> None:
 def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
     """Tell what a camera is, and what it can be set to."""
     camera = _chosen(camera, rig)
-    table = Table("camera", camera, box=SIMPLE)
     with closing(open_camera(camera)) as device:
-        for name, value in camera_rows(device):
-            table.add_row(name, value)
-    Console().print(table)
+        rows = list(camera_rows(device))
+    show_table(("camera", camera), rows)
+    give_result(camera=camera, details=dict(rows))
 
 
 def snap(
@@ -84,11 +88,15 @@ def snap(
     with closing(open_camera(_chosen(camera, rig))) as device:
         folder = frames_folder(out)
         choose(device, exposure, gain)
-        for _ in range(count):
-            with _progress(device):
-                frame = device.snap()
-            saved = save_frame(folder, frame)
-            typer.echo(f"{saved}: {frame_line(frame, frame_figures(frame))}")
+        saved = []
+        with shown_progress() as progress:
+            for number in range(count):
+                progress.begin(f"picture {number + 1} of {count}, MB")
+                with _followed(device, progress):
+                    frame = device.snap()
+                saved.append(str(save_frame(folder, frame)))
+                tell(f"{saved[-1]}: {frame_line(frame, frame_figures(frame))}")
+    give_result(out, saved=saved)
 
 
 def live(
@@ -112,7 +120,8 @@ def live(
     device = open_camera(_chosen(camera, rig))
     with closing(device), pressed_keys() as pressed, suppress(KeyboardInterrupt):
         choose(device, exposure, gain)
-        showing = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        drawn_live = console.is_terminal and not json_wanted.get()
+        showing = Live(console=console, auto_refresh=False) if drawn_live else None
         with showing or nullcontext(), closing(_frames(device)) as stream:
             for number, frame in enumerate(itertools.islice(stream, frames), start=1):
                 figures = frame_figures(frame)
@@ -122,7 +131,7 @@ def live(
                     folder = folder or frames_folder(out)
                     line += f"; saved {save_frame(folder, frame)}"
                 if showing is None:
-                    typer.echo(line)
+                    tell(line)
                 else:
                     drawn = Group(histogram_text(histogram(frame)), Text(line))
                     showing.update(drawn, refresh=True)
@@ -236,17 +245,19 @@ def _frames(device: Camera) -> Generator[RawFrame, None, None]:
 
 
 @contextmanager
-def _progress(device: Any) -> Iterator[None]:
-    """Show how a picture comes over the wire, on a terminal, where the camera reports it."""
-    console = Console(stderr=True)
-    if not console.is_terminal or not hasattr(device, "on_progress"):
+def _followed(device: Any, progress: Quiet) -> Iterator[None]:
+    """Show how a picture comes over the wire, where the camera reports it."""
+    if not hasattr(device, "on_progress"):
         yield
         return
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("picture")
-        device.on_progress = lambda done, size: progress.update(task, completed=done, total=size)
-        try:
-            yield
-        finally:
-            device.on_progress = lambda done, size: None
+    before = device.on_progress
+
+    def follow(done: int, size: int) -> None:
+        before(done, size)
+        progress.at(done // 1_000_000, size // 1_000_000)
+
+    device.on_progress = follow
+    try:
+        yield
+    finally:
+        device.on_progress = before

@@ -16,12 +16,11 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from emmc_rig.capture.signals import ENDING, handled
-from emmc_rig.commands.bars import show_table
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
+from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 from emmc_rig.commands.stage_scale import register as register_scale
 from emmc_rig.errors import AppError
 
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from drivers.stage import Stage
 
 app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
-_told = Console(stderr=True)
 
 StageOption = Annotated[
     str | None,
@@ -67,7 +65,7 @@ def list_devices(rig: RigOption = None) -> None:
     _list_cameras()
     ports = list_serial_ports()
     if not ports:
-        typer.echo("no serial port: plug a stage in, or try --rig simulated")
+        tell("no serial port: plug a stage in, or try --rig simulated")
         return
     rows = []
     for port in ports:
@@ -91,10 +89,10 @@ def _list_cameras(backend: Any = None) -> None:
         try:
             found += [(kind, one) for one in list_usb(interface, backend)]
         except DriverError as fault:
-            typer.echo(f"USB cameras cannot be listed: {fault}")
+            tell(f"USB cameras cannot be listed: {fault}")
             return
     if not found:
-        typer.echo("no USB camera: plug one in and switch it on, or try --camera simulated")
+        tell("no USB camera: plug one in and switch it on, or try --camera simulated")
         return
     refused = "no: see `emmc-rig devices udev-rule`"
     show_table(
@@ -121,13 +119,16 @@ def probe(
     logging.getLogger("drivers").setLevel(logging.ERROR)
     if rig is not None:
         protocol = simulated_protocol(rig)
-        typer.echo(f"simulated:{protocol}: {probe_simulated(protocol)}")
+        tell(f"simulated:{protocol}: {probe_simulated(protocol)}")
         return
     chosen = ports or [port.device for port in list_serial_ports() if port.guess]
     if not chosen:
         raise AppError("no port with a known adapter: name the ports to ask")
-    for port in chosen:
-        typer.echo(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
+    with shown_progress() as progress:
+        progress.begin("ask", len(chosen))
+        for port in chosen:
+            tell(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
+            progress.step(port)
 
 
 @app.command()
@@ -141,7 +142,8 @@ def info(stage: StageOption = None, rig: RigOption = None) -> None:
 def home(axes: AxesArgument = None, stage: StageOption = None, rig: RigOption = None) -> None:
     """Find the reference of the axes, and show where they are."""
     with _opened(stage, rig) as opened:
-        opened.home(axes or None)
+        with shown_progress("home"):
+            opened.home(axes or None)
         _show(opened)
 
 
@@ -165,17 +167,20 @@ def jog(
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
-        if home_first:
-            opened.home([axis])
-        if signal_on is not None:
-            if not isinstance(opened, SignallingStage):
-                raise AppError("--signal: only Zaber and Grbl raise an output on arrival")
-            target_um = distance_um + (0.0 if to else opened.position_um(axis))
-            at_um = opened.move_and_signal_um(axis, target_um, signal_on)
-        else:
-            move = opened.move_to_um if to else opened.move_by_um
-            at_um = move({axis: distance_um})[axis]
-        typer.echo(f"{axis} at {at_um:.3f} um")
+        if signal_on is not None and not isinstance(opened, SignallingStage):
+            raise AppError("--signal: only Zaber and Grbl raise an output on arrival")
+        with shown_progress("home" if home_first else "move") as progress:
+            if home_first:
+                opened.home([axis])
+                progress.begin("move")
+            if signal_on is not None and isinstance(opened, SignallingStage):
+                target_um = distance_um + (0.0 if to else opened.position_um(axis))
+                at_um = opened.move_and_signal_um(axis, target_um, signal_on)
+            else:
+                move = opened.move_to_um if to else opened.move_by_um
+                at_um = move({axis: distance_um})[axis]
+        tell(f"{axis} at {at_um:.3f} um")
+        give_result(axis=axis, at_um=at_um)
 
 
 @app.command()
@@ -206,12 +211,12 @@ def serve(
         server = TcpServer(firmware, host, int(number))
 
     def ended(number: int, frame: FrameType | None) -> None:
-        _told.print(f"emmc-rig: no longer serving ({signal.Signals(number).name})")
+        say("emmc-rig", f"no longer serving ({signal.Signals(number).name})")
         raise typer.Exit(128 + number)
 
     try:
         with handled(ended, ENDING), server:
-            typer.echo(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
+            tell(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
             while True:
                 time.sleep(1.0)
     except OSError as fault:
@@ -223,7 +228,7 @@ def udev_rule() -> None:
     """Print the udev rule that lets a user open the devices (Linux)."""
     from drivers.ports import udev_rule_path
 
-    typer.echo(udev_rule_path().read_text(encoding="utf-8"), nl=False)
+    tell(udev_rule_path().read_text(encoding="utf-8").removesuffix("\n"))
 
 
 @app.command()
@@ -242,7 +247,10 @@ def bench(
         u3v_timings,
     )
 
-    with nullcontext() if out is None else result_folder(out, "devices bench") as folder:
+    with (
+        nullcontext() if out is None else result_folder(out, "devices bench") as folder,
+        shown_progress("stage commands") as progress,
+    ):
         timings = stage_timings(repeats)
         show_table(
             ("stage", "command", "exchanges", "ms", "ms for each exchange"),
@@ -252,37 +260,41 @@ def bench(
                 for one in timings
             ],
         )  # fmt: skip
+        progress.begin("pictures")
         picture = picture_timing()
-        typer.echo(
+        tell(
             f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
             f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times "
             "rawpy alone"
         )
+        progress.begin("USB3 Vision")
         streams = list(u3v_timings())
         for one in streams:
-            typer.echo(
+            tell(
                 f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
                 f"{one.gigabytes_per_s:.2f} GB/s"
             )
+        progress.begin("triggers")
         trigger, session = trigger_timing(), capture_timing()
         for what, one in (
             ("a frame at each step", trigger),
             ("shots of `emmc-rig capture`", session),
         ):
-            typer.echo(
+            tell(
                 f"{what}, {one.vibration_ms:g} ms of vibration, {one.exposure_ms:g} ms of exposure "
                 f"(simulated): {one.asked_ms:.1f} ms a frame asked for, {one.triggered_ms:.1f} ms "
                 "triggered by the stage's arrival"
             )
+        metrics = {
+            "stage_commands": [one.as_dict() for one in timings],
+            "picture": picture.as_dict(),
+            "trigger": trigger.as_dict(),
+            "triggered_session": session.as_dict(),
+            "usb3_vision": [one.as_dict() for one in streams],
+        }
         if folder is not None:
-            metrics = {
-                "stage_commands": [one.as_dict() for one in timings],
-                "picture": picture.as_dict(),
-                "trigger": trigger.as_dict(),
-                "triggered_session": session.as_dict(),
-                "usb3_vision": [one.as_dict() for one in streams],
-            }
             write_metrics(folder, metrics)
+    give_result(metrics=metrics)
 
 
 @contextmanager
@@ -301,7 +313,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
             yield opened
         except KeyboardInterrupt as stop:
             notes = getattr(stop, "__notes__", ["the stage was stopped"])
-            _told.print("; ".join(notes), highlight=False, soft_wrap=True)
+            say("stopped", "; ".join(notes))
             raise
         except DriverError as fault:
             notes = getattr(fault, "__notes__", [])
@@ -322,13 +334,15 @@ def signals_interrupt() -> Iterator[None]:
 def _show(stage: Stage) -> None:
     from drivers.errors import NotHomedError
 
-    rows = []
+    rows, axes = [], {}
     for axis in stage.axes:
         low_um, high_um = stage.limits_um(axis)
         try:
-            homed, position = "yes", f"{stage.position_um(axis):.3f}"
+            axes[axis] = stage.position_um(axis)
+            homed, position = "yes", f"{axes[axis]:.3f}"
         except NotHomedError:
-            homed, position = "no", "unknown"
+            axes[axis], homed, position = None, "no", "unknown"
         speeds = f"{stage.speed_um_s(axis):g}", f"{stage.top_speed_um_s(axis):g}"
         rows.append((axis, homed, position, f"{low_um:g} to {high_um:g}", *speeds))
     show_table(("axis", "homed", "position um", "limits um", "speed um/s", "up to"), rows)
+    give_result(positions_um=axes)

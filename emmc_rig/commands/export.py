@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.output import give_result, shown_progress, tell
+
 
 def export(
     result: Annotated[
@@ -35,15 +37,17 @@ def export(
     if list_formats:
         for one in known.values():
             scene = "; --scene reads it" if one.read else ""
-            typer.echo(f"{one.name:<10} {one.title}: {one.keeps}{scene}")
+            tell(f"{one.name:<10} {one.title}: {one.keeps}{scene}")
+        give_result(formats={one.name: one.keeps for one in known.values()})
         return
     if form not in known:
         raise typer.BadParameter(f"no format {form!r}; there are {', '.join(known)}")
     if result is None:
         raise typer.BadParameter("name a result or a scene, or --list the formats")
     out = out or Path(f"emmc-{form}")
-    with result_folder(out, f"export --format {form}") as folder:
+    with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
         opened = open_export(result, truth)
+        bars.begin("write")
         known[form].write(folder, opened)
         files = [path for path in folder.rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in files)
@@ -60,6 +64,5 @@ def export(
             },
         )
         shown = files[0].relative_to(folder) if len(files) == 1 else None
-    typer.echo(
-        f"wrote {out / shown if shown else out}, {shown_bytes(size)} in {len(files)} file(s)"
-    )
+    tell(f"wrote {out / shown if shown else out}, {shown_bytes(size)} in {len(files)} file(s)")
+    give_result(out)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import OutOption
+from emmc_rig.commands.output import give_result, shown_progress, tell
 
 
 def figure(
@@ -44,15 +45,17 @@ def figure(
         side,
         width,
     )
-    with result_folder(out, "figure") as folder:
+    with result_folder(out, "figure") as folder, shown_progress("read") as bars:
         opened = [open_export(results[0], truth), *(open_export(one) for one in results[1:])]
+        bars.begin("draw")
         drawn = draw_results(opened, settings)
         drawn.save(folder)
         write_metrics(
             folder, {"results": results, "truth": truth, "caption": drawn.caption, **drawn.measured}
         )
-    typer.echo(drawn.caption)
-    typer.echo(f"wrote {out / 'figure.pdf'}, .svg, .png and .txt, the caption")
+    tell(drawn.caption)
+    tell(f"wrote {out / 'figure.pdf'}, .svg, .png and .txt, the caption")
+    give_result(out)
 
 
 def _pair(option: str, text: str) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba.core import event
 
-from emmc_rig.commands.bars import say
+from emmc_rig.commands.output import say
 from emmc_rig.progress import Watcher
 
 SIZE = (48, 64)

@@ -11,6 +11,7 @@ import typer
 
 from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.output import say, shown_progress, tell
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def live(
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
-    if rig is None:
+    if rig != "simulated":
         refuse(context, given_names(context) & {"scene", "size"}, "without --rig simulated")
     if read_only and plan is not None:
         refuse(context, ("plan",), "with --read-only")
@@ -80,23 +81,21 @@ def live(
     if method is not None and psi is None:
         raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
     listening = listening_socket(host, port)
-    with (
-        closing(listening),
-        _watch(rig, camera, stage, design, scene, size, psi, method, plan) as watch,
-    ):
+    with closing(listening), ExitStack() as opened:
+        with shown_progress("open the devices"):
+            watch = opened.enter_context(
+                _watch(rig, camera, stage, design, scene, size, psi, method, plan)
+            )
         token = new_token()
         number = listening.getsockname()[1]
         shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
         address = f"http://{shown}:{number}/{token}/"
-        typer.echo(address)
+        tell(address)
         hosts = LOCAL_HOSTS
         if host not in ("127.0.0.1", "::1", "localhost"):
             hosts = ("*",) if host in EVERYWHERE else (*LOCAL_HOSTS, shown)
-            typer.echo(
-                "careful: others in the network who know this address can "
-                + ("look" if read_only else "look and move the stage"),
-                err=True,
-            )
+            does = "look" if read_only else "look and move the stage"
+            say("careful", f"others in the network who know this address can {does}")
         if browser:
             import webbrowser
 
@@ -105,7 +104,7 @@ def live(
         try:
             Server(application(SetupPage(watch), token, read_only, hosts)).run(sockets=[listening])
         except KeyboardInterrupt:
-            typer.echo("ended; the stage stands")
+            tell("ended; the stage stands")
 
 
 @contextmanager

@@ -6,15 +6,35 @@ An option that would be ignored is refused: wrong usage, in one line.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
+from typer.main import get_command
+
+from emmc_rig.commands.output import emit, json_wanted
+from emmc_rig.errors import ERRORS
 
 TIMED = {"camera", "size", "repeats", "out"}
 STUDIED = {"scene", "camera", "size", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
-    "calibrate": {"drift": {"known", "out"}, "session": {"route", "sensor", "out"}},
+    "calibrate": {
+        "drift": {"known", "out"},
+        "session": {"route", "sensor", "out"},
+        "check": {
+            "camera",
+            "size",
+            "target",
+            "rays",
+            "seed",
+            "leave_out",
+            "few",
+            "stage",
+            "psnr",
+            "out",
+        },
+        "plan": {"camera", "size", "target", "rays", "seed", "leave_out", "few", "frames", "out"},
+    },
     "capture": {"schema": set(), "new": {"out"}},
     "chart": {
         "solvers": {"camera", "dictionary", "out"},
@@ -34,22 +54,63 @@ MODES: dict[str, dict[str, set[str]]] = {
         "verdicts": STUDIED | {"fast", "fault", "method", "seed"},
         "worst": STUDIED | {"fast", "method", "dictionary", "seed"},
     },
+    "train": {"network": {"camera", "views", "steps", "minutes", "seed", "resume", "out"}},
 }
 """By command and mode, as its function names them: what else may be given."""
+NEEDS = {
+    "calibrate": {"known": "drift", "frames": "plan", "psnr": "check", "sensor": "session"},
+    "cameras": {"out": "name"},
+    "chart": {"until": "next_shot"},
+    "export": {"truth": "result"},
+    "train": {"camera": "network", "steps": "network", "minutes": "network"},
+}
+"""By command, an option and the one without which it does nothing."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
 
 class ModalCommand(TyperCommand):
-    """A command that refuses what its mode ignores."""
+    """A command that refuses what its mode ignores, and takes --json."""
+
+    def __init__(self, *args: Any, params: list | None = None, **more: Any) -> None:
+        super().__init__(*args, params=[*(params or ()), _json_option()], **more)
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; raises BadParameter."""
+        before = json_wanted.set(ctx.params.pop("json"))
+        try:
+            return self._run(ctx)
+        except ERRORS as fault:
+            if json_wanted.get():
+                emit("error", text=str(fault))
+            raise
+        finally:
+            json_wanted.reset(before)
+
+    def _run(self, ctx: Any) -> Any:
         given = given_names(ctx)
         for mode, used in MODES.get(self.name or "", {}).items():
             if mode in given:
                 refuse(ctx, given - used - {mode}, f"with {option_of(ctx, mode)}")
                 break
+        for name, needed in NEEDS.get(self.name or "", {}).items():
+            if name in given and needed not in given:
+                refuse(ctx, (name,), f"without {option_of(ctx, needed)}")
         return super().invoke(ctx)
+
+
+def _json_option() -> Any:
+    """Return --json as typer would make it of a command's parameter."""
+    alone = typer.Typer(add_completion=False)
+
+    @alone.command()
+    def command(
+        json: Annotated[
+            bool, typer.Option("--json", help="print progress, results and errors as lines of JSON")
+        ] = False,
+    ) -> None:
+        pass
+
+    return get_command(alone).params[0]
 
 
 def given_names(context: typer.Context) -> set[str]:

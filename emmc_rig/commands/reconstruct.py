@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from emmc_rig.commands.options import DictionaryOption
+from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 
 if TYPE_CHECKING:
@@ -78,7 +79,6 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.commands.bars import console, shown_bars
     from emmc_rig.reconstruct.captures import Request, reconstruct_captures
     from emmc_rig.reconstruct.inputs import load_settings
     from emmc_rig.reconstruct.memory import parse_memory
@@ -102,7 +102,7 @@ def reconstruct(
 
         advice = advice_for(*open_frames(frames[0], psi), budget, want)
         method, why = advice.method, advice.why
-        console.print(why, highlight=False, soft_wrap=True)
+        say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     requests = [
         Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
@@ -110,7 +110,7 @@ def reconstruct(
     ]
     limit = None if memory is None else parse_memory(memory)
     failed, refused = False, False
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         bars.begin(method if len(requests) == 1 else f"{method}, {len(requests)} captures", None)
         done = []
         for request, outcome in reconstruct_captures(
@@ -121,13 +121,14 @@ def reconstruct(
             done.append((request, outcome))
     for request, outcome in done:
         if len(requests) > 1:
-            typer.secho(f"{request.folder}:", bold=True)
+            tell(f"{request.folder}:")
         if isinstance(outcome, Exception):
-            typer.secho(f"failed: {outcome}", fg="red")
+            tell(f"failed: {outcome}", "red")
             failed = True
             continue
         _say_result(outcome, request)
         show_verdict(outcome["verdict"])
+        give_result(request.out)
         refused = refused or outcome["verdict"]["level"] == "do not use"
     if failed or (strict and refused):
         raise typer.Exit(1)
@@ -157,7 +158,6 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
 
 
 def _say_result(metrics: dict, request: Request) -> None:
-    from emmc_rig.commands.bars import say
 
     for line in metrics["screening"]:
         say("screening", line)
@@ -173,13 +173,13 @@ def _say_result(metrics: dict, request: Request) -> None:
     if "blocks" in metrics:
         rows, columns = metrics["blocks"]
         compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"
-    typer.echo(
+    tell(
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     written = ("pictures", "light_field.h5", "result.zarr")
     shown = next(request.out / name for name in written if (request.out / name).exists())
-    typer.echo(f"open {shown}")
+    tell(f"open {shown}")
 
 
 def _list_methods() -> None:
@@ -187,8 +187,9 @@ def _list_methods() -> None:
     from reconstruction.methods import METHODS
 
     for known in METHODS.values():
-        typer.echo(f"{known.name}: {known.title}")
-        typer.echo(f"    assumes  {known.assumes}")
-        typer.echo(f"    use it   {known.when}")
-        typer.echo(f"    costs    {known.cost}")
-    typer.echo(COSTS)
+        tell(f"{known.name}: {known.title}")
+        tell(f"    assumes  {known.assumes}")
+        tell(f"    use it   {known.when}")
+        tell(f"    costs    {known.cost}")
+    tell(COSTS)
+    give_result(methods=list(METHODS))

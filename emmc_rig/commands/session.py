@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
 app = typer.Typer(no_args_is_help=True, help="Sessions of `emmc-rig capture`: look, check, export.")
 
@@ -30,12 +30,9 @@ def list_sessions(
         typer.Option("--verdict", help="of the light field: trust, cannot tell, doubt, do not use"),
     ] = "",
     psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
-    json_lines: Annotated[bool, typer.Option("--json", help="as lines of JSON")] = False,
 ) -> None:
     """List the sessions in a folder and below it: state, frames, camera, verdict, PSNR stated."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column
 
     from emmc_rig.commands.verdict import VERDICT_COLOURS
     from emmc_rig.errors import AppError
@@ -50,36 +47,30 @@ def list_sessions(
     least_db = None if psnr is None else parse_psnr(psnr, "--psnr")
     wanted = Wanted(camera, since, before, verdict, least_db)
     heads = ("session", "state", "frames", "size", "begun", "camera", "verdict", "dB", "title")
-    table = Table(box=SIMPLE)
-    for head in heads:
-        table.add_column(head, overflow="fold")
-    there = found = 0
-    for one in sessions_in(folder):
-        there += 1
-        if not wanted.fits(one):
-            continue
-        found += 1
-        if json_lines:
-            print(json.dumps({**asdict(one), "folder": str(one.folder)}, allow_nan=False))
-        # Its path from here tells sessions of one name in several folders apart.
-        inside = os.path.relpath(one.folder, folder)
-        table.add_row(
-            one.name if inside == "." else inside,
-            one.state,
-            f"{one.stored}/{one.planned}",
-            shown_bytes(one.bytes),
-            one.created[:16],
-            one.camera,
-            one.verdict,
-            "" if one.stated_db is None else f"{one.stated_db:.1f}",
-            one.title,
-        )
+    there, found = 0, []
+    with shown_progress("read sessions") as progress:
+        for one in sessions_in(folder):
+            there += 1
+            progress.step(one.name)
+            if wanted.fits(one):
+                found.append(one)
     if not there:
         raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
     if not found:
         raise AppError(f"{folder}: none of its {there} session(s) is such; ask for less")
-    if not json_lines:
-        Console().print(table)
+    rows = []
+    for one in found:
+        # Its path from here tells sessions of one name in several folders apart.
+        inside = os.path.relpath(one.folder, folder)
+        name = one.name if inside == "." else inside
+        stated = "" if one.stated_db is None else f"{one.stated_db:.1f}"
+        frames, size = f"{one.stored}/{one.planned}", shown_bytes(one.bytes)
+        rows.append(
+            (name, one.state, frames, size, one.created[:16], one.camera, one.verdict, stated,
+             one.title)
+        )  # fmt: skip
+    show_table([Column(head, overflow="fold") for head in heads], rows)
+    give_result(sessions=[{**asdict(one), "folder": str(one.folder)} for one in found])
 
 
 def _is_day(text: str) -> bool:
@@ -95,7 +86,6 @@ def compare(
     sessions: Annotated[list[Path], typer.Argument(help="two session folders, or more")],
 ) -> None:
     """Show in what sessions differ: plan, rig, exposures, verdict, PSNR stated."""
-    from emmc_rig.commands.bars import show_table
     from emmc_rig.session.listing import compared
     from emmc_rig.session.session import Session
 
@@ -103,7 +93,11 @@ def compare(
         raise typer.BadParameter("name two sessions, or more")
     opened = [Session(one) for one in sessions]
     heads = ("", *(one.folder.name for one in opened))
-    show_table(heads, [(name, *values) for name, values in compared(opened)])
+    rows = compared(opened)
+    show_table(heads, [(name, *values) for name, values in rows])
+    give_result(
+        sessions=list(map(str, sessions)), compared={name: list(values) for name, values in rows}
+    )
 
 
 @app.command()
@@ -117,27 +111,28 @@ def show(session: Folder) -> None:
     from emmc_rig.session.verify import counts
 
     listed, opened = summary(session), Session(session)
-    typer.echo(f"{listed.name}: {listed.title}")
-    typer.echo(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
-    typer.echo(f"  {'begun':<12} {listed.created}")
-    typer.echo(f"  {'size':<12} {shown_bytes(listed.bytes)}")
-    typer.echo(f"  {'frames':<12} {listed.stored} of {listed.planned}")
+    tell(f"{listed.name}: {listed.title}")
+    tell(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
+    tell(f"  {'begun':<12} {listed.created}")
+    tell(f"  {'size':<12} {shown_bytes(listed.bytes)}")
+    tell(f"  {'frames':<12} {listed.stored} of {listed.planned}")
     for kind, (done, planned) in counts(opened).items():
-        typer.echo(f"  {kind:<12} {done} of {planned}")
+        tell(f"  {kind:<12} {done} of {planned}")
     if opened.amendments:
         plans = Counter(entry.get("plan", 0) for entry in opened.stored.values())
         for number in range(opened.amendments + 1):
             name = amended_name(PLAN, number)
-            typer.echo(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
+            tell(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
     leftovers, foreign = opened.strangers()
     if leftovers:
-        typer.echo(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
+        tell(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
     for name in foreign:
-        typer.echo(f"  {name}: not of this session")
+        tell(f"  {name}: not of this session")
     for reason in exposure_reasons(shot_exposures(opened)):
-        typer.echo(f"  {reason.level:<12} {reason.what}; {reason.remedy}")
+        tell(f"  {reason.level:<12} {reason.what}; {reason.remedy}")
     for kind, line in events(opened):
-        typer.echo(f"  {kind:<12} {line}")
+        tell(f"  {kind:<12} {line}")
+    give_result(**{**asdict(listed), "folder": str(listed.folder)})
 
 
 @app.command()
@@ -148,16 +143,19 @@ def verify(session: Folder) -> None:
     from emmc_rig.session.verify import verify as verified
 
     opened = Session(session)
-    with _bar("verify", len(opened.stored)) as step:
-        verdict = verified(opened, lambda frame_id: step())
+    with shown_progress() as progress:
+        progress.begin("verify", len(opened.stored))
+        verdict = verified(opened, progress.step)
     for line in verdict.lines():
-        typer.echo(line)
+        tell(line)
+    if verdict.is_complete:
+        tell(f"complete: {verdict.good} frames, every one as the journal says")
+    give_result(complete=verdict.is_complete, good=verdict.good, planned=verdict.planned)
     if not verdict.is_complete:
         raise AppError(
             f"{session}: {verdict.good} of {verdict.planned} frames are good; "
             f"go on with: emmc-rig capture {session}"
         )
-    typer.echo(f"complete: {verdict.good} frames, every one as the journal says")
 
 
 @app.command()
@@ -174,9 +172,11 @@ def export(
     from emmc_rig.session.session import Session
 
     opened = Session(session)
-    with _bar("export", len(opened.needed)) as step:
-        export_hdf5(opened, out, compress, lambda frame_id: step())
-    typer.echo(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
+    with shown_progress() as progress:
+        progress.begin("export", len(opened.needed))
+        export_hdf5(opened, out, compress, progress.step)
+    tell(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
+    give_result(out, bytes=out.stat().st_size)
 
 
 @app.command()
@@ -191,12 +191,13 @@ def prune(
     from emmc_rig.session.session import Session
 
     Session(session)  # no lock for what is none
-    with held(session):
+    with held(session), shown_progress("look"):
         removed, size = pruned(Session(session), dry_run)
     verb = "would remove" if dry_run else "removed"
     for name in removed:
-        typer.echo(f"{verb} {name}")
-    typer.echo(f"{verb} {len(removed)} leftover(s), {shown_bytes(size)}")
+        tell(f"{verb} {name}")
+    tell(f"{verb} {len(removed)} leftover(s), {shown_bytes(size)}")
+    give_result(removed=removed, bytes=size, dry_run=dry_run)
 
 
 @app.command()
@@ -213,8 +214,10 @@ def sheet(
 
     opened = Session(session)
     folder = out or session
-    write_sheet(opened, folder, pictures)
-    typer.echo(f"open {folder / REPORT}")
+    with shown_progress("draw"):
+        write_sheet(opened, folder, pictures)
+    tell(f"open {folder / REPORT}")
+    give_result(report=str(folder / REPORT))
 
 
 @app.command()
@@ -231,40 +234,34 @@ def bench(
     from emmc_rig.files.results import write_metrics
     from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
 
-    with nullcontext() if out is None else result_folder(out, "session bench") as results:
+    with (
+        nullcontext() if out is None else result_folder(out, "session bench") as results,
+        shown_progress("capture on idle devices") as progress,
+    ):
         measured = []
         for one in overheads(folder, 300):
             measured.append(one)
-            typer.echo(
+            tell(
                 f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of "
                 f"{one.move_s:g} s: {one.sequencing_ms:.2f} ms each beside the devices, "
                 f"{one.handing_over_ms:.2f} ms handing over; {one.hidden_share:.0%} of hashing and "
                 "writing behind the bench's work"
             )
+        progress.begin("verify")
         rates = verification(folder, shots)
-        typer.echo(
+        tell(
             f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
             f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
             f"threads: {rates.share:.0%} of the slower"
         )
+        progress.begin("list")
         listing_s = listing_seconds(folder, listed)
-        typer.echo(f"listing a session of {listed} shots: {listing_s:.3f} s")
+        tell(f"listing a session of {listed} shots: {listing_s:.3f} s")
+        metrics = {
+            "overhead": [one.as_dict() for one in measured],
+            "verification": rates.as_dict(),
+            "listing": {"shots": listed, "seconds": listing_s},
+        }
         if results is not None:
-            metrics = {
-                "overhead": [one.as_dict() for one in measured],
-                "verification": rates.as_dict(),
-                "listing": {"shots": listed, "seconds": listing_s},
-            }
             write_metrics(results, metrics)
-
-
-@contextmanager
-def _bar(name: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a bar on a terminal; yields what advances it, from any thread."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task(name, total=total)
-        yield lambda: progress.advance(task)
+    give_result(metrics=metrics)

@@ -17,6 +17,7 @@ from emmc_rig.commands.options import (
     ShotsOption,
     SizeOption,
 )
+from emmc_rig.commands.output import give_result, shown_progress, tell
 
 if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
@@ -39,12 +40,13 @@ def simulate(
     from emmc_rig.files.results import parse_size
 
     described = emmc.camera(camera, shots)
-    with result_folder(out, "simulate") as folder:
+    with result_folder(out, "simulate") as folder, shown_progress("simulate"):
         metrics = simulate_into(folder, scene, camera, described, parse_size(size), seed, as_zarr)
-    typer.echo(
+    tell(
         f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "
         f"efficiency {metrics['light_efficiency']:.1%}; in {out}"
     )
+    give_result(out)
 
 
 def simulate_into(

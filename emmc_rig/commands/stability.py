@@ -13,6 +13,7 @@ from emmc_rig.commands.options import (
     SeedOption,
     SizeOption,
 )
+from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
 
 def stability(
@@ -72,7 +73,6 @@ def stability(
     ] = None,
 ) -> None:
     """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
-    from emmc_rig.commands.bars import say, show_table, shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.stability.curves import breaking_rows
     from emmc_rig.study.stability.fault_sweep import CAMERA, planned, stability_settings
@@ -97,7 +97,7 @@ def stability(
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
         screening={None: "both", True: "on", False: "off"}[screening],
     )  # fmt: skip
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         planned(settings)  # raises for wrong names before anything is measured
         switches = {"theory": theory, "numerics": numerics, "mismatch": mismatch}
         wanted = [name for name, on in switches.items() if on]
@@ -110,16 +110,16 @@ def stability(
     shown = [(f"{row.title}, {row.unit}", *row.cells) for row in rows]
     show_table(("fault", *methods), shown, title)
     for line in beside.lines:
-        typer.echo(line)
+        tell(line)
     for line in outcome.left_out:
         say("left out", line)
-    typer.echo(f"open {outcome.page}")
+    tell(f"open {outcome.page}")
+    give_result(out)
 
 
 def _list_faults() -> None:
     from rich.table import Column
 
-    from emmc_rig.commands.bars import show_table
     from emmc_rig.study.stability.faults import FAULTS
 
     show_table(
@@ -129,15 +129,15 @@ def _list_faults() -> None:
             for one in FAULTS.values()
         ],
     )
+    give_result(faults=list(FAULTS))
 
 
 def _verdicts(out: Path, *wanted: Any) -> None:
     """Measure how often verdicts flag results that a fault broke, and good ones."""
-    from emmc_rig.commands.bars import say, show_table, shown_bars
     from emmc_rig.study.stability import detector
 
     settings = detector.detector_settings(*wanted)
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         results = detector.run_detector(settings, out, bars)
     show_table(
         ("fault", "method", "broken: flagged", "good: flagged", "between", "poor", "cannot tell"),
@@ -153,12 +153,12 @@ def _verdicts(out: Path, *wanted: Any) -> None:
     for one in detector.wrong(results):
         kind = "missed" if one.kind == "broken" else "false alarm"
         say(kind, detector.case_words(one))
-    typer.echo(f"open {out / 'verdicts.csv'}")
+    tell(f"open {out / 'verdicts.csv'}")
+    give_result(out)
 
 
 def _worst(out: Path, *wanted: Any) -> None:
     """Measure what harms every method most, and which details it keeps, loses or invents."""
-    from emmc_rig.commands.bars import show_table, shown_bars
     from emmc_rig.study.stability.worst_study import (
         details_table,
         noise_table,
@@ -167,9 +167,10 @@ def _worst(out: Path, *wanted: Any) -> None:
     )
 
     settings = worst_settings(*wanted)
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         outcome = run_worst(settings, out, bars)
     for name in (Path(scene).stem for scene in settings.scenes):
         show_table(*noise_table(name, outcome.noise), name)
         show_table(*details_table(name, outcome.details), name)
-    typer.echo(f"open {outcome.page}")
+    tell(f"open {outcome.page}")
+    give_result(out)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import yaml
 
+from emmc_rig.commands.output import give_result, shown_progress, tell
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -80,12 +81,14 @@ def scale(
                 f"{axis} will be homed, then moved by {counts} counts of unknown length. "
                 "Is its way free?"
             )
-            if not (yes or typer.confirm(question)):
+            if not (yes or typer.confirm(question, err=True)):
                 raise AppError("nothing was moved: clear the way, then answer y")
+            with shown_progress("home"):
+                opened.home([axis])
             if camera is None:
                 steps, readings = measure(opened, axis, counts, places, _asked)
             else:
-                with closing(open_camera(camera)) as device:
+                with closing(open_camera(camera)) as device, shown_progress("measure"):
                     reader = shadow_reader(device, um_per_pixel or 0.0)
                     steps, readings = measure(opened, axis, counts, places, reader)
             found = fit_step_length(steps, readings)
@@ -93,12 +96,15 @@ def scale(
     except (DriverError, CalibrationError) as fault:
         raise AppError("; ".join([str(fault), *getattr(fault, "__notes__", [])])) from fault
     share = found.deviation_um / found.um_per_step
-    typer.echo(
+    tell(
         f"{axis}: {found.um_per_step:.6g} um a count, deviation {100 * share:.2g} %, worst reading "
         f"{found.worst_um:.3g} um off the line" + (", counting downwards" * found.reversed)
     )
-    typer.echo("take the data sheet's own figure if it is within that; for the stage's file:")
-    typer.echo(yaml.safe_dump(settings, sort_keys=False), nl=False)
+    tell("take the data sheet's own figure if it is within that; for the stage's file:")
+    tell(yaml.safe_dump(settings, sort_keys=False).removesuffix("\n"))
+    give_result(
+        axis=axis, um_per_step=found.um_per_step, deviation_um=found.deviation_um, settings=settings
+    )
     if out is not None:
         whole = _merged(config.model_dump(mode="json", exclude_defaults=True), settings)
         with out.open("x", encoding="utf-8") as file:
@@ -110,10 +116,9 @@ def measure(
 ) -> tuple[list[float], list[float]]:
     """Return where the axis counted to be and where it was read, at places over the distance.
 
-    Homes the axis; the places lie about the middle of its travel, and every one is approached
+    The axis is homed; the places lie about the middle of its travel, and every one is approached
     from below. The stage's unit is the count.
     """
-    stage.home([axis])
     low, high = stage.limits_um(axis)
     if counts > high - low:
         raise AppError(f"{axis} has {high - low:.0f} counts of travel: move less than {counts}")
@@ -139,7 +144,7 @@ def scale_settings(config: StageConfig, stage: Any, axis: str, um_per_step: floa
 
 
 def _asked(number: int) -> float:
-    return typer.prompt(f"place {number + 1}: where does it stand, in um", type=float)
+    return typer.prompt(f"place {number + 1}: where does it stand, in um", type=float, err=True)
 
 
 def shadow_reader(camera: Any, um_per_pixel: float) -> ReadPlace:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import OutOption, SeedOption
+from emmc_rig.commands.output import give_result, show, shown_progress, tell
 
 
 def tables(
@@ -31,15 +32,13 @@ def tables(
     out: OutOption = Path("emmc-tables"),
 ) -> None:
     """Reproduce the paper's tables and figures; run it again to go on where it stopped."""
-    from rich.console import Console
-
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.study.tables.cell_sweep import FAST, TablesSettings
     from emmc_rig.study.tables.reproducing import run_tables, shown
 
     settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
     for part in shown(outcome.grids, outcome.findings):
-        Console().print(part)
-    typer.echo(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
+        show(part)
+    tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
+    give_result(out)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import SeedOption
+from emmc_rig.commands.output import give_result, shown_progress, tell
 
 NETWORK_CAMERAS = (
     "scenario-ii-cfa", "rgbw-bayer-1shot", "rgbw-bayer-3shots", "rgbw-mono",
@@ -55,7 +56,6 @@ def train(
     ] = None,
 ) -> None:
     """Train a dictionary of light-field patches, or a network; Ctrl-C leaves a checkpoint."""
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.results import parse_size
 
     if network:
@@ -71,16 +71,17 @@ def train(
         "learning": {"atoms": atoms, "sparsity": sparsity, "iterations": iterations, "seed": seed},
     }
     settings = train_settings(out, scenes or (), leave_out or (), grid, kind, chosen, resume)
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         dictionary, provenance = run(settings, bars)
     last = provenance["history"][-1]
-    typer.echo(
+    tell(
         f"{dictionary.size} atoms from {patches} patches of {len(provenance['sources'])} "
         f"scene(s): error {last['updated_rmse'] or last['coded_rmse']:.5f} with {sparsity} atoms "
         f"per patch; {provenance['learning_seconds']:.1f} s, peak memory "
         f"{provenance['peak_memory_gib']:.2f} GiB"
     )
-    typer.echo(f"wrote {out}; its atoms: {picture_path(out)}")
+    tell(f"wrote {out}; its atoms: {picture_path(out)}")
+    give_result(out, provenance=provenance)
 
 
 def _train_network(
@@ -92,7 +93,6 @@ def _train_network(
     seed: int,
     resume: bool,
 ) -> None:
-    from emmc_rig.commands.bars import shown_bars
     from emmc_rig.files.results import parse_size
     from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
     from reconstruction.unrolled.weights import Architecture
@@ -101,12 +101,13 @@ def _train_network(
     training = NetworkTraining(
         out, tuple(cameras), architecture, steps, minutes, seed=seed, resume=resume
     )
-    with shown_bars() as bars:
+    with shown_progress() as bars:
         weights, learner = train_network(training, bars)
     count = sum(array.size for array in weights.arrays.values())
     last = learner.losses_db[-max(1, learner.steps // 20) :]
-    typer.echo(
+    tell(
         f"{count} weights after {learner.steps} of {steps} steps: {sum(last) / len(last):.2f} dB "
         "on the last twentieth of the random worlds"
     )
-    typer.echo(f"wrote {out}")
+    tell(f"wrote {out}")
+    give_result(out, weights=count, steps=learner.steps, psnr_db=sum(last) / len(last))

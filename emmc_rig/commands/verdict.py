@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import typer
+from emmc_rig.commands.output import tell
 
 VERDICT_COLOURS = {"trust": "green", "cannot tell": "cyan", "doubt": "yellow", "do not use": "red"}
 
 
 def show_reason(level: str, what: str, remedy: str, figure: float) -> None:
     """Print one reason in a line."""
-    typer.secho(f"{level}: {what}; {remedy}", fg=VERDICT_COLOURS[level])
+    tell(f"{level}: {what}; {remedy}", VERDICT_COLOURS[level])
 
 
 def show_verdict(verdict: dict) -> None:
     """Print a verdict, a line for each reason."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
-        typer.secho("trust: frames, Psi and light field agree", fg=colour)
+        tell("trust: frames, Psi and light field agree", colour)
     for reason in verdict["reasons"]:
         show_reason(**reason)

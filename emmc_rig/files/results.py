@@ -92,6 +92,8 @@ def shown_seconds(seconds: float) -> str:
     """Return a duration for people."""
     if seconds < 90:
         return f"{seconds:.0f} s"
+    if seconds < 600:
+        return "{:.0f} min {:.0f} s".format(*divmod(round(seconds), 60))
     if seconds < 5400:
         return f"{seconds / 60:.0f} min"
     return f"{seconds / 3600:.1f} h"

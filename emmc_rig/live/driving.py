@@ -31,7 +31,7 @@ class Driving:
 
     def __init__(self, stage: Stage, publish: Callable[..., None]) -> None:
         self.stage, self._publish = stage, publish
-        self._lock = threading.Lock()
+        self._lock, self._reading = threading.Lock(), threading.Lock()
         self._busy = ""
         self.begun = 0
         self._idle = threading.Event()
@@ -119,7 +119,8 @@ class Driving:
 
     def _carry_out(self) -> None:
         self._read_limits()
-        self._read_positions("")
+        with self._reading:
+            self._publish(stage=self._read_positions(), axes=self._axes())
         while not self._ending.is_set():
             try:
                 steps = self._moves.get(timeout=POLL_S)
@@ -132,23 +133,24 @@ class Driving:
                         step(self.stage)
             except (AppError, DriverError, ValueError) as fault:
                 trouble = str(fault)
-            stopped = self._stopped_by_hand
-            with self._lock:
-                self._busy = ""
-                self._idle.set()
-            self._publish(busy="", stopped=stopped)
-            self._read_positions("" if stopped else trouble)
+            with self._reading:  # whoever sees that it ended sees where it ended, and how
+                unread = self._read_positions()
+                stopped = self._stopped_by_hand
+                with self._lock:
+                    self._busy = ""
+                    self._idle.set()
+                trouble = "" if stopped else trouble
+                self._publish(busy="", stopped=stopped, axes=self._axes(), stage=trouble or unread)
 
     def _follow(self) -> None:
         """Read positions while an axis moves; what goes wrong is the move's to report."""
         while not self._ending.is_set():
-            if self._idle.is_set():
-                self._ending.wait(POLL_S)
-                continue
-            for axis in self.stage.axes:
-                with suppress(DriverError):
-                    self._positions_um[axis] = self.stage.position_um(axis)
-            self._publish(axes=self._axes())
+            with self._reading:
+                if not self._idle.is_set():
+                    for axis in self.stage.axes:
+                        with suppress(DriverError):
+                            self._positions_um[axis] = self.stage.position_um(axis)
+                    self._publish(axes=self._axes())
             self._ending.wait(POLL_S)
 
     def _read_limits(self) -> None:
@@ -156,7 +158,9 @@ class Driving:
             with suppress(DriverError):
                 self._limits_um[axis] = self.stage.limits_um(axis)
 
-    def _read_positions(self, trouble: str) -> None:
+    def _read_positions(self) -> str:
+        """Read where every axis is; returns why one cannot be read, "" where none or not homed."""
+        trouble = ""
         for axis in self.stage.axes:
             self._positions_um[axis] = None
             try:
@@ -165,7 +169,7 @@ class Driving:
                 continue
             except DriverError as fault:
                 trouble = trouble or str(fault)
-        self._publish(axes=self._axes(), stage=trouble)
+        return trouble
 
     def _axes(self) -> Mapping[str, Any]:
         return {

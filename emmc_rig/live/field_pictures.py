@@ -96,18 +96,19 @@ def disparity_of(light_field: Array) -> NDArray[np.float32]:
     along lines of slope d: L_u = -d L_x and L_v = -d L_y, solved by least squares over a window
     and all views (Bolles, Baker and Marimont 1987; as Lucas and Kanade 1981 for flow).
     """
-    grey = light_field.mean(axis=-1, dtype=np.float32)
+    grey = light_field @ np.full(light_field.shape[-1], 1 / light_field.shape[-1], np.float32)
     by_v, by_u, by_y, by_x = (
         np.gradient(grey, axis=axis) if grey.shape[axis] > 1 else np.zeros_like(grey)
         for axis in range(4)
     )
 
-    def gathered(values: Array) -> Array:
-        return cv2.blur(values.sum(axis=(0, 1)), (WINDOW_PX, WINDOW_PX))
+    def gathered(*products: tuple[Array, Array]) -> Array:
+        summed = sum(np.einsum("vuyx,vuyx->yx", one, other) for one, other in products)
+        return cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX))
 
-    power = gathered(by_x**2 + by_y**2)
-    product = gathered(by_u * by_x + by_v * by_y)
-    change = gathered(by_u**2 + by_v**2)
+    power = gathered((by_x, by_x), (by_y, by_y))
+    product = gathered((by_u, by_x), (by_v, by_y))
+    change = gathered((by_u, by_u), (by_v, by_v))
     safe = np.maximum(power, 1e-12)
     found = -product / safe
     left = np.maximum(change - product**2 / safe, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -137,8 +138,16 @@ def preview(frame: RawFrame, balance: Balance = AS_READ) -> NDArray[np.uint8]:
 
 
 def srgb_codes(linear: Array) -> NDArray[np.uint8]:
-    """Return linear light in [0, 1] (any shape) as 8 bits for a display (IEC 61966-2-1)."""
-    return codes_of(srgb_of(linear))
+    """Return linear light in [0, 1] (any shape) as 8 bits for a display (IEC 61966-2-1).
+
+    By a table of 16-bit light, and so within a code of the exact one.
+    """
+    return _display_codes()[codes_of(linear, 16)]
+
+
+@cache
+def _display_codes() -> NDArray[np.uint8]:
+    return codes_of(srgb_of(np.linspace(0, 1, 1 << 16, dtype=np.float32)))
 
 
 def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:

@@ -42,14 +42,17 @@ from emmc_rig.session.decisions import decided_words, decisions, ended, metered_
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import Entry
+from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
 from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
-MOST_PICTURES = 200
+MOST_PICTURES, FIRST_PICTURES = 200, 12
+"""On the page, and of each kind without unfolding the rest."""
 QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
+TONES = {"trust": "good", "doubt": "watch", "do not use": "bad"}
 BOARDS = ("reference", "open")
 """Kinds of frames that show a whiteboard through the whole aperture."""
 HEADINGS = {
@@ -81,7 +84,7 @@ def quick_pictures(session: Session) -> int:
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
-    sections = [*_frames(session, pictures), Section("timeline", "Timeline", _timeline(session))]
+    sections = [Section("timeline", "Timeline", _timeline(session))]
     taken = decisions(session.journal.entries)
     if taken:
         last = ended(session.journal.entries)
@@ -89,7 +92,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         title = "Shots: what they gave, and which was next"
         sections.append(Section("decisions", title, body, "Shots"))
     body = fragment("session_events.html", events=events(session))
-    sections.append(Section("events", "Events", body))
+    sections += [Section("events", "Events", body), *_frames(session, pictures)]
     sources = {
         "command": session.header["command"],
         **session.header["versions"],
@@ -150,6 +153,7 @@ def _cards(session: Session) -> list[Card]:
         Card("Frames", f"{stored} of {planned}", kinds),
         Card("Size", shown_bytes(size), "the camera's own bytes"),
         *_exposure_cards(session),
+        *_light_field_cards(session),
         Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
     ]
     runs = run_entries(session.journal.entries)
@@ -173,6 +177,13 @@ def _exposure_cards(session: Session) -> list[Card]:
     return [Card("Exposure", reached, note, "watch" if reasons else "good")]
 
 
+def _light_field_cards(session: Session) -> list[Card]:
+    """Return the verdict of the light field, once the session is reconstructed."""
+    verdict, stated_db = reconstructed(session.folder)
+    stated = "" if stated_db is None else f"{stated_db:.1f} dB stated"
+    return [Card("Light field", verdict, stated, TONES.get(verdict, ""))] if verdict else []
+
+
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; shots of the scene get the most room."""
     left, balance = pictures, _balance(session)
@@ -185,6 +196,7 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         body = fragment(
             "session_frames.html",
             pictures=[_picture(session, frame, balance) for frame in shown],
+            first=FIRST_PICTURES,
             total=len(frames),
         )
         title = HEADINGS[kind]

@@ -99,7 +99,7 @@ def summary(folder: Path) -> Summary:
     planned = begun["frames"] - (0 if last is None else last["spared_frames"])
     asked = metered(entries)
     planned += 0 if asked is None else len(asked["asked"])
-    verdict, stated_db = _judged(folder / RECONSTRUCTION / METRICS)
+    verdict, stated_db = reconstructed(folder)
     return Summary(
         name,
         title,
@@ -124,8 +124,9 @@ def _camera_name(plan: Path) -> str:
     return str(read.get("camera", "")) if isinstance(read, dict) else ""
 
 
-def _judged(metrics: Path) -> tuple[str, float | None]:
-    """Return verdict and stated PSNR of a reconstruction, "" and None where there is none."""
+def reconstructed(session: Path) -> tuple[str, float | None]:
+    """Return verdict and stated PSNR of its reconstruction, "" and None where there is none."""
+    metrics = session / RECONSTRUCTION / METRICS
     try:
         read = parse_json(metrics.read_bytes(), str(metrics), AppError)
         stated_db = read.get("stated_db")

@@ -23,10 +23,12 @@ import numpy as np
 from pydantic import ValidationError
 
 import reconstruction.adaptive
+from emmc_rig.files.folders import result_folder
+from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
-from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
+from emmc_rig.study.sweep import NotApplicableError, Results, Sweep, csv_text
 from emmc_rig.study.trial import Setup, Trial, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
@@ -77,12 +79,14 @@ class Scaled:
 
 @dataclass(frozen=True)
 class Cost(Figures):
-    """A constant, and the PSNR lost with a factor: on average over captures, and at most."""
+    """A constant, and the PSNR lost with a factor: on average over captures, the standard error of
+    that (0 of one capture), and at most."""
 
     constant: str
     value: str
     factor: float
     mean_db: float
+    error_db: float
     worst_db: float
 
 
@@ -229,8 +233,9 @@ def constant_costs(
             if (trial := replace(at, constant=one, factor=factor)) in results
         ]
         if lost:
-            value = str(one.value)
-            costs.append(Cost(one.label, value, factor, sum(lost) / len(lost), max(lost)))
+            error = float(np.std(lost, ddof=1)) / len(lost) ** 0.5 if len(lost) > 1 else 0.0
+            mean = sum(lost) / len(lost)
+            costs.append(Cost(one.label, str(one.value), factor, mean, error, max(lost)))
     costs.sort(key=lambda cost: -abs(cost.mean_db))
     return costs, sorted(set(sweep.left_out.values()))
 
@@ -241,14 +246,17 @@ def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     captures = [Setup(scene, asked.described, size, asked.seed) for scene in scenes]
     costs, left_out = constant_costs(captures, folder, show)
     show.table(
-        ("constant", "value", "times", "costs dB", "at most"),
+        ("constant", "value", "times", "costs dB", "error", "at most"),
         [
             (one.constant, one.value, f"{one.factor:g}", f"{one.mean_db:+.2f}",
-             f"{one.worst_db:+.2f}")
+             f"{one.error_db:.2f}", f"{one.worst_db:+.2f}")
             for one in costs
         ],
     )  # fmt: skip
     for line in left_out:
         show.note("left out", line)
+    rows = [one.as_dict() for one in costs]
+    with result_folder(folder, "chart --constants", adds=True) as new:
+        write_text(new / "constants.csv", csv_text(rows, form=".3g"))
     about = {"scenes": list(scenes), "camera": asked.camera, "size": list(size)}
-    return {**about, "rows": [one.as_dict() for one in costs], "left_out": left_out}
+    return {**about, "rows": rows, "left_out": left_out}

@@ -10,9 +10,9 @@ did not see (Occam's factor, log det). So it does for l, which differs from leaf
 of several lengths are compared, and the likelihood is their mean. With one length alone a picture
 that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
 
-Operations of a patch: m^2 / 2 (2 + L D) S + m R S + (L D + 4 H) m^3 / 6 with R rays a pixel (25, or
+Operations of a patch: m^2 / 2 (2 + L D) S + m R S + L (D + 4 H) m^3 / 6 with R rays a pixel (25, or
 25 k^2), S distinct separations of them (81), L lengths, D disparities, H pairs of amplitude and
-colourfulness, each probed at 4 of the disparities and at one length.
+colourfulness, each probed at 4 of the disparities.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ def _spectrum(
 @dataclass(frozen=True, eq=False)
 class PatchEvidence:
     """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kind of
-    texture that explains the patch best at the first length, the mean over lengths; kind: (patch,),
-    which of the prior's it is."""
+    texture that explains the patch best, the mean over lengths; kind: (patch,), which of the
+    prior's it is."""
 
     log_likelihood: NDArray[np.float32]
     kind: NDArray[np.int64]
@@ -175,7 +175,7 @@ def patch_evidence(
     tables = np.pad(tables, ((0, 0), (0, -evaluated % TERMS), (0, 0)))
     probed = np.unique(np.linspace(0, len(disparities) - 1, PROBES + 2).round()[1:-1])
     out = np.empty((len(filled), evaluated), dtype=np.float32)
-    chosen = np.zeros(len(filled), dtype=np.int64)
+    chosen = np.zeros((len(filled), len(lengths)), dtype=np.int64)
     noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
     index = offsets.reshape(len(places), len(places)).astype(np.int64)
@@ -207,4 +207,5 @@ def patch_evidence(
         list(pool.map(evaluate, range(0, len(filled), LANES)))
     each = out[:count].reshape(count, len(lengths), -1)
     mean = np.logaddexp.reduce(each, axis=1) - np.float32(np.log(len(lengths)))
-    return PatchEvidence(mean, chosen[:count])
+    likeliest = each.max(axis=-1).argmax(axis=1)
+    return PatchEvidence(mean, chosen[np.arange(count), likeliest])

@@ -254,7 +254,7 @@ def evidence(
     out,
     chosen,
 ):
-    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane,).
+    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane, length).
 
     A hypothesis is a length of the texture, and a disparity: all disparities of the first, ...
     data, ridge: (shot, pixel_y, pixel_x), readings less those of the mean, their variances.
@@ -263,8 +263,7 @@ def evidence(
     apart. tables: (offset, hypothesis, wave), the texture's correlation, padded with zeros to a
     multiple of TERMS hypotheses. amplitudes, chromas: (kind,), variance of luminance,
     times scales (lane,), and of a chrominance over that of luminance. probes: indices of
-    the disparities at which every kind is compared, at the first length; out is that of the best of
-    them, `chosen`.
+    the disparities at which every kind is compared; out is that of the best of them, `chosen`.
     """
     stored = weights.shape[4]
     readings = places.shape[0]
@@ -321,23 +320,29 @@ def evidence(
     likelihood = np.empty(lanes, np.float32)
     best = np.empty(lanes, np.float32)
     strength, chroma = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    best[:] = -np.inf
-    for e in range(amplitudes.size):
+    lengths = chosen.shape[1]
+    each = hypotheses // lengths
+    for length in range(lengths):
+        best[:] = -np.inf
+        for e in range(amplitudes.size):
+            for lane in range(lanes):
+                strength[lane] = amplitudes[e] * scales[lane]
+                chroma[lane] = chromas[e]
+            for h in probes:
+                _fill(sums[length * each + h], known, seen, strength, chroma, tiles, values)
+                _log_likelihood(
+                    tiles, values, measured, freedom, inverses, product, square, likelihood
+                )
+                for lane in range(lanes):
+                    if likelihood[lane] > best[lane]:
+                        best[lane] = likelihood[lane]
+                        chosen[lane, length] = e
         for lane in range(lanes):
-            strength[lane] = amplitudes[e] * scales[lane]
-            chroma[lane] = chromas[e]
-        for h in probes:
+            kind = chosen[lane, length]
+            strength[lane] = amplitudes[kind] * scales[lane]
+            chroma[lane] = chromas[kind]
+        for h in range(length * each, (length + 1) * each):
             _fill(sums[h], known, seen, strength, chroma, tiles, values)
             _log_likelihood(tiles, values, measured, freedom, inverses, product, square, likelihood)
             for lane in range(lanes):
-                if likelihood[lane] > best[lane]:
-                    best[lane] = likelihood[lane]
-                    chosen[lane] = e
-    for lane in range(lanes):
-        strength[lane] = amplitudes[chosen[lane]] * scales[lane]
-        chroma[lane] = chromas[chosen[lane]]
-    for h in range(hypotheses):
-        _fill(sums[h], known, seen, strength, chroma, tiles, values)
-        _log_likelihood(tiles, values, measured, freedom, inverses, product, square, likelihood)
-        for lane in range(lanes):
-            out[lane, h] = likelihood[lane]
+                out[lane, h] = likelihood[lane]

@@ -96,7 +96,10 @@ class Mean:
 
 
 def averaged(survey: Survey, fits: Fits) -> Mean:
-    """Return the mean of the models, by the held-out readings; the first model without any."""
+    """Return the mean of the models, by the held-out readings; the first model without any.
+
+    Their light fields are given back: what follows needs as much memory, and none of them.
+    """
     given, held = survey.given, survey.held
     if not held.any():
         shares = np.zeros((len(fits.residuals), *held.shape[1:]), dtype=np.float32)
@@ -106,6 +109,7 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     shares = mixture.shares_of(fits.residuals, given.noise, held)
     light_field = mixture.mean_light_field(fits.light_fields, shares, k)
     spread = mixture.spread(fits.light_fields, light_field, shares, k)
+    fits.light_fields.clear()
     residual = sum(share * one for share, one in zip(shares, fits.residuals, strict=True))
     sure = deviation(fits.scene, survey.scale, spread, np.asarray(residual), given.noise, held)
     return Mean(light_field, shares, sure)

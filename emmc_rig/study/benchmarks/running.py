@@ -86,6 +86,7 @@ def run_benchmark(
     camera = camera or one.camera
     wanted = Asked(camera, find_camera(camera), **asked)
     measure: Measure = import_module(f"emmc_rig.study.{one.module}").benchmark
+    show.begin(name, None)
     if one.journal:
         with sweep_folder(out, one.journal, command) as folder:
             metrics = measure(wanted, show, folder)

@@ -1,4 +1,4 @@
-"""What a capture shows: bar, time left and the frame's histogram on a terminal, else plain lines.
+"""What a capture shows: bar, time left and the frame's histogram on a terminal; words elsewhere.
 
 On a terminal p pauses and resumes, and q stops after the present frame.
 """
@@ -6,21 +6,13 @@ On a terminal p pauses and resumes, and q stops after the present frame.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from drivers.raw import RawFrame
@@ -28,6 +20,7 @@ from emmc_rig.capture.checks import Figures
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.keyboard import pressed_keys
 from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
@@ -41,21 +34,13 @@ class CaptureDisplay(CaptureWatcher):
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
-        self._progress = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.description}"),
-            console=console,
-        )
+        self._progress = Progress(*columns(), console=console)
         self._task: TaskID | None = None
         self._histogram = Text()
         self._line = Text()
         self._live: Live | None = None
-        self._done = self._planned = 0
         self._asking = False
-        self._left = ""
+        self._left = self._doing = ""
 
     @contextmanager
     def shown(self) -> Iterator[None]:
@@ -69,6 +54,7 @@ class CaptureDisplay(CaptureWatcher):
             Live(console=self._console, get_renderable=self._drawn, refresh_per_second=8) as live,
         ):
             self._live = live
+            self._task = self._progress.add_task("open the rig", total=None, detail="")
             listener = threading.Thread(target=self._listen, args=(pressed, ended), name="keys")
             listener.start()
             try:
@@ -94,42 +80,34 @@ class CaptureDisplay(CaptureWatcher):
 
     def begin(self, done: int, planned: int) -> None:
         """Start the bar."""
-        self._done, self._planned = done, planned
-        self._task = self._progress.add_task("frames", total=planned, completed=done, left="")
-        if not self._console.is_terminal and done:
+        if self._task is not None:
+            self._progress.update(self._task, description="frames", total=planned, completed=done)
+        if done:
             self.tell(f"{done} of {planned} frames are there already")
 
     def more(self, planned: int) -> None:
         """Lengthen the bar."""
-        self._planned = planned
         if self._task is not None:
             self._progress.update(self._task, total=planned)
 
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Say what is under way."""
-        if self._live is not None and self._task is not None and name != "write":
+        if name != "write":
             paused = "paused, p goes on: " if self._control.paused else ""
-            self._progress.update(self._task, description=f"{paused}{frame.id}: {name}")
+            self._doing = f"{paused}{frame.id}: {name}"
+            self._update()
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
         """Show the frame's histogram."""
+        if self._live is None:
+            return
         span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
-        line = (
+        few = replace(frame, mosaic=thinned(frame.mosaic))
+        self._histogram = histogram_text(histogram(few))
+        self._line = Text(
             f"{planned.id}: {frame.exposure_s or 0:g} s, brightest {found.bright_dn / span:.0%} of "
             f"white, saturated {found.saturated:.2%}"
         )
-        if self._live is not None:
-            few = replace(frame, mosaic=thinned(frame.mosaic))
-            self._histogram = histogram_text(histogram(few))
-            self._line = Text(line)
-        elif not self._console.is_terminal:
-            self._console.print(
-                f"{time.strftime('%H:%M:%S')} {self._done + 1}/{self._planned} {line}"
-                + (f"; {self._left}" if self._left else ""),
-                highlight=False,
-                soft_wrap=True,
-            )
-            self._done += 1
 
     def stored(self, frame: PlannedFrame) -> None:
         """Advance the bar."""
@@ -140,8 +118,7 @@ class CaptureDisplay(CaptureWatcher):
         """Show how long the rest will take."""
         unknown = f", and the exposures of {guessed} not metered yet" if guessed else ""
         self._left = f"about {shown_seconds(seconds)} left{unknown}"
-        if self._task is not None:
-            self._progress.update(self._task, left=self._left)
+        self._update()
 
     def paused(self, reason: str) -> None:
         """Say why nothing happens."""
@@ -154,6 +131,11 @@ class CaptureDisplay(CaptureWatcher):
     def tell(self, message: str) -> None:
         """Print a line."""
         self._console.print(f"emmc-rig capture: {message}", highlight=False, soft_wrap=True)
+
+    def _update(self) -> None:
+        if self._task is not None:
+            detail = "; ".join(filter(None, (self._left, self._doing)))
+            self._progress.update(self._task, detail=detail)
 
     def _drawn(self) -> Group:
         return Group(self._histogram, self._line, self._progress)

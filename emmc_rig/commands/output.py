@@ -1,0 +1,221 @@
+"""What a command shows: progress on a terminal, results in words; with --json all as JSON lines.
+
+Progress goes to standard error, and only to a terminal. With `--json` standard output has one JSON
+object a line, and nothing else:
+
+| event | facts |
+|---|---|
+| `stage` | `stage`, `steps`: it begins; null where their number is not known |
+| `step` | `stage`, `done`, `steps`, `detail` |
+| `message` | `text`: a result in words |
+| `note` | `label`, `text`: a warning, or what is missing |
+| `table` | `title`, `heads`, `rows` |
+| `result` | the command's result: `out`, `metrics` as metrics.json has them, or facts of its own |
+| `error` | `text`: the command failed |
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.box import SIMPLE
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from emmc_rig.errors import StoppedError
+
+if TYPE_CHECKING:
+    from reconstruction.result import Progress as SolverProgress
+
+console = Console(stderr=True)
+json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
+"""Whether the running command was given --json."""
+
+
+def tell(text: str = "", style: str | None = None) -> None:
+    """Show a result in words. style: its colour."""
+    if json_wanted.get():
+        emit("message", text=text)
+    else:
+        typer.secho(text, fg=style)
+
+
+def say(label: str, text: object, style: str = "yellow") -> None:
+    """Print one line to standard error; brackets in the text are brackets, not markup."""
+    if json_wanted.get():
+        emit("note", label=label, text=str(text))
+        return
+    line = Text.assemble((f"{label}:", style), " ", str(text))
+    console.print(line, highlight=False, soft_wrap=True)
+
+
+def show(drawn: RenderableType) -> None:
+    """Print what rich draws to standard output; a script has it in the result."""
+    if not json_wanted.get():
+        Console().print(drawn)
+
+
+def show_table(heads: Sequence[Any], rows: Iterable[Sequence[Any]], title: str = "") -> None:
+    """Print a table to standard output. heads: names, or columns of rich."""
+    if json_wanted.get():
+        names = [str(getattr(head, "header", head)) for head in heads]
+        emit("table", title=title, heads=names, rows=[list(map(str, row)) for row in rows])
+        return
+    table = Table(*heads, title=title or None, box=SIMPLE)
+    for row in rows:
+        table.add_row(*row)
+    show(table)
+
+
+def give_result(out: Path | None = None, **facts: Any) -> None:
+    """Give the command's result to a script; out: a folder with metrics.json, or a file."""
+    if not json_wanted.get():
+        return
+    if out is not None:
+        metrics = out / "metrics.json"
+        if metrics.is_file():
+            facts = {"metrics": json.loads(metrics.read_text(encoding="utf-8")), **facts}
+        facts = {"out": str(out), **facts}
+    emit("result", **facts)
+
+
+def emit(event: str, **facts: Any) -> None:
+    """Print an event as one line of JSON."""
+    print(json.dumps({"event": event, **facts}, allow_nan=False), flush=True)
+
+
+class Quiet:
+    """A `Watcher` that shows no progress, and what a study shows beside it."""
+
+    line = staticmethod(tell)
+    note = staticmethod(say)
+    table = staticmethod(show_table)
+
+    def begin(self, stage: str, steps: int | None = None) -> None:
+        """Begin a stage; the one before is done. steps: None where not known."""
+
+    def step(self, detail: str = "") -> None:
+        """Show that one step more is done; from any thread."""
+
+    def at(self, done: float, steps: float | None, detail: str = "") -> None:
+        """Show how many steps are done."""
+
+    def advance(self, progress: SolverProgress) -> None:
+        """Show how far a solver is."""
+        change = progress.relative_change
+        detail = "" if change is None else f"change {change:.1e}"
+        self.at(progress.step, progress.total, detail)
+
+    def finish(self) -> None:
+        """End the last stage."""
+
+
+class Lines(Quiet):
+    """Progress as lines of JSON."""
+
+    def __init__(self) -> None:
+        self._stage: str | None = None
+        self._steps: float | None = None
+        self._done: float = 0
+        self._lock = threading.Lock()
+
+    def begin(self, stage: str, steps: int | None = None) -> None:
+        """Print a line."""
+        self._stage, self._steps, self._done = stage, steps, 0
+        emit("stage", stage=stage, steps=steps)
+
+    def step(self, detail: str = "") -> None:
+        """Print a line."""
+        with self._lock:
+            self._print(self._done + 1, self._steps, detail)
+
+    def at(self, done: float, steps: float | None, detail: str = "") -> None:
+        """Print a line."""
+        with self._lock:
+            self._print(done, steps, detail)
+
+    def _print(self, done: float, steps: float | None, detail: str) -> None:
+        self._done = done
+        emit("step", stage=self._stage, done=done, steps=steps, detail=detail)
+
+
+class Bars(Quiet):
+    """Progress as bars on a terminal."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._task: TaskID | None = None
+
+    def begin(self, stage: str, steps: int | None = None) -> None:
+        """Finish the stage before and start a bar."""
+        self.finish()
+        self._task = self._progress.add_task(stage, total=steps, detail="")
+
+    def step(self, detail: str = "") -> None:
+        """Advance the current bar."""
+        if self._task is not None:
+            self._progress.update(self._task, advance=1, detail=detail)
+
+    def at(self, done: float, steps: float | None, detail: str = "") -> None:
+        """Set the current bar."""
+        if self._task is not None:
+            self._progress.update(self._task, completed=done, total=steps, detail=detail)
+
+    def finish(self) -> None:
+        """Fill the current bar: a solver may stop before its last step."""
+        if self._task is not None:
+            done = self._progress.tasks[-1].completed or 1
+            self._progress.update(self._task, total=done, completed=done, detail="")
+
+
+def columns() -> tuple[ProgressColumn, ...]:
+    """Return what a bar shows: stage, share, steps, time, and a detail."""
+    return (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[detail]}"),
+    )
+
+
+@contextmanager
+def shown_progress(stage: str | None = None) -> Iterator[Quiet]:
+    """Yield what shows progress until the block ends; a stage named here has begun.
+
+    The last bar is filled if the block ends well. A KeyboardInterrupt that says what is kept
+    becomes a StoppedError.
+    """
+    with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
+        shown = (
+            Lines() if json_wanted.get() else Bars(progress) if console.is_terminal
+            else Quiet()
+        )  # fmt: skip
+        if stage is not None:
+            shown.begin(stage)
+        try:
+            yield shown
+        except KeyboardInterrupt as stop:
+            if str(stop):
+                raise StoppedError(str(stop)) from stop
+            raise
+        shown.finish()

@@ -1,0 +1,105 @@
+"""What commands show: progress on a terminal only, and with --json lines of JSON alone."""
+
+import io
+import json
+
+import pytest
+import typer
+from programs import program
+from rich.console import Console
+
+from emmc_rig import cli
+from emmc_rig.commands import output
+
+SIZE = ("--size", "24x32")
+SIMULATE = ("simulate", "--scene", "near-planar", *SIZE, "--out", "frames")
+RESULTS = {
+    "simulate": SIMULATE,
+    "cameras": ("cameras",),
+    "cameras NAME": ("cameras", "rgbw-mono", "--out", "sheet"),
+    "reconstruct": ("reconstruct", "frames", "--method", "tv", "--out", "result"),
+    "reconstruct --list": ("reconstruct", "--list"),
+    "export": ("export", "near-planar", "--format", "png8", "--out", "views"),
+    "export --list": ("export", "--list"),
+    "stability --list": ("stability", "--list"),
+    "devices info": ("devices", "info", "--rig", "simulated"),
+    "devices home": ("devices", "home", "--rig", "simulated"),
+    "devices snap": ("devices", "snap", "--rig", "simulated", "--out", "snaps"),
+    "capture": (
+        "capture", "plan.yaml", "--rig", "simulated", "--scene", "near-planar", *SIZE,
+        "--out", "session",
+    ),
+    "session show": ("session", "show", "session"),
+    "session verify": ("session", "verify", "session"),
+    "session export": ("session", "export", "session", "--out", "session.h5"),
+    "session prune": ("session", "prune", "session"),
+    "session sheet": ("session", "sheet", "session"),
+    "session list": ("session", "list"),
+}  # fmt: skip
+PLAN = "camera: rgbw-bayer-1shot\nshots: [{}]\nwhiteboards: null\ndarks: null\n"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a plan, and what the commands before leave in it."""
+    folder = tmp_path_factory.mktemp("shown")
+    (folder / "plan.yaml").write_text(PLAN)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for command in ("simulate", "capture"):
+            code, _, err = program(*RESULTS[command])
+            assert code == 0, err
+    return folder
+
+
+def test_every_command_takes_json():
+    def all_of(group):
+        for command in group.commands.values():
+            yield from all_of(command) if hasattr(command, "commands") else [command]
+
+    for command in all_of(typer.main.get_command(cli.app)):
+        assert "--json" in [name for one in command.params for name in one.opts], command.name
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_with_json_every_line_is_an_event_and_the_last_one_the_result(folder, monkeypatch, name):
+    monkeypatch.chdir(folder)
+    code, out, err = program(*RESULTS[name], "--json")
+    assert code == 0, err
+    assert err == ""
+    events = [json.loads(line) for line in out.splitlines()]
+    assert [event["event"] for event in events].index("result") == len(events) - 1
+    assert len(events[-1]) > 1
+    metrics = folder / str(events[-1].get("out")) / "metrics.json"
+    if metrics.exists():
+        assert events[-1]["metrics"] == json.loads(metrics.read_text())
+
+
+def test_with_json_what_fails_says_so_in_an_event_and_in_the_exit_code(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = program("session", "show", "nowhere", "--json")
+    (event,) = map(json.loads, out.splitlines())
+    assert code == 1
+    assert event["event"] == "error"
+    assert event["text"] in err
+
+
+def test_steps_of_a_solver_are_events_that_count_to_the_last(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    _, out, _ = program(*RESULTS["reconstruct"], "--json")
+    steps = [one for one in map(json.loads, out.splitlines()) if one["event"] == "step"]
+    counted = [one["done"] for one in steps]
+    assert counted == sorted(counted)
+    assert {one["stage"] for one in steps} == {"tv"}
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_progress_is_drawn_on_a_terminal_and_nowhere_else(folder, monkeypatch, terminal):
+    monkeypatch.chdir(folder)
+    drawn = io.StringIO()
+    monkeypatch.setattr(output, "console", Console(file=drawn, force_terminal=terminal, width=100))
+    code, out, err = program(*RESULTS["simulate"])
+    assert code == 0
+    assert "sensor PSNR" in out
+    assert err == ""
+    assert ("simulate" in drawn.getvalue()) is terminal
