@@ -107,12 +107,16 @@ def test_the_hci_folder_has_the_views_in_hci_s_order(written, export):
     np.testing.assert_array_equal(bottom, export.disparity[-1])
 
 
-def test_hdf5_and_mat_hold_what_their_tools_ask_for(written):
+def test_hdf5_and_mat_hold_what_their_tools_ask_for(written, export):
     with h5py.File(written("hci-hdf5") / "lf.h5") as file:
-        assert np.asarray(file["LF"]).shape == (5, 5, 36, 48, 3)
+        codes = np.asarray(file["LF"])
+        assert codes.shape == (5, 5, 36, 48, 3)
+        views = linear_of(codes[::-1, ::-1] / 255)
+        np.testing.assert_allclose(views, export.light_field, atol=CODE)
         assert (file.attrs["vRes"], file.attrs["xRes"]) == (5, 48)
     held = scipy.io.loadmat(written("lftoolbox") / "light_field.mat")["LF"]
     assert (held.dtype, held.shape) == (np.uint16, (5, 5, 36, 48, 4))
+    np.testing.assert_allclose(held[..., :3] / 65535, export.light_field, atol=1e-5)
 
 
 def test_eslf_interleaves_the_views(written, export):
