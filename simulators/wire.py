@@ -308,7 +308,7 @@ class TcpServer(_Server):
     def _read(self, source: Any) -> bytes:
         if source is self._listener and self._client is not None:
             refused, _ = self._listener.accept()
-            with refused, suppress(ConnectionError):
+            with refused, suppress(OSError):
                 refused.sendall(IN_USE + b"\r\n")
                 refused.shutdown(socket.SHUT_WR)
             return b""
