@@ -185,7 +185,7 @@ def _psi(outcome: Outcome) -> str:
 
 
 def _sensor(sheet_: SensorSheet) -> str:
-    figure, (transfer, linearity, rows) = sheet(3, 5.0, label="temporal variance, DN²")
+    figure, (transfer, linearity, rows) = sheet(3, 4.2, label="temporal variance, DN²")
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
     grid = np.linspace(0, max(curve.mean_dn), 50)
