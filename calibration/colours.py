@@ -77,10 +77,10 @@ def crosstalk(
     return found if found.largest > LEAST_CROSSTALK else None
 
 
-def mixing(mask: ShadowMask, filters: Crosstalk) -> ShadowMask:
-    """Return the mask as pixels see it whose filters let other colours through."""
+def mixing(mask: ShadowMask, seen: Array) -> ShadowMask:
+    """Return the mask as pixels see it whose filters see (filter, colour) of the colours."""
     cells = mask.cells.copy()
-    cells[..., :3] = mask.cells[..., :3] @ filters.seen.T.astype(np.float32)
+    cells[..., :3] = mask.cells[..., :3] @ np.asarray(seen, np.float32).T
     return replace(mask, cells=cells)
 
 

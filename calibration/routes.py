@@ -21,7 +21,7 @@ from calibration.choice import (
     prediction_variance,
     worst,
 )
-from calibration.colours import crosstalk, in_three_colours, mixing, other_colours
+from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.combine import combined
 from calibration.defects import Defects, View, find_defects, loss_variance
 from calibration.errors import CalibrationError
@@ -80,7 +80,7 @@ class Outcome:
 
     frames: exposures that each route used. findings: what is wrong with the bench and was taken
     into account. advice: what to measure again. unwatched: what no whiteboard was there to tell,
-    and what that may cost.
+    and what that may cost. crosstalk: of the colour filters, where it matters.
     """
 
     chosen: str
@@ -94,6 +94,7 @@ class Outcome:
     advice: tuple[str, ...]
     findings: tuple[str, ...] = ()
     unwatched: tuple[str, ...] = ()
+    crosstalk: Crosstalk | None = None
 
     @property
     def calibration(self) -> Calibration:
@@ -151,7 +152,7 @@ def calibrate(
         on_stage("parametric fit")
         seen = as_readings(few, design.layout, good)
         plain = shadow_mask(camera, design.size)
-        mask = plain if seen_colours is None else mixing(plain, seen_colours)
+        mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
         advice += fit_advice(fit)
         parametric = with_misfit(Parametric(fit, mask), seen)
@@ -234,6 +235,7 @@ def calibrate(
         tuple(advice),
         tuple(findings),
         tuple(unwatched(_missing(sets, levels, design, bool(turned)))),
+        seen_colours,
     )
 
 
