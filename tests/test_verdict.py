@@ -15,6 +15,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import FAULTS, trial
 from emmc_rig.study.trial import Setup, trial_of
+from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
@@ -420,3 +421,11 @@ def test_colours_that_one_grey_shot_hardly_shows_cannot_be_told(scene):
     assert "colour filter" in verdict.words
     stated_db = -10 * np.log10(np.square(result.maps["sigma"], dtype=np.float64).mean())
     assert stated_db == pytest.approx(given.psnr_db(result.light_field), abs=3)
+
+
+def test_several_shots_averaged_with_patches_come_near_the_better_of_both_methods():
+    given = trial_of(Setup("wide-disparity", find_camera("rgbw-bayer-3shots"), SIZE, zoom=3))
+    quick = MethodSettings(adaptive=fast(AdaptiveSettings()))
+    level = {name: given.psnr_db(given.solved(name, quick).light_field)
+             for name in ("adaptive", "tv-dict", "adaptive-dict")}  # fmt: skip
+    assert level["adaptive-dict"] > max(level["adaptive"], level["tv-dict"]) - 0.5

@@ -50,12 +50,13 @@ TRIAL_STEPS = 4
 @dataclass(frozen=True, eq=False)
 class Model:
     """What is fitted: Psi, of one colour or three; the centre view's disparity (y, x) and picture
-    (y, x, c) to begin with; the steps."""
+    (y, x, c) to begin with; the steps; whether one plane is all there is."""
 
     psi: ImagingMatrix
     centre: Array
     picture: Array
     texture: TextureSettings
+    planar: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +176,8 @@ def _needed(
         kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
         left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
         still = model.texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
-        model = replace(model, centre=plane.over(psi.size, psi.binning), texture=still)
+        centre = plane.over(psi.size, psi.binning)
+        model = replace(model, centre=centre, texture=still, planar=True)
     if may_be_grey(model.picture):
         grey = replace(model, psi=grey_psi(psi), picture=model.picture.mean(axis=-1, keepdims=True))
         residuals = [_trial(one, bright, held, settings)[held] for one in (model, grey)]

@@ -74,7 +74,7 @@ class Evidence:
         return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
-TOLD = ("decided", "at_end", "share_free", "misfit", "misfit_row", "misfit_column")
+TOLD = ("decided", "at_end", "share_free", "over_plain", "misfit", "misfit_row", "misfit_column")
 """Parameters of a result that bear on whether it can be trusted."""
 
 
