@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.errors import CalibrationError
 from calibration.evidence import Prior, averaged, log_evidence, plane_prior
@@ -283,7 +283,7 @@ def find_drift(
     count = len(KINDS)
     mask_alone = drift[:count]
     statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
-    probability = float(chi2.sf(statistic, count))
+    probability = float(chdtrc(count, statistic))
     moved = displacement_px(mask, placement, drift)
     names = [*KINDS, *(f"brightness_{shot + 1}" for shot in range(1, shots))]
     return Drift(
