@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,10 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     fits.light_fields.clear()
     residual = sum(share * one for share, one in zip(shares, fits.residuals, strict=True))
     sure = deviation(fits.scene, survey.scale, spread, np.asarray(residual), given.noise, held)
+    if sure is not None:
+        # The residuals, on which it is calibrated, do not show it.
+        sigma = np.sqrt(np.square(sure.sigma) + survey.unseen).astype(np.float32)
+        sure = replace(sure, sigma=sigma)
     return Mean(light_field, shares, sure)
 
 

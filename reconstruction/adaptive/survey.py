@@ -30,6 +30,7 @@ from reconstruction.adaptive.parsimony import (
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
+from reconstruction.colour import unseen_colour
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.tv import TVSettings, reconstruct_tv
 
@@ -61,8 +62,9 @@ class Model:
 class Survey:
     """given: as it was. scale: of the scene's contrast; bright: `given` over it. held: readings
     kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
-    disparities. mu: weight of total variation, plain: its light field. model: what is fitted,
-    left_out: in words, what the scene does not need.
+    disparities. unseen: variance by colours that frames do not show, (y, x). mu: weight of total
+    variation, plain: its light field. model: what is fitted, left_out: in words, what the scene
+    does not need.
     """
 
     given: Given
@@ -71,6 +73,7 @@ class Survey:
     held: NDArray[np.bool_]
     unexplained: Array
     volume: search.Volume
+    unseen: Array
     mu: float
     plain: Array
     model: Model
@@ -91,6 +94,7 @@ def surveyed(
     psi, k = given.psi, given.psi.binning
     flat = flat_psi(psi)
     picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
+    unseen = unseen_colour(flat, given.frames, given.usable, picture)
     own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
     scale = min(1.0, own / CONTRAST)
     bright = given.over(scale)
@@ -118,7 +122,7 @@ def surveyed(
     if settings.parsimony:
         model, left_out = _needed(model, volume, bright, held, settings)
     return Survey(
-        given, scale, bright, held, data.readings, volume, mu, plain, model, tuple(left_out)
+        given, scale, bright, held, data.readings, volume, unseen, mu, plain, model, tuple(left_out)
     )
 
 

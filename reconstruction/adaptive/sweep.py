@@ -22,9 +22,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, cubic
-from reconstruction.adaptive.bands import in_bands
 from reconstruction.adaptive.labels import compatibility, posteriors
 from reconstruction.adaptive.search import Volume, interpolated, places
 
