@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.colour import coloured
 from reconstruction.differences import norm_squared
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.patch_term import PatchTerm
@@ -73,7 +74,8 @@ def contrast(guess: Array) -> float:
 def smooth_guess(psi: ImagingMatrix | FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
 
-    Every colour is the ratio of blurred back-projections, as if all views were equal.
+    Every colour is the ratio of blurred back-projections, as if all views were equal; where no
+    pixel has a filter, that is grey, and colours are those that the masks show (`colour`).
     """
     flat = psi if isinstance(psi, FlatPsi) else flat_psi(psi)
     kept = np.where(usable, frames, 0).astype(np.float32)
@@ -84,7 +86,8 @@ def smooth_guess(psi: ImagingMatrix | FlatPsi, frames: Array, usable: NDArray[np
         for image in (kept, seen)
     ]
     floor = 1e-3 * float(blurred[1].mean())
-    return np.maximum(blurred[0], 0) / np.maximum(blurred[1], floor)
+    picture = np.maximum(blurred[0], 0) / np.maximum(blurred[1], floor)
+    return picture if flat.colour is not None else coloured(flat, kept, usable, picture)
 
 
 def first_light_field(psi: ImagingMatrix, guess: Array, patch_term: PatchTerm | None) -> Array:

@@ -412,7 +412,9 @@ def surveyed(
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    settled = _settled(mosaic, read, noise_sigma, use, settings, name == "tv-dict")
+    settled = _settled(
+        mosaic, read, noise_sigma, use, settings, name in ("tv-dict", "adaptive-dict")
+    )
     return Survey(settled, halo, left_out, gains, words, largest)
 
 

@@ -17,11 +17,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 from scipy.stats.qmc import Sobol
 
+from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
 from emmc_rig.model.geometry import centred_grid
 from simulators.flaws import (
@@ -113,8 +114,10 @@ def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, inde
     return at_x, at_y
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@row_kernel("readings", 0, fastmath=True)
 def trace(
+    begin,
+    end,
     scene,
     finer,
     response,
@@ -147,7 +150,7 @@ def trace(
     board = scene.shape[2] == 1
     f, g = finer
     even = falloff.shape[3] == 1
-    for y in prange(rows):
+    for y in range(begin, end):
         passed = np.empty((3, columns), np.float32)
         total = np.zeros(columns)
         seen = np.zeros(columns)
@@ -294,7 +297,7 @@ class Bench:
         self._sensor, self._board, self._lamp, self._seconds = sensor, board, lamp, seconds
         axes = 4 if self._errors.edge_blur_um == 0 else 6
         self._points = ray_points(views, rays_per_view, axes)
-        self._points[..., 4:] = norm.ppf(self._points[..., 4:])
+        self._points[..., 4:] = ndtri(self._points[..., 4:])
         lens = camera.lens
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
         self._falloff = optics.falloff(size, views, lengths_um)

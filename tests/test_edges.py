@@ -59,6 +59,19 @@ def test_an_object_across_the_border_is_no_edge(camera_psi):
     assert found_edges(camera_psi, noisy(camera_psi, light_field)) is None
 
 
+@pytest.mark.parametrize("bright_px", [12, 20])
+def test_a_dark_object_that_ends_beside_the_picture_is_no_edge_unless_it_is_all_along(
+    camera_psi, bright_px
+):
+    light_field, _ = plane_scene(camera_psi, 1.5)
+    light_field[:, :, bright_px:, :4] *= 0.4
+    assert found_edges(camera_psi, noisy(camera_psi, light_field)) is None
+    light_field[:, :, :bright_px, :4] *= 0.4
+    edges = found_edges(camera_psi, noisy(camera_psi, light_field))
+    assert edges is not None
+    assert edges.widths == (0, 0, 4, 0)
+
+
 def test_a_dark_line_inside_a_brighter_one_is_no_edge(camera_psi):
     light_field, _ = plane_scene(camera_psi, 1.5)
     light_field[:, :, -3] *= 0.1

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.adaptive.mixture import mean_light_field, shares_of, spread
+from reconstruction.adaptive.mixture import excess, mean_light_field, shares_of, spread
 
 SHAPE, NOISE = (2, 60, 80), 1e-6
 
@@ -55,3 +55,9 @@ def test_the_spread_is_the_weighted_variance_of_light_fields():
     apart = 0.25 * 0.75 * np.square(fields[0] - fields[1]).mean(axis=-1)
     found = spread(list(fields), mean, shares, 2)
     np.testing.assert_allclose(found, apart, rtol=1e-4, atol=1e-6)
+
+
+def test_the_excess_of_residuals_is_their_square_beyond_the_noise_and_never_0(held):
+    (missed,) = misses(0.01)
+    assert excess(missed, noise(), held) == pytest.approx(1e-4, rel=0.1)
+    assert excess(np.zeros(SHAPE), noise(), held) == pytest.approx(NOISE * (2 / held.sum()) ** 0.5)

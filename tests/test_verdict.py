@@ -14,6 +14,8 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.trial import Setup, trial_of
+from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
@@ -407,3 +409,23 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert verdict["level"] == "do not use"
     assert "\x1b" not in last
     assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
+
+
+@pytest.mark.parametrize("scene", ["deep-occlusions", "near-planar"])
+def test_colours_that_one_grey_shot_hardly_shows_cannot_be_told(scene):
+    given = trial_of(Setup(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
+    result, verdict = reconstruct_judged(
+        "adaptive-fast", given.psi, given.readings, given.noise_sigma, usable=given.usable
+    )
+    assert verdict.level == "cannot tell"
+    assert "colour filter" in verdict.words
+    stated_db = -10 * np.log10(np.square(result.maps["sigma"], dtype=np.float64).mean())
+    assert stated_db == pytest.approx(given.psnr_db(result.light_field), abs=3)
+
+
+def test_several_shots_averaged_with_patches_come_near_the_better_of_both_methods():
+    given = trial_of(Setup("wide-disparity", find_camera("rgbw-bayer-3shots"), SIZE, zoom=3))
+    quick = MethodSettings(adaptive=fast(AdaptiveSettings()))
+    level = {name: given.psnr_db(given.solved(name, quick).light_field)
+             for name in ("adaptive", "tv-dict", "adaptive-dict")}  # fmt: skip
+    assert level["adaptive-dict"] > max(level["adaptive"], level["tv-dict"]) - 0.5

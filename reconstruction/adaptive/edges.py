@@ -28,6 +28,9 @@ ALONG_PX = 6.0
 DARKER = 0.15
 """Share by which every line of an edge is darker than what is within, and the next line by less
 than half of it: 0.22 to 1, and 0.05 at most, on four real light fields. 2x 0.00, 0.5x +1.03 dB."""
+ALL_ALONG = 0.9
+"""Share of its length over which a line of an edge is darker by half of DARKER: on corners of four
+real light fields all of it; of a dark object that ends beside the picture's edge (dragons) 0.73."""
 SUDDEN = 3.0
 """Times more that brightness changes, in squares, at the edge than at the next lines within: at
 least 3.5 on those four. 2x 0.00, 0.5x 0.00 dB."""
@@ -77,10 +80,10 @@ class _Lines:
         floor = 1e-3 * max(float(below.mean()), TINY)
         return np.maximum(above, 0) / np.maximum(below, floor)
 
-    def change(self, line: int) -> tuple[float, float]:
+    def change(self, line: int) -> tuple[float, float, float]:
         """Return by how much a line is brighter than those within: its mean, and mean square.
 
-        As a share of their brightness.
+        As a share of their brightness. Last, over which share of its length it is darker.
         """
         beside = self.colours(slice(line + 1, line + 1 + BESIDE))
         seen = self.seen[line]
@@ -92,6 +95,7 @@ class _Lines:
         return (
             float(relative.mean() / max(brightness.mean(), TINY)),
             float(np.square(relative).mean() / max(np.square(brightness).mean(), TINY)),
+            float((relative < -DARKER / 2 * brightness).mean()),
         )
 
 
@@ -112,10 +116,10 @@ def _lines(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_], side: int) -
 
 def _width(lines: _Lines) -> int:
     """Return how many lines are an edge."""
-    mean, square = zip(*(lines.change(line) for line in range(WIDEST + 1)), strict=True)
+    mean, square, darker = zip(*(lines.change(line) for line in range(WIDEST + 1)), strict=True)
     width = 0
     for last in range(WIDEST):
-        if mean[last] >= -DARKER:
+        if mean[last] >= -DARKER or darker[last] < ALL_ALONG:
             break
         ends = mean[last + 1] > -DARKER / 2
         if ends and square[last] > SUDDEN * max(square[last + 1 :]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +14,18 @@ from reconstruction.adaptive.rest import UNEXPLAINED, misfit_of, rest
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey, in_front
 from reconstruction.adaptive.sweep import swept
-from reconstruction.adaptive.uncertainty import Deviation, deviation
+from reconstruction.adaptive.uncertainty import Deviation, apart, deviation
 
 Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """The models, total variation last if it is one of them. light_fields: (v, u, y, x, c) of each;
-    residuals: frames less what each predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces
-    and texture, at the survey's scale."""
+    """The models of surfaces, another if it is asked for, and total variation last if it is one.
+
+    light_fields: (v, u, y, x, c) of each; residuals: frames less what each predicts, (shot,
+    pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's scale.
+    """
 
     light_fields: list[Array]
     residuals: list[Array]
@@ -31,13 +33,17 @@ class Fits:
 
 
 def fitted_models(
-    survey: Survey, settings: AdaptiveSettings, on_step: Callable[[int], None]
+    survey: Survey,
+    settings: AdaptiveSettings,
+    on_step: Callable[[int], None],
+    other: Callable[[NDArray[np.bool_]], Array] | None = None,
 ) -> Fits:
-    """Return a fit for each of `settings.misfits`, and total variation's.
+    """Return a fit for each of `settings.misfits`, what `other` finds, and total variation's.
 
     All fits but the last search the disparity again with their texture (`sweep`); where that leads
     astray the last one, which keeps what the patches agreed on, predicts held-out readings better.
-    on_step: called with the number of steps done.
+    on_step: called with the number of steps done. other: returns a light field by another method,
+    given which readings to fit.
     """
     given, bright, held, model = survey.given, survey.bright, survey.held, survey.model
     scale = np.float32(survey.scale)
@@ -79,6 +85,9 @@ def fitted_models(
         np.clip(seen, 0, 1, out=seen)
         light_fields.append(np.broadcast_to(seen, given.psi.light_field_shape))
     assert scene is not None
+    if other is not None:
+        light_fields.append(other(given.usable & ~held))
+        residuals.append(given.frames - given.psi.forward(light_fields[-1]))
     if settings.free:
         light_fields.append(survey.plain)
         residuals.append(given.frames - given.psi.forward(survey.plain))
@@ -88,11 +97,13 @@ def fitted_models(
 @dataclass(frozen=True, eq=False)
 class Mean:
     """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sure: its
-    standard deviation, None with too few held-out readings."""
+    standard deviation, None with too few held-out readings. over_plain: its mean square residual of
+    these beyond their noise, over total variation's; None without any."""
 
     light_field: Array
     shares: NDArray[np.float32]
     sure: Deviation | None
+    over_plain: float | None = None
 
 
 def averaged(survey: Survey, fits: Fits) -> Mean:
@@ -110,9 +121,19 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     light_field = mixture.mean_light_field(fits.light_fields, shares, k)
     spread = mixture.spread(fits.light_fields, light_field, shares, k)
     fits.light_fields.clear()
-    residual = sum(share * one for share, one in zip(shares, fits.residuals, strict=True))
-    sure = deviation(fits.scene, survey.scale, spread, np.asarray(residual), given.noise, held)
-    return Mean(light_field, shares, sure)
+    residual = np.asarray(sum(s * one for s, one in zip(shares, fits.residuals, strict=True)))
+    sure = deviation(fits.scene, survey.scale, spread, residual, given.noise, held)
+    plain = (given.frames - given.psi.forward(survey.plain)).astype(np.float32)
+    excess, its_own = (mixture.excess(one, given.noise, held) for one in (residual, plain))
+    over_plain = excess / max(its_own, 1e-20)
+    if sure is not None:
+        # The residuals, on which it is calibrated, show neither.
+        variance = np.square(sure.sigma) + survey.unseen.astype(np.float32)
+        if not survey.model.planar:
+            share = np.float32(over_plain / (1 + over_plain))
+            variance += share * apart(light_field, survey.plain)
+        sure = replace(sure, sigma=np.sqrt(variance))
+    return Mean(light_field, shares, sure, over_plain)
 
 
 def with_rest(survey: Survey, light_field: Array, settings: AdaptiveSettings) -> Array:

@@ -68,12 +68,14 @@ def reconstruct_adaptive(
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     disparity: Array | None = None,
+    other: Callable[[NDArray[np.bool_]], Array] | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
-    it is known, in place of the one searched. Raises ReconstructionError for inputs that do not
+    it is known, in place of the one searched. other: returns a light field (v, u, y, x, c) to
+    average with, given which readings to fit. Raises ReconstructionError for inputs that do not
     fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -94,7 +96,7 @@ def reconstruct_adaptive(
     if edges is not None:
         given = replace(given, usable=given.usable & ~edges.within)
     survey = surveyed(given, settings, known, report)
-    fits = fitted_models(survey, settings, lambda step: report(2 + step))
+    fits = fitted_models(survey, settings, lambda step: report(2 + step), other)
     mean = averaged(survey, fits)
     light_field = (
         with_rest(survey, mean.light_field, settings) if settings.rest else (mean.light_field)
@@ -128,6 +130,7 @@ def reconstruct_adaptive(
             "misfit_row": float(misfit.row),
             "misfit_column": float(misfit.column),
             **({} if decided is None else {"decided": decided}),
+            **({} if mean.over_plain is None else {"over_plain": mean.over_plain}),
             **({} if explained is None else {"explained": explained}),
             **{
                 f"share_{name.replace(' ', '_')}": float(v)

@@ -56,6 +56,16 @@ def shares_of(
     return (inverse / inverse.sum(axis=0)).astype(np.float32)
 
 
+def excess(residual: Array, noise: Array, held: NDArray[np.bool_]) -> float:
+    """Return the mean square of the held-out residuals beyond noise, at least noise's own chance.
+
+    residual, noise (a variance), held: (shot, pixel_y, pixel_x).
+    """
+    allowed = float(noise[held].mean(dtype=np.float64))
+    square = float(np.square(residual[held], dtype=np.float64).mean())
+    return max(square - allowed, allowed * (2 / held.sum()) ** 0.5)
+
+
 def _around(values: Array) -> NDArray[np.float64]:
     """Return sums over all shots and a window, (pixel_y, pixel_x), of values (shot, ...)."""
     flat = values.sum(axis=0, dtype=np.float64)

@@ -30,6 +30,7 @@ from reconstruction.adaptive.parsimony import (
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
+from reconstruction.colour import unseen_colour
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.tv import TVSettings, reconstruct_tv
 
@@ -49,20 +50,22 @@ TRIAL_STEPS = 4
 @dataclass(frozen=True, eq=False)
 class Model:
     """What is fitted: Psi, of one colour or three; the centre view's disparity (y, x) and picture
-    (y, x, c) to begin with; the steps."""
+    (y, x, c) to begin with; the steps; whether one plane is all there is."""
 
     psi: ImagingMatrix
     centre: Array
     picture: Array
     texture: TextureSettings
+    planar: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
     """given: as it was. scale: of the scene's contrast; bright: `given` over it. held: readings
     kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
-    disparities. mu: weight of total variation, plain: its light field. model: what is fitted,
-    left_out: in words, what the scene does not need.
+    disparities. unseen: variance by colours that frames do not show, (y, x). mu: weight of total
+    variation, plain: its light field. model: what is fitted, left_out: in words, what the scene
+    does not need.
     """
 
     given: Given
@@ -71,6 +74,7 @@ class Survey:
     held: NDArray[np.bool_]
     unexplained: Array
     volume: search.Volume
+    unseen: Array
     mu: float
     plain: Array
     model: Model
@@ -91,6 +95,7 @@ def surveyed(
     psi, k = given.psi, given.psi.binning
     flat = flat_psi(psi)
     picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
+    unseen = unseen_colour(flat, given.frames, given.usable, picture)
     own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
     scale = min(1.0, own / CONTRAST)
     bright = given.over(scale)
@@ -118,7 +123,7 @@ def surveyed(
     if settings.parsimony:
         model, left_out = _needed(model, volume, bright, held, settings)
     return Survey(
-        given, scale, bright, held, data.readings, volume, mu, plain, model, tuple(left_out)
+        given, scale, bright, held, data.readings, volume, unseen, mu, plain, model, tuple(left_out)
     )
 
 
@@ -147,7 +152,9 @@ def _searched(
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)
-    volume = search.fine(data, fine, rough, settings.stride, settings.step_px, *smooth)
+    volume = search.fine(
+        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
+    )
     on_searched(2)
     return volume
 
@@ -169,7 +176,8 @@ def _needed(
         kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
         left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
         still = model.texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
-        model = replace(model, centre=plane.over(psi.size, psi.binning), texture=still)
+        centre = plane.over(psi.size, psi.binning)
+        model = replace(model, centre=centre, texture=still, planar=True)
     if may_be_grey(model.picture):
         grey = replace(model, psi=grey_psi(psi), picture=model.picture.mean(axis=-1, keepdims=True))
         residuals = [_trial(one, bright, held, settings)[held] for one in (model, grey)]

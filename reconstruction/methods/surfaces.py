@@ -1,4 +1,4 @@
-"""The methods `adaptive` and `adaptive-fast`: surfaces by evidence, and their texture."""
+"""The methods `adaptive...`: surfaces by evidence, and their texture."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.method import Given, Method, Sensitivity
+from reconstruction.methods import tv_dict
 from reconstruction.result import Reconstruction
 
 if TYPE_CHECKING:
@@ -27,6 +31,21 @@ def _solve(
         given.on_step, given.clock,
     )  # fmt: skip
     return dataclasses.replace(result, method=name)
+
+
+def _with_patches(given: Given, settings: MethodSettings) -> Reconstruction:
+    """Return what `adaptive` finds when it averages with `tv-dict`, too."""
+    given.needed_dictionary("adaptive-dict")
+
+    def patched(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+        fitted = dataclasses.replace(given, usable=usable, on_step=None)
+        return tv_dict.METHODS[0].solve(fitted, settings).light_field
+
+    result = reconstruct_adaptive(
+        given.psi, given.frames, given.noise_sigma, settings.adaptive, given.usable,
+        given.on_step, given.clock, other=patched,
+    )  # fmt: skip
+    return dataclasses.replace(result, method="adaptive-dict")
 
 
 METHODS = (
@@ -51,6 +70,18 @@ METHODS = (
         partial(_solve, "adaptive-fast", fast),
         "adaptive",
         AdaptiveSettings,
+        sensitivity=Sensitivity(one_shot=True),
+    ),
+    Method(
+        "adaptive-dict",
+        "as adaptive, averaged with tv-dict by held-out readings",
+        "what `adaptive` and `tv-dict` assume, each where it holds",
+        "that of both",
+        "two and more shots, where the best is wanted",
+        _with_patches,
+        "adaptive",
+        AdaptiveSettings,
+        needs_dictionary=True,
         sensitivity=Sensitivity(one_shot=True),
     ),
 )

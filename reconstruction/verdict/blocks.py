@@ -48,6 +48,7 @@ def _largest(values: Sequence[float], weights: Sequence[float]) -> float:
 
 COMBINED: dict[str, Combine] = {
     "strength_errors": _error_of_mean,
+    "colour_error": _root_mean_square,
     "missed": _root_mean_square,
     "plain": _root_mean_square,
     "misfit": _root_mean_square,

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.colour import unseen_colour
+from reconstruction.flat import flat_psi
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import foretold
 from reconstruction.verdict.pixels import judged_pixels
-from reconstruction.verdict.shadow import relief, shadow
+from reconstruction.verdict.shadow import Relief, relief, shadow
 from reconstruction.verdict.shots import compared
 
 Array = NDArray[np.floating]
@@ -26,6 +28,7 @@ class Evidence:
 
     method: its name; status: its status. left_out: shots that screening left out. bad: share of
     the pixels that screening left out. noise: the readings' deviation over their mean.
+    colour_error: root mean square by colours that frames do not show, over the brightness.
     """
 
     method: str
@@ -59,6 +62,7 @@ class Evidence:
     noise_share: float | None
     beyond: float | None
     parameters: dict[str, float]
+    colour_error: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -70,7 +74,7 @@ class Evidence:
         return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
-TOLD = ("decided", "at_end", "share_free", "misfit", "misfit_row", "misfit_column")
+TOLD = ("decided", "at_end", "share_free", "over_plain", "misfit", "misfit_row", "misfit_column")
 """Parameters of a result that bear on whether it can be trusted."""
 
 
@@ -135,8 +139,17 @@ def gathered(
         explained=None if fits is None else fits.explained,
         noise_share=None if fits is None else fits.noise,
         beyond=None if fits is None else fits.beyond,
+        colour_error=_colour_error(psi, frames, usable, found),
         parameters={key: result.parameters[key] for key in TOLD if key in result.parameters},
     )
+
+
+def _colour_error(
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], found: Relief
+) -> float:
+    unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
+    square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
+    return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
 
 
 def _plain(values: Iterable[float]) -> tuple[float | None, ...]:

@@ -16,8 +16,8 @@ from reconstruction.verdict.evidence import Evidence
 
 Level = Literal["trust", "cannot tell", "doubt", "do not use"]
 LEVELS: tuple[Level, ...] = ("trust", "cannot tell", "doubt", "do not use")
-"""Graver ones later. `cannot tell`: nothing speaks against the light field, but a Psi that is wrong
-would not show in these readings."""
+"""Graver ones later. `cannot tell`: nothing speaks against the light field, but a wrong Psi, or
+wrong colours, would not show in these readings."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,9 @@ AT_END = Limits(0.01, 1.0)
 MISFIT = Limits(8.0, float("inf"))
 """Residual of the readings over their noise. In one clean shot of the scene fish, almost without
 noise (0.0005), it is 4."""
+COLOUR_ERROR = 0.1
+"""Root mean square. One shot of `scenario-iii-mono`: 0.08 to 0.16, of `rgbw-mono` 0.04 to 0.13
+(64x80, three scenes of group A, two built in)."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods that lose little with one shot."""
@@ -122,7 +125,7 @@ def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     found = [
         reason
-        for rule in (_shots, _coding, _masks, _pixels, _noise, _search, _misfit, _fit)
+        for rule in (_shots, _coding, _colour, _masks, _pixels, _noise, _search, _misfit, _fit)
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
@@ -230,6 +233,17 @@ def _coding(e: Evidence) -> Iterator[Reason]:
             f"the masks' strength is known to {deviation:.1%} only: a Psi that is wrong may pass",
             deviation,
             remedy,
+            "cannot tell",
+        )
+
+
+def _colour(e: Evidence) -> Iterator[Reason]:
+    if e.colour_error is not None and e.colour_error > COLOUR_ERROR:
+        yield Reason(
+            f"no pixel has a colour filter, and the masks show colours to {e.colour_error:.0%} of "
+            "the brightness only: others would explain the readings as well",
+            e.colour_error,
+            "take more shots, or a sensor with colour filters",
             "cannot tell",
         )
 

@@ -486,23 +486,20 @@ function prepareControls() {
 
 async function main() {
   prepareControls();
+  await viewerShown; // what is seen first comes first
   const frames = [
     frameViewer(byId("shots"), data.shots, "Captured frames"),
     frameViewer(byId("whiteboards"), data.whiteboards, "Whiteboard frames"),
   ];
-  sources.estimate = await decoded(data.estimate);
-  if (data.truth) {
-    sources.truth = await decoded(data.truth);
-    sources.errorViews = await decoded(data.error.views);
-    sources.errorMean = await decoded(data.error.mean);
-  }
+  const named = data.truth ? { errorMean: data.error.mean, errorViews: data.error.views, truth: data.truth } : {};
+  for (const [name, picture] of Object.entries({ ...named, estimate: data.estimate }))
+    sources[name] = await decoded(picture);
   listen();
   drawViews();
   drawEpi();
   drawError();
   byId("refocus-value").textContent = (+byId("refocus-slider").value).toFixed(2);
-  drawRefocus("quick"); // keeps the small views, so that the slider's first move is quick too
-  drawRefocus("full");
+  (window.requestIdleCallback ?? setTimeout)(() => drawRefocus("full")); // below what is seen first
   await Promise.all(frames);
   document.documentElement.dataset.ready = "yes";
 }

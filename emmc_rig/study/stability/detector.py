@@ -173,7 +173,7 @@ class DetectorSweep(Sweep[Case]):
     journal = "verdicts.jsonl"
     noun = "cases"
     stage = "judge"
-    revision = 3
+    revision = 4
 
     def inputs(self, point: Case) -> dict[str, object]:
         """Return everything that a case's evidence depends on, as plain data."""
