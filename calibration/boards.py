@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +42,26 @@ class BoardFrame:
             through = f"window moved by {self.window} cells"
         x, y = self.stage_um
         return f"shot {self.shot}, {through}, {self.lamp} lamp, mask at ({x:g}, {y:g}) um"
+
+
+class _Lazily(Mapping[tuple[int, int, int, str], MeanFrame]):
+    """Frames changed as they are asked for, so that one at a time is held twice."""
+
+    def __init__(
+        self,
+        frames: Mapping[tuple[int, int, int, str], MeanFrame],
+        change: Callable[[MeanFrame], MeanFrame],
+    ) -> None:
+        self._frames, self._change = frames, change
+
+    def __getitem__(self, key: tuple[int, int, int, str]) -> MeanFrame:
+        return self._change(self._frames[key])
+
+    def __iter__(self) -> Iterator[tuple[int, int, int, str]]:
+        return iter(self._frames)
+
+    def __len__(self) -> int:
+        return len(self._frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +129,14 @@ class BoardSet:
         return Whiteboards(
             dark,
             {key: as_if_dark(frame) for key, frame in self.references.items()},
-            {
-                (one.shot, *one.pinhole, one.lamp): as_if_dark(one.frame)
-                for one in self.frames
-                if one.pinhole is not None
-            },
+            _Lazily(
+                {
+                    (one.shot, *one.pinhole, one.lamp): one.frame
+                    for one in self.frames
+                    if one.pinhole is not None
+                },
+                as_if_dark,
+            ),
         )
 
     def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,17 +57,29 @@ def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
 
 def predicted_by_psi(psi: ImagingMatrix, board: Board) -> Array:
     """Return what a measured Psi predicts of a whiteboard at its shot's position, white lamp."""
-    white = np.zeros(psi.light_field_shape, dtype=psi.weights.dtype)
-    white[board.views_open] = 1
-    return psi.forward(white)[board.shot].astype(np.float64)
+    return _by_pixel(psi.weights, board, psi.binning, lambda plane: plane)
 
 
 def prediction_variance(deviation: Array, board: Board, binning: int) -> Array:
     """Return the variance of `predicted_by_psi` from the deviation of its coefficients."""
-    variance = np.square(deviation[board.shot][board.views_open], dtype=np.float64).sum(axis=(0, 2))
-    rows, columns = board.reading.shape
     # The samples of a pixel were measured as one: their deviations add up.
-    return variance.reshape(rows, binning, columns, binning).mean(axis=(1, 3)) * binning**4
+    return _by_pixel(deviation, board, binning, np.square) * binning**2
+
+
+def _by_pixel(
+    coefficients: Array, board: Board, binning: int, change: Callable[[Array], Array]
+) -> Array:
+    """Return changed coefficients summed over samples, open views and colours, (pixel_y, pixel_x).
+
+    One plane is held at a time.
+    """
+    rows, columns = board.reading.shape
+    total = np.zeros((rows, columns))
+    for v, u in np.argwhere(board.views_open):
+        for plane in np.moveaxis(coefficients[board.shot, v, u], 1, 0):
+            changed = change(plane.astype(np.float64))
+            total += changed.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
+    return total
 
 
 def judge(

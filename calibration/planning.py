@@ -95,8 +95,13 @@ class PlannedFrames:
         return sum(self.counts.values()) + self.dark_frames + self.reference_frames
 
 
+def dark_variance(kind: Kind, light: Light) -> float:
+    """Return the variance of readings by the darks of their exposure, which all frames share."""
+    return float(reading_variance(np.zeros(1), kind, light)[0]) / DARK_FRAMES
+
+
 def reading_variance(reading: Array, kind: Kind, light: Light) -> Array:
-    """Return the variance of one frame's readings, without the reference's part."""
+    """Return the variance of one frame's readings, without those of the reference and the dark."""
     return light.noise.variance(reading, light.exposure_s * light.times(kind), light.light)
 
 
@@ -112,10 +117,11 @@ def information_of(
     opened = kind.views_open(mask.views)
     reading, slopes = shadow.with_slopes(chosen, channels, opened, kind.stage_um)
     variance = reading_variance(reading, kind, light)
-    # The reference is divided by as well, and its noise does not average over the boards.
+    # The noise of reference and dark does not average over the boards.
     variance = (
         variance
         + reading**2 * reading_variance(np.ones_like(reading), Kind(None), light) / REFERENCE_FRAMES
+        + dark_variance(kind, light)
     )
     return (slopes.T @ (slopes / variance[:, None])) * (light.pixels / SAMPLED)
 
@@ -156,7 +162,9 @@ def plan_parametric(
 
 @dataclass(frozen=True)
 class FreeNoise:
-    """Squared relative error of the free route: of one frame a view, and of the references."""
+    """Squared relative error of the free route: of one frame a view, and of what all share, the
+    references and the darks.
+    """
 
     pinhole2: float
     reference2: float
@@ -183,7 +191,7 @@ def free_noise(mask: ShadowMask, placement: Placement, light: Light) -> FreeNois
         psi = shadow.readings(chosen, channels, views_open(mask.views, view))
         pinhole += float(reading_variance(psi, Kind(view), light).sum())
         reference = reading_variance(np.ones_like(psi), Kind(None), light) / REFERENCE_FRAMES
-        white += float((psi**2 * reference).sum())
+        white += float((psi**2 * reference).sum()) + len(psi) * dark_variance(Kind(view), light)
         squares += float((psi**2).sum())
     return FreeNoise(pinhole / squares, white / squares)
 

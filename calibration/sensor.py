@@ -6,7 +6,11 @@ its slope is the gain K in DN per electron. Every figure's deviation is a jackkn
 groups of rows. Under a colour filter each of its 2 x 2 phases has its own level; all lie on one
 curve.
 
-Source: EMVA Standard 1288, release 3.1, sections 2 to 8.
+What differs from pixel to pixel is told from noise by the covariance of the two frames, and split
+into rows, columns and pixels.
+
+Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8) and general (row, column and pixel
+nonuniformity, spectrograms).
 """
 
 from __future__ import annotations
@@ -27,7 +31,13 @@ LINEAR_RANGE = (0.05, 0.95)
 CLIPPED_SHARE = 0.01
 FALLEN_SHARE = 0.8
 """Of the greatest variance: beyond what noise makes of the variance of a frame of any size."""
+COLLAPSED_SHARE = 0.1
+"""Of the greatest variance, where every pixel is full: then the mean is where they saturate."""
+PRNU_SHARE, HELD_SHARE = 0.5, 0.4
+"""Of saturation, where PRNU is measured; of the brightest flat, what is held till that is known."""
 QUANTISATION_DN2 = 1 / 12
+QUANTISED_DN2, QUANTISED_DN = 0.24, 0.40
+"""A dark variance below the first is that of the steps: the read noise is below the second."""
 BRIGHTER_DEVIATIONS = 10.0
 HOT_DEVIATIONS = 8.0
 DEAD_SHARE = 0.5
@@ -52,11 +62,33 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
+class Nonuniformity:
+    """What differs between pixels, without noise: the variances of its parts.
+
+    variances: of those. spectra: by direction ("horizontal", "vertical"), amplitude at `frequency`,
+    cycles a pixel.
+    """
+
+    parts: dict[str, float]
+    variances: dict[str, float]
+    frequency: dict[str, Array]
+    spectra: dict[str, Array]
+
+    def figure(self, name: str, scale: float) -> tuple[float, float]:
+        """Return the deviation of a part (or of `total`) and how sure it is, times a scale."""
+        found, sure = self.parts[name], float(np.sqrt(self.variances[name]))
+        value = float(np.sqrt(max(found, 0.0)))
+        return scale * value, scale * (sure / (2 * value) if found > sure else float(np.sqrt(sure)))
+
+
+@dataclass(frozen=True, eq=False)
 class SensorSheet:
     """The EMVA 1288 quantities; `deviations` by their names.
 
     linearity_residual: percent, per point of the curve. good: (y, x), neither hot nor dead.
-    saturated: the flats reach saturation; else what follows from it is a lower bound.
+    saturated: the flats reach saturation; else what follows from it is a lower bound. quantised:
+    the read noise is below what the steps of the converter tell, and an upper bound. dsnu, prnu:
+    in DN and as shares.
     """
 
     gain_dn_per_electron: float
@@ -67,8 +99,9 @@ class SensorSheet:
     full_well_electrons: float
     saturation_dn: float
     linearity_error_percent: float
-    dsnu_electrons: float
-    prnu_percent: float
+    exposures: int
+    dsnu: Nonuniformity
+    prnu: Nonuniformity
     snr_max_db: float
     dynamic_range_db: float
     hot_pixels: int
@@ -78,18 +111,35 @@ class SensorSheet:
     good: NDArray[np.bool_]
     deviations: dict[str, float] = field(default_factory=dict)
     saturated: bool = True
+    quantised: bool = False
+
+    @property
+    def dsnu_electrons(self) -> float:
+        """Dark signal nonuniformity, of all pixels."""
+        return self.dsnu.figure("total", 1 / self.gain_dn_per_electron)[0]
+
+    @property
+    def prnu_percent(self) -> float:
+        """Photo response nonuniformity, of all pixels."""
+        return self.prnu.figure("total", 100.0)[0]
 
     def rows(self) -> list[tuple[str, float, float | None, str]]:
         """Return (quantity, value, standard deviation or None, unit) for a table."""
-        return [
-            (
-                words if self.saturated or name not in OF_SATURATION else f"{words}, at least",
-                float(getattr(self, name)),
-                self.deviations.get(name),
-                unit,
-            )
-            for name, (words, unit) in QUANTITIES.items()
-        ]
+        found = []
+        for name, (words, unit) in QUANTITIES.items():
+            if name in OF_SATURATION and not self.saturated:
+                words += ", at least"
+            if name == "read_noise_electrons" and self.quantised:
+                words += ", at most"
+            found.append((words, float(getattr(self, name)), self.deviations.get(name), unit))
+        for words, one, scale, unit in (
+            ("DSNU", self.dsnu, 1 / self.gain_dn_per_electron, "e"),
+            ("PRNU", self.prnu, 100.0, "%"),
+        ):
+            for name in one.parts:
+                part = words if name == "total" else f"{words} of {name}s"
+                found.append((part, *one.figure(name, scale), unit))
+        return found
 
 
 QUANTITIES = {
@@ -100,8 +150,7 @@ QUANTITIES = {
     "full_well_electrons": ("Saturation capacity", "e"),
     "saturation_dn": ("Saturation", "DN above dark"),
     "linearity_error_percent": ("Linearity error", "%"),
-    "dsnu_electrons": ("DSNU", "e"),
-    "prnu_percent": ("PRNU", "%"),
+    "exposures": ("Exposures of the linearity", ""),
     "snr_max_db": ("Greatest signal-to-noise ratio", "dB"),
     "dynamic_range_db": ("Dynamic range", "dB"),
     "hot_pixels": ("Hot pixels", ""),
@@ -155,7 +204,7 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     """Return the sensor's figures from pairs of dark and of evenly lit frames.
 
     darks: at two exposures or more, for the dark current. flats: from dim to saturated, at least
-    four below saturation; only one pair is held at a time. Raises CalibrationError for too few
+    four below saturation; few pairs are held at a time. Raises CalibrationError for too few
     exposures, flats no brighter than the dark, and sizes that differ.
     """
     if len({pair.exposure_s for pair in darks}) < 2:
@@ -163,42 +212,44 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     hot = _hot(darks)
     good = ~hot
     dark_levels = [_level(pair, good, white_level_dn) for pair in darks]
-    levels = []
-    lit, loudest = None, 0.0
-    for pair in sorted(flats, key=lambda one: one.exposure_s):
+    levels: list[_Level] = []
+    unsaturated: list[tuple[float, Pair]] = []
+    loudest = 0.0
+    for pair in flats:
         level = _level(pair, good, white_level_dn)
         levels.append(level)
-        # A phase that saturates loses its variance: the brightest pair before that shows the
-        # pixels' own response best.
+        # A phase that saturates loses its variance.
         quietest = float(level.variance.mean(axis=0).min())
         if level.clipped.max() < CLIPPED_SHARE and quietest > loudest:
-            lit, loudest = pair, quietest
-    if len(levels) < 4 or lit is None:
+            mean, loudest = float(level.mean.mean()), quietest
+            unsaturated = [one for one in unsaturated if one[0] > HELD_SHARE * mean]
+            unsaturated.append((mean, pair))
+    if len(levels) < 4 or not unsaturated:
         raise CalibrationError(
             f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
             "some below saturation"
         )
-    dead = _dead(lit, darks[0])
+    brightest_dn, brightest = unsaturated[-1]
+    dead = _dead(brightest, darks[0])
     good &= ~dead
-    spatial = _spatial(lit, darks[0], good)
-    everything = _figures(dark_levels, levels, np.arange(BLOCKS), spatial)
+    everything = _figures(dark_levels, levels, np.arange(BLOCKS))
     without = [
-        _figures(dark_levels, levels, np.delete(np.arange(BLOCKS), block), spatial)
+        _figures(dark_levels, levels, np.delete(np.arange(BLOCKS), block))
         for block in range(BLOCKS)
     ]
     factor = (BLOCKS - 1) / np.sqrt(BLOCKS)
     deviations = {
-        name: float(factor * np.std([one[name] for one in without]))
-        for name in everything
-        if name not in ("prnu_percent", "dsnu_electrons")
+        name: float(factor * np.std([one[name] for one in without])) for name in everything
     }
-    used = int(good.sum())
-    # A deviation from n independent pixels is known to 1 / sqrt(2 n) of itself.
-    for name in ("prnu_percent", "dsnu_electrons"):
-        deviations[name] = everything[name] / np.sqrt(2 * used)
+    black_dn = everything["black_level_dn"]
+    half_dn = black_dn + PRNU_SHARE * (brightest_dn - black_dn)
+    lit = min(unsaturated, key=lambda one: abs(one[0] - half_dn))[1]
     curve, residual = _curve(dark_levels, levels)
     return SensorSheet(
         **everything,
+        exposures=len(levels),
+        dsnu=_nonuniformity(darks[0], None, good),
+        prnu=_nonuniformity(lit, darks[0], good),
         hot_pixels=int(hot.sum()),
         dead_pixels=int(dead.sum()),
         curve=curve,
@@ -206,6 +257,7 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
         good=good,
         deviations=deviations,
         saturated=_saturated(levels),
+        quantised=everything["dark_variance_dn2"] < QUANTISED_DN2,
     )
 
 
@@ -232,9 +284,19 @@ def _points(
 
 
 def _saturation(signal: Array, spread: Array, clipped: Array) -> float:
-    """Return the signal at which the variance is greatest: EMVA 1288's saturation point."""
-    free = np.where(clipped < CLIPPED_SHARE, spread, 0)
-    return float(max(signal[np.argmax(free[:, phase]), phase] for phase in range(4)))
+    """Return the signal at saturation: where all pixels are full, else of the greatest variance.
+
+    Between two exposures the latter, EMVA 1288's saturation point, is known to their step alone.
+    """
+    found = []
+    for phase in range(signal.shape[1]):
+        free = np.where(clipped[:, phase] < CLIPPED_SHARE, spread[:, phase], 0)
+        loudest = int(np.argmax(free))
+        full = (signal[:, phase] > signal[loudest, phase]) & (
+            spread[:, phase] < COLLAPSED_SHARE * free[loudest]
+        )
+        found.append(signal[full, phase].mean() if full.any() else signal[loudest, phase])
+    return float(max(found))
 
 
 def _saturated(flats: Sequence[_Level]) -> bool:
@@ -246,7 +308,7 @@ def _saturated(flats: Sequence[_Level]) -> bool:
 
 
 def _figures(
-    darks: Sequence[_Level], flats: Sequence[_Level], blocks: NDArray[np.intp], spatial: Array
+    darks: Sequence[_Level], flats: Sequence[_Level], blocks: NDArray[np.intp]
 ) -> dict[str, float]:
     signal, spread, times, clipped, slope, black, dark = _points(darks, flats, blocks)
     saturation = _saturation(signal, spread, clipped)
@@ -261,23 +323,25 @@ def _figures(
     # The dark point anchors the line.
     x, y = np.append(signal[below], 0.0), np.append(spread[below], dark)
     gain, _ = _line(x, y, np.append(weight, 1 / dark**2))
-    read2 = max(dark - QUANTISATION_DN2, 0)
-    well = saturation / gain if gain > 0 else 0.0
-    read = np.sqrt(read2) / gain if gain > 0 else 0.0
-    least = np.sqrt(read**2 + QUANTISATION_DN2 / gain**2) + 0.5 if gain > 0 else 1.0
-    dsnu_dn, prnu = spatial
+    if gain <= 0:
+        raise CalibrationError(
+            "the variance does not grow with the light: are these frames as the sensor gave them?"
+        )
+    read_dn = np.sqrt(max(dark - QUANTISATION_DN2, 0))
+    if dark < QUANTISED_DN2:
+        read_dn = QUANTISED_DN
+    well, read = saturation / gain, read_dn / gain
+    least = np.sqrt(read**2 + QUANTISATION_DN2 / gain**2) + 0.5
     residual = _linearity(signal, times, saturation)
     return {
         "gain_dn_per_electron": gain,
         "read_noise_electrons": float(read),
-        "dark_current_electrons_per_s": slope / gain if gain > 0 else 0.0,
+        "dark_current_electrons_per_s": slope / gain,
         "black_level_dn": black,
         "dark_variance_dn2": dark,
         "full_well_electrons": well,
         "saturation_dn": saturation,
         "linearity_error_percent": float((np.nanmax(residual) - np.nanmin(residual)) / 2),
-        "dsnu_electrons": float(dsnu_dn / gain) if gain > 0 else 0.0,
-        "prnu_percent": float(100 * prnu),
         "snr_max_db": float(10 * np.log10(max(well, 1e-9))),
         "dynamic_range_db": float(20 * np.log10(max(well / least, 1e-9))),
     }
@@ -328,32 +392,52 @@ def _dead(flat: Pair, dark: Pair) -> NDArray[np.bool_]:
     return dead
 
 
-def _spatial(flat: Pair, dark: Pair, good: NDArray[np.bool_]) -> Array:
-    """Return DSNU in DN and PRNU as a share: spatial deviations less what noise makes of them.
+def _nonuniformity(pair: Pair, dark: Pair | None, good: NDArray[np.bool_]) -> Nonuniformity:
+    """Return what differs between pixels, in DN, or with a dark pair as a share of the signal.
 
     A smooth quadratic is taken out of each phase first: the lamp's falloff is not the pixels'.
     """
-    found = []
-    for pair, minus in ((dark, None), (flat, dark)):
-        squares, count, level = 0.0, 0, 0.0
-        first, second = pair.first.astype(np.float64), pair.second.astype(np.float64)
-        if minus is not None:
-            black = (minus.first.astype(np.float64) + minus.second) / 2
-            first, second = first - black, second - black
-        for a, b, use in zip(_phases(first), _phases(second), _phases(good), strict=True):
-            mean = (a + b) / 2
-            smooth = _quadratic(mean, use)
-            off = ((mean - smooth) / (smooth if minus is not None else 1))[use]
-            noise = 0.5 * np.var((a - b)[use] / (smooth[use] if minus is not None else 1)) / 2
-            if minus is not None:
-                # The dark frame subtracted is a mean of two as well.
-                both = (minus.first.astype(np.float64) - minus.second)[good]
-                noise += 0.25 * np.var(both) / float(np.mean(smooth)) ** 2
-            squares += max(float(np.var(off)) - noise, 0.0) * off.size
-            count += off.size
-            level += float(smooth.mean())
-        found.append(np.sqrt(squares / count))
-    return np.array(found)
+    rows, columns = (count // 2 * 2 for count in good.shape)
+    frames = [one.astype(np.float64) for one in (pair.first, pair.second)]
+    if dark is not None:
+        # One dark each, so that their noise does not vary together.
+        frames = [one - black for one, black in zip(frames, (dark.first, dark.second), strict=True)]
+    parts: dict[str, list[float]] = {name: [] for name in ("total", "row", "column", "pixel")}
+    variances: dict[str, list[float]] = {name: [] for name in parts}
+    spectra: dict[str, list[Array]] = {"horizontal": [], "vertical": []}
+    planes = (_phases(one[:rows, :columns]) for one in (*frames, good))
+    for first, second, use in zip(*planes, strict=True):
+        smooth = _quadratic((first + second) / 2, use)
+        scale = smooth if dark is not None else 1.0
+        a, b = (np.where(use, (one - smooth) / scale, 0) for one in (first, second))
+        m, n = a.shape
+        both = float(np.sum(a * b) / use.sum())
+        alone = float((np.sum(a**2) + np.sum(b**2)) / (2 * use.sum()))
+        of_rows, of_columns = (float(np.mean(a.mean(k) * b.mean(k))) for k in (1, 0))
+        pixel = (both - of_rows - of_columns) / (1 - 1 / m - 1 / n)
+        found = (both, of_rows - pixel / n, of_columns - pixel / m, pixel)
+        for name, value in zip(parts, found, strict=True):
+            parts[name].append(value)
+        noise = max(alone - both, 0.0)
+        # Of a covariance of count pairs: (s^4 + (s^2 + noise)^2) / count.
+        for name, covariance, more, count in (
+            ("total", both, noise, use.sum()),
+            ("row", of_rows, noise / n, m),
+            ("column", of_columns, noise / m, n),
+            ("pixel", pixel, noise, use.sum()),
+        ):
+            squares = covariance**2 + (max(covariance, 0.0) + more) ** 2
+            variances[name].append(squares / float(count))
+        for name, axis in (("horizontal", 1), ("vertical", 0)):
+            spectrum = np.fft.rfft(a, axis=axis) * np.conj(np.fft.rfft(b, axis=axis))
+            spectra[name].append(spectrum.real.mean(axis=1 - axis) / a.shape[axis])
+    halves = {"horizontal": columns // 2, "vertical": rows // 2}
+    return Nonuniformity(
+        {name: float(np.mean(values)) for name, values in parts.items()},
+        {name: float(np.sum(values)) / len(values) ** 2 for name, values in variances.items()},
+        {name: np.fft.rfftfreq(count, 2.0) for name, count in halves.items()},
+        {name: np.sqrt(np.maximum(np.mean(values, axis=0), 0)) for name, values in spectra.items()},
+    )
 
 
 def _quadratic(values: Array, use: NDArray[np.bool_]) -> Array:

@@ -11,6 +11,7 @@ import yaml
 import emmc_rig as emmc
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
+from calibration.planning import DARK_FRAMES, REFERENCE_FRAMES
 from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
 from emmc_rig.calibrate.comparison import in_three_colours, true_error
 from emmc_rig.calibrate.drift import run_drift
@@ -80,7 +81,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     run, camera_file, tmp_path
 ):
     frames = []
-    for target in ("0.005", "0.0019"):
+    for target in ("0.05", "0.0019"):
         out = tmp_path / target
         code, said, _ = run(
             "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
@@ -92,7 +93,9 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
         opened = {tuple(one["pinhole"]) for one in plan["whiteboards"] if one["pinhole"]}
         assert opened == set(np.ndindex(3, 3))
         written = yaml.safe_load((out / "plan.yaml").read_text())
-        assert written["darks"]["of_boards"] > 0
+        # As many as the estimate assumes: darks of each exposure before and after, references.
+        assert 2 * written["darks"]["of_boards"] == DARK_FRAMES
+        assert written["whiteboards"].get("references", 4) == REFERENCE_FRAMES
         frames.append(plan["frames"])
     assert frames[1] > frames[0]
 

@@ -95,7 +95,13 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
     assert gain["value"] == pytest.approx(noise.gain_dn_per_electron, rel=0.1)
     assert read["value"] == pytest.approx(noise.read_noise_electrons, rel=0.3)
     assert len(figures["Photon transfer curve"]["signal_dn"]) >= 16
-    assert "Photon transfer" in (out / "report.html").read_text()
+    for name in ("DSNU of rows", "PRNU of columns", "PRNU of pixels"):
+        assert figures[name]["value"] >= 0
+    assert figures["Exposures of the linearity"]["value"] == 4
+    assert len(figures["Spectrogram of DSNU, DN"]["vertical"]["amplitude"]) == SIZE[0] // 4 + 1
+    page = (out / "report.html").read_text()
+    assert "Photon transfer" in page
+    assert "linearity, spectrograms" in page
 
 
 def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path, capsys):

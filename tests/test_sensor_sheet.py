@@ -55,9 +55,8 @@ def test_read_noise_black_level_and_dark_current_come_out(sheet):
     assert sheet.dark_current_electrons_per_s == pytest.approx(12, rel=0.05)
 
 
-def test_the_full_well_is_where_the_variance_is_greatest(sheet):
-    # Exposures are steps: the last below the well is what is found.
-    assert 0.8 * 50_000 < sheet.full_well_electrons < 1.03 * 50_000
+def test_the_full_well_is_where_every_pixel_is_full_whatever_the_steps_of_exposure(sheet):
+    assert sheet.full_well_electrons == pytest.approx(50_000, rel=0.01)
     assert sheet.snr_max_db == pytest.approx(10 * np.log10(sheet.full_well_electrons))
     noise_floor = np.sqrt(2.5**2 + 1 / 12 / 0.8**2) + 0.5
     expected = 20 * np.log10(sheet.full_well_electrons / noise_floor)
@@ -65,8 +64,64 @@ def test_the_full_well_is_where_the_variance_is_greatest(sheet):
 
 
 def test_the_pixels_own_differences_are_told_from_noise_and_from_the_lamp(sheet):
-    assert sheet.prnu_percent == pytest.approx(1.0, rel=0.08)
-    assert sheet.dsnu_electrons == pytest.approx(1.5 / 0.8, rel=0.1)
+    for one, scale, truth in ((sheet.prnu, 100, 1.0), (sheet.dsnu, 1, 1.5)):
+        value, deviation = one.figure("total", scale)
+        assert abs(value - truth) < 4 * deviation
+        assert value == pytest.approx(truth, rel=0.05)
+
+
+def test_the_stated_deviation_of_dsnu_is_that_of_repeated_measurements():
+    found = []
+    for seed in range(10):
+        flaws = SensorFlaws(offset_spread_dn=1.5, full_well_electrons=50_000.0, seed=seed)
+        one = characterise(
+            frames(flaws, lit=False, times=DARKS_S, seed=seed), frames(flaws, seed=50), WHITE_DN
+        )
+        found.append(one.dsnu.figure("total", 1.0))
+    values, stated = np.transpose(found)
+    assert 0.5 < np.std(values, ddof=1) / np.mean(stated) < 1.8
+
+
+def test_rows_and_columns_are_told_from_pixels_and_a_pattern_stands_in_the_spectrogram(sheet):
+    rng = np.random.default_rng(3)
+    rows, columns = rng.normal(0, 3.0, (SIZE[0], 1)), rng.normal(0, 2.0, (1, SIZE[1]))
+    columns = columns + 4.0 * np.sqrt(2) * np.sin(2 * np.pi * np.arange(SIZE[1]) / 16)
+    pattern = rows + columns
+
+    def patterned(pairs):
+        return [
+            Pair(one.exposure_s, *((f + pattern).round() for f in (one.first, one.second)))
+            for one in pairs
+        ]
+
+    darks = patterned(frames(lit=False, times=DARKS_S))
+    found = characterise(darks, patterned(frames()), WHITE_DN).dsnu
+    smooth = np.concatenate([rows[k::2] - rows[k::2].mean() for k in (0, 1)])
+    assert found.figure("row", 1.0)[0] == pytest.approx(np.std(smooth), rel=0.15)
+    assert found.figure("column", 1.0)[0] == pytest.approx(np.sqrt(4.0**2 + 2.0**2), rel=0.15)
+    assert found.figure("pixel", 1.0)[0] == pytest.approx(1.5, rel=0.15)
+    peak = np.argmax(found.spectra["horizontal"][1:]) + 1
+    assert found.frequency["horizontal"][peak] == pytest.approx(1 / 16)
+    assert sheet.dsnu.figure("row", 1.0)[0] < 0.3
+
+
+def test_read_noise_below_the_steps_of_the_converter_is_an_upper_bound():
+    noise = SensorNoise(
+        black_level_dn=64, gain_dn_per_electron=0.05, read_noise_electrons=2.5, white_level_dn=4095
+    )
+
+    def pairs(times, lit):
+        rng = np.random.default_rng(1)
+        reading = np.full(SIZE, float(lit))
+        return [
+            Pair(t, *(FLAWS.expose_dn(noise, reading, t, 1.0, rng) for _ in range(2)))
+            for t in times
+        ]
+
+    found = characterise(pairs(DARKS_S, False), pairs(FLATS_S, True), 4095)
+    assert found.quantised
+    assert found.read_noise_electrons == pytest.approx(0.40 / 0.05, rel=0.05)
+    assert "Temporal dark noise, at most" in [row[0] for row in found.rows()]
 
 
 def test_hot_and_dead_pixels_are_those_that_are(sheet):

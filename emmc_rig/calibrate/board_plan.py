@@ -165,8 +165,8 @@ def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached"
             f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
-            f"{planned.expected_error:.3%}, with {others + most * len(views)}; raise --target"
-            f"{'' if most_frames is None else ' or --frames'}"
+            f"{planned.expected_error:.3%}, with {others + most * len(views)} frames; raise "
+            f"--target{'' if most_frames is None else ' or --frames'}"
         )
     return replace(planned, counts={**opened, **planned.counts})
 

@@ -78,6 +78,14 @@ class SessionCalibration:
                 "variance_dn2": curve.variance_dn2.tolist(),
                 "exposure_s": curve.exposure_s.tolist(),
             }
+            for name, one in (("DSNU, DN", self.sensor.dsnu), ("PRNU, share", self.sensor.prnu)):
+                figures[f"Spectrogram of {name}"] = {
+                    direction: {
+                        "cycles_per_pixel": one.frequency[direction].tolist(),
+                        "amplitude": amplitude.tolist(),
+                    }
+                    for direction, amplitude in one.spectra.items()
+                }
             (folder / SENSOR).write_text(metrics_text(figures), encoding="utf-8")
 
     def __repr__(self) -> str:

@@ -185,7 +185,7 @@ def _psi(outcome: Outcome) -> str:
 
 
 def _sensor(sheet_: SensorSheet) -> str:
-    figure, (transfer, linearity) = sheet(2, 5.0, label="temporal variance, DN²")
+    figure, (transfer, linearity, rows) = sheet(3, 4.2, label="temporal variance, DN²")
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
     grid = np.linspace(0, max(curve.mean_dn), 50)
@@ -196,8 +196,18 @@ def _sensor(sheet_: SensorSheet) -> str:
     linearity.axhline(0, color=INK, linewidth=0.8)
     linearity.set_ylabel("deviation from the line, %", color=FAINT, fontsize=9)
     titled(linearity, "Linearity", "exposure, s")
+    for name, one, scale in (("DSNU, DN", sheet_.dsnu, 1.0), ("PRNU, %", sheet_.prnu, 100.0)):
+        for direction, line_style in (("horizontal", "-"), ("vertical", ":")):
+            amplitude = scale * one.spectra[direction][1:]
+            label = f"{name}, {direction}"
+            rows.plot(one.frequency[direction][1:], amplitude, line_style, label=label)
+    rows.set_ylabel("amplitude", color=FAINT, fontsize=9)
+    rows.legend(fontsize=7, frameon=False)
+    titled(rows, "Spectrograms", "cycles a pixel")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    pictures = {"Photon transfer curve and linearity": data_address(svg_of(figure), ".svg")}
+    pictures = {
+        "Photon transfer curve, linearity, spectrograms": data_address(svg_of(figure), ".svg")
+    }
     return fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()), pictures=pictures)
 
 

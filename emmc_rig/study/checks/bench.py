@@ -113,8 +113,13 @@ def check_sensor(settings: CalibrateSettings) -> tuple[list[Row], dict]:
         "prnu_percent": 100 * flaws.response_spread,
         "dsnu_electrons": flaws.offset_spread_dn / noise.gain_dn_per_electron,
     }
+    deviations = {
+        **sheet.deviations,
+        "prnu_percent": sheet.prnu.figure("total", 100.0)[1],
+        "dsnu_electrons": sheet.dsnu.figure("total", 1 / sheet.gain_dn_per_electron)[1],
+    }
     rows = [
-        Row(name, f"{getattr(sheet, name):.5g} +- {sheet.deviations[name]:.2g}", f"{truth:.5g}")
+        Row(name, f"{getattr(sheet, name):.5g} +- {deviations[name]:.2g}", f"{truth:.5g}")
         for name, truth in known.items()
     ]
     hot, dead = flaws.bad(size)
