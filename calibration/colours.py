@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.floating]
 LEAST_CROSSTALK = 2e-3
 LEAST_SHARE = 5e-4
+LEAST_OWN = 0.5
+"""Of a filter's light that is of its own colour."""
 MEDIAN_DEVIATION = 1.2533
 """Of a median of normal values, over that of their mean."""
 
@@ -53,7 +55,8 @@ def crosstalk(
 ) -> Crosstalk | None:
     """Return what every filter sees of the lamps' colours.
 
-    None without whiteboards under coloured lamps, and where it is too little to matter.
+    None without whiteboards under coloured lamps, and where it is too little to matter. Raises
+    CalibrationError where pixels see another colour than their own.
     """
     references = [boards.references.get((0, lamp)) for lamp in LAMP_COLOURS]
     if any(one is None for one in references) or channels.max() >= len(LAMP_COLOURS):
@@ -72,15 +75,22 @@ def crosstalk(
             deviation[f, colour] = MEDIAN_DEVIATION * spread / np.sqrt(pixels.size)
     total = seen.sum(axis=1, keepdims=True)
     seen, deviation = seen / total, deviation / total
+    if seen.diagonal().min() < LEAST_OWN:
+        f = int(np.argmin(seen.diagonal()))
+        raise CalibrationError(
+            f"pixels behind the {LAMP_COLOURS[f]} filter see {seen[f, f]:.0%} {LAMP_COLOURS[f]}: "
+            "these whiteboards are of another camera, whose colour filters lie otherwise, or the "
+            "lamp did not change its colour"
+        )
     seen[seen < LEAST_SHARE] = 0
     found = Crosstalk(seen / seen.sum(axis=1, keepdims=True), np.where(seen > 0, deviation, 0))
     return found if found.largest > LEAST_CROSSTALK else None
 
 
-def mixing(mask: ShadowMask, filters: Crosstalk) -> ShadowMask:
-    """Return the mask as pixels see it whose filters let other colours through."""
+def mixing(mask: ShadowMask, seen: Array) -> ShadowMask:
+    """Return the mask as pixels see it whose filters see (filter, colour) of the colours."""
     cells = mask.cells.copy()
-    cells[..., :3] = mask.cells[..., :3] @ filters.seen.T.astype(np.float32)
+    cells[..., :3] = mask.cells[..., :3] @ np.asarray(seen, np.float32).T
     return replace(mask, cells=cells)
 
 

@@ -1,45 +1,85 @@
 """Whether Psi still fits, from scene captures alone; what has moved, by how much, and the repair.
 
-The drift (shift, rotation, scale, distance; brightness of later shots against the first) that
-makes the evidence of blocks of the captures greatest (see `evidence`), by Gauss-Newton steps on
-the blocks' scores, after a coarse search of shifts. Its covariance is the sandwich of curvature and
-scores (White 1982), since the prior of the scene is but a model; a drift is told only where it is
-far outside that, and large enough to matter.
+The drift (shift, rotation, scale, distance, tilt; crosstalk of the colour filters; brightness of
+later shots against the first) that makes the evidence of blocks of the captures greatest (see
+`evidence`). Where to begin is told by the correlation of the open aperture's shadow with the
+captures over their local mean, at every shift and at turns and scales on a grid; from the best of
+these, and from where the mask was, Gauss-Newton steps on the blocks' scores climb, on the middle of
+the picture first. Its covariance is the sandwich of curvature and scores (White 1982), since the
+prior of the scene is but a model; a drift is told only where it is far outside that, and large
+enough to matter. A place that explains the captures no better than places where the mask cannot be
+is no place of the mask.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
+from calibration.boards import Board
+from calibration.colours import mixing
 from calibration.errors import CalibrationError
 from calibration.evidence import Prior, averaged, log_evidence, plane_prior
 from calibration.parametric import Stages
 from calibration.placement import Placement
-from calibration.shadow import Shadow, ShadowMask
+from calibration.registration import correlated
+from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
-KINDS = ("shift_x_um", "shift_y_um", "rotation_rad", "scale", "distance_share")
-ATTRIBUTES = ("offset_x_um", "offset_y_um", "rotation_rad", "scale", "distance_share")
-SPREADS = (30.0, 30.0, 0.004, 0.003, 0.05)
-"""Of the prior of a drift between calibration and capture."""
+ATTRIBUTES = {
+    "shift_x_um": "offset_x_um",
+    "shift_y_um": "offset_y_um",
+    "rotation_rad": "rotation_rad",
+    "scale": "scale",
+    "distance_share": "distance_share",
+    "tilt_x_rad": "tilt_x_rad",
+    "tilt_y_rad": "tilt_y_rad",
+}
+"""Of a placement, by kinds of drift."""
+KINDS = tuple(ATTRIBUTES)
+SPREADS = (30.0, 30.0, 0.006, 0.005, 0.05, 0.003, 0.003)
+"""Of the prior of a drift around where the search of its start arrives."""
+CROSSTALK_SPREAD = 0.05
+WORDS = {
+    "shift_x_um": "a shift in x",
+    "shift_y_um": "a shift in y",
+    "rotation_rad": "a turn",
+    "scale": "a change of scale",
+    "distance_share": "a change of distance",
+    "tilt_x_rad": "a tilt in x",
+    "tilt_y_rad": "a tilt in y",
+}
 MOST_STEPS = 12
-RIM = 0.95
-"""Of the shifts searched: a drift beyond it may be larger than what is found."""
+WIDENING = 2
+"""The part of the picture that steps are taken on, from one climb to the next."""
+LOCAL_PX = 3.0
+"""Deviation of the local mean: twice a cell, whose shadow is to be left."""
+START_PX = 96
+TURN_STEP_DEG, SCALE_STEP = 1.0, 0.015
+"""Of which a half moves the rim of START_PX by less than half a pixel."""
+SPARE = 1.5
+"""Times the range: shifts looked at, to know one beyond it."""
+DECOYS = 12
+LEAST_SURE = 6.0
+"""Standard deviations of the decoys' evidence: chosen from hundreds of places, noise reaches 4."""
 
 
 class DriftSettings(Settings):
     """Settings of the search.
 
     block_px: side of a block. blocks: so many, spread over the picture. candidates: disparities
-    kept per block after a first look at all. false_alarms: chance of one on a Psi that fits.
-    harmless_px: root mean square displacement of the shadow below which a drift does not matter.
+    kept per block after a first look at all. search_px, search_deg, search_scale: how far is
+    searched, along either axis. starts: from so many places, beside where the mask was.
+    false_alarms: chance of one on a Psi that fits. harmless_px: root mean square displacement of
+    the shadow below which a drift does not matter.
     """
 
     block_px: int = Field(default=8, ge=4, le=16)
@@ -48,7 +88,10 @@ class DriftSettings(Settings):
     disparity_px: float = Field(default=2.0, gt=0)
     disparity_steps: int = Field(default=9, ge=1)
     candidates: int = Field(default=2, ge=1)
-    search_px: float = Field(default=1.2, ge=0)
+    search_px: float = Field(default=8.0, gt=0)
+    search_deg: float = Field(default=2.0, ge=0)
+    search_scale: float = Field(default=0.03, ge=0)
+    starts: int = Field(default=3, ge=1)
     false_alarms: float = Field(default=1e-4, gt=0, lt=1)
     harmless_px: float = Field(default=0.05, ge=0)
     tolerance: float = Field(default=0.3, gt=0, description="of a last step, in deviations")
@@ -59,10 +102,12 @@ class DriftSettings(Settings):
 class Drift:
     """What has drifted since the calibration.
 
-    values, deviations: by KINDS, then the brightness of shots 2, 3, ... (relative). displacement:
-    of the shadow, root mean square over the picture, pixels; by kind likewise. chi2: the drift
-    squared over its covariance; probability: of more on a Psi that fits. beyond_search: what was
-    found lies at the rim of what was searched, so that the real drift may be larger.
+    values, deviations: by KINDS, then "crosstalk", what the filters let through of other colours
+    beyond what the calibration has (where pixels see one), and the brightness of shots 2, 3, ...
+    (relative). displacement: of the shadow, root mean square over the picture, pixels; by kind
+    likewise. chi2: the drift squared over its covariance; probability: of more on a Psi that fits.
+    beyond_search: the mask is farther off than was asked to search. recognised: the place explains
+    the captures better than places where the mask cannot be, by so many standard deviations.
     """
 
     values: dict[str, float]
@@ -75,24 +120,57 @@ class Drift:
     placement: Placement
     steps: int
     status: str
-    beyond_search: bool = False
+    searched: str
+    beyond_search: bool
+    recognised: float
+
+    @property
+    def refused(self) -> bool:
+        """Whether where the mask is now is not known, so that no Psi can be told to fit."""
+        return self.beyond_search or self.recognised < LEAST_SURE
 
     @property
     def words(self) -> str:
         """What to tell the user in one line."""
+        if self.recognised < LEAST_SURE:
+            return (
+                f"the mask's shadow is not recognised in these captures ({self.searched}): it has "
+                "moved farther, is another, or the scene tells too little; take one whiteboard "
+                "and calibrate again"
+            )
         if self.beyond_search:
             return (
-                f"the shadow has moved by {self.displacement_px:.1f} pixels or more, as far as was "
-                "searched: Psi is not repaired; take one whiteboard and calibrate again"
+                f"the mask has moved by about {self.displacement_px:.1f} pixels, farther than "
+                f"searched ({self.searched}): Psi is not repaired; take one whiteboard and "
+                "calibrate again"
             )
         if not self.drifted:
-            return "Psi still fits the captures"
+            return f"Psi still fits the captures ({self.searched})"
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
         return (
             f"Psi no longer fits: the shadow has moved by {self.displacement_px:.2f} pixels, most "
-            f"of it {largest} ({self.by_kind_px[largest]:.2f} pixels); use the repaired Psi or "
-            "take one whiteboard"
+            f"of it {WORDS[largest]} ({self.by_kind_px[largest]:.2f} pixels); use the repaired Psi "
+            f"or take one whiteboard ({self.searched})"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Captures:
+    """Shots of a scene: readings, variance and usable, (shot, pixel_y, pixel_x), normalised.
+
+    colour: likewise, the one colour that each pixel sees; None: every pixel sees all three.
+    """
+
+    readings: Array
+    variance: Array
+    usable: NDArray[np.bool_]
+    colour: NDArray[np.uint8] | None
+
+    def channels(self) -> NDArray[np.uint8]:
+        """Return the colour that each pixel sees, or ANY_COLOUR, (shot, pixel_y, pixel_x)."""
+        if self.colour is None:
+            return np.full(self.readings.shape, ANY_COLOUR, dtype=np.uint8)
+        return self.colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,27 +189,29 @@ class _Blocks:
 
 
 def _blocks(
-    readings: Array,
-    variance: Array,
-    usable: NDArray[np.bool_],
-    colour: NDArray[np.uint8],
-    side: int,
-    count: int,
-    rng: np.random.Generator,
+    taken: Captures, side: int, count: int, rng: np.random.Generator, half_px: float = np.inf
 ) -> _Blocks:
-    """Return blocks on a jittered grid whose pixels are all usable and not dark."""
-    _, rows, columns = readings.shape
+    """Return blocks on a jittered grid whose pixels are all usable and not dark.
+
+    half_px: from the middle of the picture, along either axis.
+    """
+    sizes = [
+        min(n, max(int(2 * half_px), 4 * side)) if half_px < n else n
+        for n in taken.readings.shape[1:]
+    ]
+    rows, columns = sizes
+    above, before = ((n - m) // 4 * 2 for n, m in zip(taken.readings.shape[1:], sizes, strict=True))
     across = max(int(np.sqrt(count * columns / rows)), 1)
     down = max(count // across, 1)
     found = []
-    floor = 0.05 * float(np.percentile(readings[usable], 90))
+    floor = 0.05 * float(np.percentile(taken.readings[taken.usable], 90))
     for i in range(down):
         for j in range(across):
             for _ in range(4):
-                top = int((i + rng.random()) * (rows - side) / down) // 2 * 2
-                left = int((j + rng.random()) * (columns - side) / across) // 2 * 2
+                top = above + int((i + rng.random()) * (rows - side) / down) // 2 * 2
+                left = before + int((j + rng.random()) * (columns - side) / across) // 2 * 2
                 place = (slice(None), slice(top, top + side), slice(left, left + side))
-                if usable[place].all() and readings[place].mean() > floor:
+                if taken.usable[place].all() and taken.readings[place].mean() > floor:
                     found.append((top, left))
                     break
     if len(found) < 8:
@@ -143,45 +223,67 @@ def _blocks(
     pixels = np.array(found)[:, None, :] + inside
     y, x = pixels[..., 0], pixels[..., 1]
 
-    def taken(array: NDArray) -> NDArray:
+    def at(array: NDArray) -> NDArray:
         return array[:, y, x].transpose(1, 0, 2)
 
     return _Blocks(
         pixels,
-        taken(colour),
-        taken(readings).astype(np.float64),
-        taken(variance).astype(np.float64),
+        at(taken.channels()),
+        at(taken.readings).astype(np.float64),
+        at(taken.variance).astype(np.float64),
     )
 
 
 class _Search:
-    """Evidence of the blocks as a function of the drift."""
+    """Evidence of the blocks as a function of the drift, and the prior of that.
+
+    origin, penalty: mean and inverse covariance of the prior. steps: of differences.
+    """
 
     def __init__(
         self,
         mask: ShadowMask,
         placement: Placement,
         stages: Stages,
-        blocks: _Blocks,
         prior: Prior,
+        spreads: Array,
+        steps: Array,
     ) -> None:
-        self.mask, self.placement, self.stages = mask, placement, stages
-        self.blocks, self.prior = blocks, prior
-        every = np.arange(len(prior.disparities_px))
+        self.mask, self.placement, self.stages, self.prior = mask, placement, stages, prior
+        self.penalty, self.steps = np.diag(1 / np.square(spreads)), steps
+        self.origin, self.farthest = np.zeros(len(spreads)), 3 * spreads
+
+    def begin(self, blocks: _Blocks, origin: Array, candidates: int | None = None) -> None:
+        """Take these blocks, each with the disparities that explain it best at the origin.
+
+        candidates: so many of them (None: all).
+        """
+        self.blocks, self.origin = blocks, origin
+        every = np.arange(len(self.prior.disparities_px))
         self.chosen = np.tile(every, (len(blocks.pixels), 1))
+        if candidates is not None:
+            self.chosen = np.argsort(-self.evidence(origin), axis=1)[:, :candidates]
 
     def coefficients(self, drift: Array) -> NDArray[np.float64]:
-        """Return (block, shot, side^2, v, u)."""
-        shadow = Shadow(self.mask, drifted(self.placement, drift))
-        count, area, _ = self.blocks.pixels.shape
-        flat = self.blocks.pixels.reshape(-1, 2)
-        shots = self.blocks.readings.shape[1]
-        found = np.empty((count, shots, area, *self.mask.views))
-        for shot in range(shots):
-            gain = 1.0 if shot == 0 else 1.0 + drift[len(KINDS) + shot - 1]
-            colours = self.blocks.colours[:, shot].ravel()
+        """Return (block, stored, shot, side^2, v, u): of a pixel's own colour, or of all three."""
+        blocks, rest = self.blocks, drift[len(KINDS) :]
+        mask, every = self.mask, blocks.colours[0, 0, 0] == ANY_COLOUR
+        if not every:
+            # As much of either other colour.
+            mask = mixing(mask, np.eye(3) * (1 - 1.5 * rest[0]) + rest[0] / 2)
+            rest = rest[1:]
+        shadow = Shadow(mask, drifted(self.placement, drift))
+        count, area, _ = blocks.pixels.shape
+        flat = blocks.pixels.reshape(-1, 2)
+        shots = blocks.readings.shape[1]
+        stored = range(3 if every else 1)
+        found = np.empty((count, len(stored), shots, area, *self.mask.views))
+        for shot, c in product(range(shots), stored):
+            gain = (1.0 if shot == 0 else 1.0 + rest[shot - 1]) / len(stored)
+            colours = blocks.colours[:, shot].ravel()
+            colours = np.full_like(colours, c) if every else colours
             each = shadow.coefficients(flat, colours, self.stages[shot], shot)
-            found[:, shot] = gain * each.reshape(count, area, *self.mask.views)
+            found[:, c, shot] = gain * each.reshape(count, area, *self.mask.views)
         return found
 
     def evidence(self, drift: Array) -> NDArray[np.float64]:
@@ -196,43 +298,55 @@ class _Search:
             self.chosen,
         )
 
-    def scores(self, drift: Array, steps: Array, central: bool) -> tuple[Array, Array]:
-        """Return the blocks' evidence and their derivatives (block, kind), by differences."""
-        here = averaged(self.evidence(drift))
-        slopes = np.empty((len(here), len(drift)))
-        for k, step in enumerate(steps):
+    def total(self, drift: Array) -> float:
+        """Return the log evidence of all blocks."""
+        return float(averaged(self.evidence(drift)).sum())
+
+    def posterior(self, drift: Array) -> float:
+        """Return the same with the prior's."""
+        off = drift - self.origin
+        return self.total(drift) - 0.5 * float(off @ self.penalty @ off)
+
+    def pull(self, drift: Array) -> Array:
+        """Return the slope of minus the log prior."""
+        return self.penalty @ (drift - self.origin)
+
+    def scores(self, drift: Array, central: bool) -> Array:
+        """Return the derivatives of the blocks' evidence (block, kind), by differences."""
+        here = None if central else averaged(self.evidence(drift))
+        slopes = np.empty((len(self.blocks.pixels), len(drift)))
+        for k, step in enumerate(self.steps):
             move = np.zeros(len(drift))
             move[k] = step
             ahead = averaged(self.evidence(drift + move))
-            behind = averaged(self.evidence(drift - move)) if central else here
-            slopes[:, k] = (ahead - behind) / (step * (1 + central))
-        return here, slopes
-
-    def keep_best(self, drift: Array, count: int) -> None:
-        """Keep the disparities that explain each block best."""
-        evidence = self.evidence(drift)
-        best = np.argsort(-evidence, axis=1)[:, :count]
-        self.chosen = np.take_along_axis(self.chosen, best, axis=1)
+            behind = averaged(self.evidence(drift - move)) if here is None else here
+            slopes[:, k] = (ahead - behind) / (step * (2 if here is None else 1))
+        return slopes
 
 
 def drifted(placement: Placement, drift: Array) -> Placement:
     """Return the placement after a drift (in the order of KINDS; what follows is ignored)."""
     changes = {
         name: getattr(placement, name) + float(value)
-        for name, value in zip(ATTRIBUTES, drift, strict=False)
+        for name, value in zip(ATTRIBUTES.values(), drift, strict=False)
     }
     return replace(placement, **changes)
 
 
 def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> float:
-    """Return the root mean square displacement of the shadow over picture and views, pixels."""
+    """Return the root mean square displacement of the shadow over picture and views, pixels.
+
+    drift: in the order of KINDS; what is not there, or follows, does not count.
+    """
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
     y, x = ((np.linspace(0, 1, 9) - 0.5) * count * mask.pitch_um for count in mask.size)
     v, u = ((np.arange(n) - (n - 1) / 2) * mask.aperture_cell_um for n in mask.views)
     yy, xx, vv, uu = np.meshgrid(y, x, v, u, indexing="ij")
     xi_x, xi_y = (1 - ratio) * xx + ratio * uu, (1 - ratio) * yy + ratio * vv
-    shift_x, shift_y, turn, scale, distance = (float(value) for value in drift[: len(KINDS)])
-    more = distance * mask.distance_um / mask.lens_um
+    shift_x, shift_y, turn, scale, distance, tilt_x, tilt_y = np.resize(
+        [*drift, *[0.0] * len(KINDS)], len(KINDS)
+    )
+    more = (distance * mask.distance_um + tilt_x * xx + tilt_y * yy) / mask.lens_um
     moved_x = shift_x - turn * xi_y + scale * xi_x - more * (uu - xx)
     moved_y = shift_y + turn * xi_x + scale * xi_y - more * (vv - yy)
     pixel_um = mask.pitch_um * mask.binning
@@ -240,10 +354,7 @@ def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> flo
 
 
 def find_drift(
-    readings: Array,
-    variance: Array,
-    usable: NDArray[np.bool_],
-    colour: NDArray[np.uint8],
+    taken: Captures,
     mask: ShadowMask,
     placement: Placement,
     stages: Stages,
@@ -252,40 +363,58 @@ def find_drift(
 ) -> Drift:
     """Return how the mask has moved between the calibration and these captures.
 
-    readings, variance, usable: (shot, pixel_y, pixel_x), normalised. colour: (shot, y, x), the one
-    colour that each pixel sees. placement, mask: as calibrated. stages: (x, y) in um per shot.
-    Raises CalibrationError where too little of the captures can be used.
+    placement, mask: as calibrated. stages: (x, y) in um per shot. Raises CalibrationError where too
+    little of the captures can be used.
     """
     settings = settings or DriftSettings()
-    if mask.binning != 1:
-        raise CalibrationError("a drift is sought on sensors whose pixels are samples")
-    shots = len(readings)
+    shots = len(taken.readings)
     rng = np.random.default_rng(settings.seed)
     side = settings.block_px if shots < 3 else max(settings.block_px - 2, 4)
-    blocks = _blocks(readings, variance, usable, colour, side, settings.blocks, rng)
     disparities = np.linspace(
         -settings.disparity_px, settings.disparity_px, settings.disparity_steps
     )
     prior = plane_prior(mask.views, side, disparities)
-    spreads = np.array([*SPREADS, *[0.1] * (shots - 1)])
-    pixel_um = mask.pitch_um
+    pixel_um = mask.pitch_um * mask.binning
     half_um = max(mask.size) / 2 * mask.pitch_um
     step = 0.02 * pixel_um
-    steps = np.array([step, step, step / half_um, step / half_um, 0.02, *[0.005] * (shots - 1)])
-    drift = np.zeros(len(spreads))
-    if settings.search_px > 0:
-        drift = _coarse(mask, placement, stages, blocks, prior, drift, settings, rng)
-    search = _Search(mask, placement, stages, blocks, prior)
-    search.keep_best(drift, settings.candidates)
-    penalty = np.diag(1 / spreads**2)
-    drift, taken, converged = _climb(search, drift, steps, penalty, settings.tolerance, on_step)
-    drift, covariance = _polish(search, drift, steps, penalty)
+    far_um = max(max(mask.views) - 1, 1) / 2 * mask.aperture_cell_um
+    lean = min(step * mask.lens_um / (far_um * half_um), 1e-3)
+    names, spreads = list(KINDS), list(SPREADS)
+    steps = [step, step, step / half_um, step / half_um, 0.02, lean, lean]
+    if taken.colour is not None:
+        names, spreads, steps = [*names, "crosstalk"], [*spreads, CROSSTALK_SPREAD], [*steps, 0.01]
+    names += [f"brightness_{shot + 1}" for shot in range(1, shots)]
+    every_step = np.array(steps + [0.005] * (shots - 1))
+    every_spread = np.array(spreads + [0.1] * (shots - 1))
+    search = _Search(mask, placement, stages, prior, every_spread, every_step)
+
+    def climbed(blocks: _Blocks, start: Array) -> tuple[Array, int, bool]:
+        search.begin(blocks, start, settings.candidates)
+        return _climb(search, start, settings.tolerance, on_step)
+
+    half_px, widest_px = START_PX / 2, max(taken.readings.shape[1:]) / 2
+    blocks = _blocks(taken, side, settings.coarse_blocks, rng, half_px)
+    starts = _starts(taken, mask, placement, stages, settings, len(names))
+    tried = [climbed(blocks, start)[0] for start in starts]
+    search.begin(blocks, starts[0])
+    drift = max(tried, key=search.total)
+    while WIDENING * half_px < widest_px:
+        half_px *= WIDENING
+        blocks = _blocks(taken, side, settings.coarse_blocks, rng, half_px)
+        drift = climbed(blocks, drift)[0]
+    blocks = _blocks(taken, side, settings.blocks, rng)
+    drift, steps_taken, converged = climbed(blocks, drift)
+    drift, covariance = _polish(search, drift)
+    recognised = _recognised(search, blocks, drift, settings, rng)
     count = len(KINDS)
     mask_alone = drift[:count]
     statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
     probability = float(chi2.sf(statistic, count))
-    moved = displacement_px(mask, placement, drift)
-    names = [*KINDS, *(f"brightness_{shot + 1}" for shot in range(1, shots))]
+    moved = displacement_px(mask, placement, mask_alone)
+    reach = np.array(
+        [settings.search_px * pixel_um] * 2
+        + [np.deg2rad(settings.search_deg), settings.search_scale]
+    )
     return Drift(
         dict(zip(names, map(float, drift), strict=True)),
         dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True)),
@@ -298,35 +427,109 @@ def find_drift(
         probability,
         probability < settings.false_alarms and moved > settings.harmless_px,
         drifted(placement, drift),
-        taken,
+        steps_taken,
         "converged" if converged else "step limit reached",
-        bool(np.abs(drift[:2]).max() > RIM * settings.search_px * pixel_um > 0),
+        f"searched: shifts up to {settings.search_px:g} pixels, turns up to "
+        f"{settings.search_deg:g} degrees, scales up to {settings.search_scale:.0%}",
+        bool((np.abs(drift[: len(reach)]) > reach).any()),
+        recognised,
     )
 
 
-def _climb(
+def _starts(
+    taken: Captures,
+    mask: ShadowMask,
+    placement: Placement,
+    stages: Stages,
+    settings: DriftSettings,
+    size: int,
+) -> list[Array]:
+    """Return where to begin: no drift, and the best places of the open aperture's shadow."""
+    reading, usable, channels = taken.readings[0], taken.usable[0], taken.channels()[0]
+    flat = np.zeros(reading.shape)
+    for channel in np.unique(channels):
+        seen = (channels == channel) & usable
+        total = gaussian_filter(np.where(seen, reading, 0).astype(np.float64), LOCAL_PX)
+        local = total / np.maximum(gaussian_filter(seen.astype(np.float64), LOCAL_PX), 1e-6)
+        flat[seen] = reading[seen] / np.maximum(local[seen], 1e-6)
+    board = Board(
+        "captures",
+        flat.astype(np.float32),
+        np.where(usable, 1, np.inf).astype(np.float32),
+        channels,
+        np.ones(mask.views, dtype=bool),
+        stages[0],
+        0,
+    )
+    reach_um = SPARE * settings.search_px * mask.pitch_um * mask.binning
+    turns = _grid(settings.search_deg, TURN_STEP_DEG)
+    scales = _grid(settings.search_scale, SCALE_STEP)
+    found = []
+    for turn, scale in product(np.deg2rad(turns), scales):
+        trial = np.zeros(size)
+        trial[2:4] = turn, scale
+        best = correlated(board, mask, drifted(placement, trial), reach_um, START_PX)
+        trial[0] = best.placement.offset_x_um - placement.offset_x_um
+        trial[1] = best.placement.offset_y_um - placement.offset_y_um
+        found.append((best.correlation, trial))
+    middle = replace(mask, size=(START_PX, START_PX))
+    chosen: list[Array] = [np.zeros(size)]
+    for _, trial in sorted(found, key=lambda one: -one[0]):
+        if len(chosen) > settings.starts:
+            break
+        if all(displacement_px(middle, placement, trial - one) > 1 for one in chosen):
+            chosen.append(trial)
+    return chosen
+
+
+def _grid(reach: float, step: float) -> Array:
+    """Return values from below -reach to above reach, 0 among them."""
+    count = int(np.ceil(reach / step)) + 1 if reach else 0
+    return np.arange(-count, count + 1) * step
+
+
+def _recognised(
     search: _Search,
+    blocks: _Blocks,
     drift: Array,
-    steps: Array,
-    penalty: Array,
-    tolerance: float,
-    on_step: Callable[[float], None],
+    settings: DriftSettings,
+    rng: np.random.Generator,
+) -> float:
+    """Return by how many standard deviations a drift explains the captures better than decoys do.
+
+    Those are displaced by several cells of the mask, where it is an unrelated one.
+    """
+    count = min(settings.coarse_blocks, len(blocks.pixels))
+    some = blocks.some(np.sort(rng.choice(len(blocks.pixels), count, replace=False)))
+    search.begin(some, drift)
+    far_um = rng.uniform(4, 10, DECOYS) * search.mask.cell_um
+    angle = rng.uniform(0, 2 * np.pi, DECOYS)
+    decoys = np.tile(drift, (DECOYS, 1))
+    decoys[:, :2] += np.stack([far_um * np.cos(angle), far_um * np.sin(angle)], axis=1)
+    evidence = [search.total(one) for one in decoys]
+    return float((search.total(drift) - np.mean(evidence)) / max(np.std(evidence), 1e-9))
+
+
+def _climb(
+    search: _Search, drift: Array, tolerance: float, on_step: Callable[[float], None]
 ) -> tuple[Array, int, bool]:
     """Return the drift after Gauss-Newton steps on the blocks' scores, their count, converged."""
     for taken in range(1, MOST_STEPS + 1):
-        here, slopes = search.scores(drift, steps, central=False)
-        value = float(here.sum() - 0.5 * drift @ penalty @ drift)
+        slopes = search.scores(drift, central=False)
+        value = search.posterior(drift)
         # Without their mean, which far from the peak is larger than what they scatter.
         centred = slopes - slopes.mean(axis=0)
-        matrix = centred.T @ centred + penalty
-        move = np.linalg.solve(matrix, slopes.sum(axis=0) - penalty @ drift)
+        matrix = centred.T @ centred + search.penalty
+        move = np.linalg.solve(matrix, slopes.sum(axis=0) - search.pull(drift))
+        # Far from the peak a step may lead where no mask can be.
+        move = np.clip(move, -search.farthest, search.farthest)
         deviations = np.sqrt(np.diag(np.linalg.inv(matrix)))
-        found = _posterior(search, drift + move, penalty)
+        found = search.posterior(drift + move)
         while found <= value:
             move = move / 2
             if np.max(np.abs(move) / deviations) < tolerance / 4:
                 return drift, taken, True
-            found = _posterior(search, drift + move, penalty)
+            found = search.posterior(drift + move)
         drift = drift + move
         on_step(found)
         if np.max(np.abs(move) / deviations) < tolerance:
@@ -334,66 +537,32 @@ def _climb(
     return drift, MOST_STEPS, False
 
 
-def _polish(
-    search: _Search, drift: Array, steps: Array, penalty: Array
-) -> tuple[Array, NDArray[np.float64]]:
+def _polish(search: _Search, drift: Array) -> tuple[Array, NDArray[np.float64]]:
     """Return the drift after a last step, Newton's own, and its sandwich covariance.
 
     Its derivatives are without the bias of the one-sided differences before.
     """
-    _, slopes = search.scores(drift, steps, central=True)
-    curvature = _curvature(search, drift, steps, penalty)
-    move = np.linalg.solve(curvature, slopes.sum(axis=0) - penalty @ drift)
-    if _posterior(search, drift + move, penalty) > _posterior(search, drift, penalty):
+    slopes = search.scores(drift, central=True)
+    curvature = _curvature(search, drift)
+    move = np.linalg.solve(curvature, slopes.sum(axis=0) - search.pull(drift))
+    if search.posterior(drift + move) > search.posterior(drift):
         drift = drift + move
     inverse = np.linalg.inv(curvature)
-    return drift, np.asarray(inverse @ (slopes.T @ slopes + penalty) @ inverse, np.float64)
+    return drift, np.asarray(inverse @ (slopes.T @ slopes + search.penalty) @ inverse, np.float64)
 
 
-def _coarse(
-    mask: ShadowMask,
-    placement: Placement,
-    stages: Stages,
-    blocks: _Blocks,
-    prior: Prior,
-    drift: Array,
-    settings: DriftSettings,
-    rng: np.random.Generator,
-) -> Array:
-    """Return the shift of greatest evidence on a grid, from some of the blocks."""
-    count = min(settings.coarse_blocks, len(blocks.pixels))
-    some = blocks.some(np.sort(rng.choice(len(blocks.pixels), count, replace=False)))
-    search = _Search(mask, placement, stages, some, prior)
-    search.keep_best(drift, settings.candidates)
-    reach = settings.search_px * mask.pitch_um
-    places = np.arange(-3, 4) * reach / 3
-    best, value = drift, -np.inf
-    for x in places:
-        for y in places:
-            trial = drift.copy()
-            trial[:2] = x, y
-            found = float(averaged(search.evidence(trial)).sum())
-            if found > value:
-                best, value = trial, found
-    return best
-
-
-def _posterior(search: _Search, drift: Array, penalty: Array) -> float:
-    return float(averaged(search.evidence(drift)).sum() - 0.5 * drift @ penalty @ drift)
-
-
-def _curvature(search: _Search, drift: Array, steps: Array, penalty: Array) -> NDArray[np.float64]:
+def _curvature(search: _Search, drift: Array) -> NDArray[np.float64]:
     """Return minus the second derivatives of the log posterior, at least the prior's."""
     size = len(drift)
     curvature = np.empty((size, size))
-    here = search.scores(drift, steps, central=False)[1].sum(axis=0)
-    for k, step in enumerate(steps):
+    here = search.scores(drift, central=False).sum(axis=0)
+    for k, step in enumerate(search.steps):
         move = np.zeros(size)
         move[k] = 2 * step
-        ahead = search.scores(drift + move, steps, central=False)[1].sum(axis=0)
+        ahead = search.scores(drift + move, central=False).sum(axis=0)
         curvature[k] = (here - ahead) / (2 * step)
-    curvature = (curvature + curvature.T) / 2 + penalty
-    scale = np.sqrt(np.diag(penalty))
+    curvature = (curvature + curvature.T) / 2 + search.penalty
+    scale = np.sqrt(np.diag(search.penalty))
     values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
     # A direction that the captures do not tell is held by the prior alone.
     held = (vectors * np.maximum(values, 1.0)) @ vectors.T

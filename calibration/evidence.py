@@ -106,9 +106,10 @@ def _add_grid(coefficients, down, across, first, count, matrix, at):
 def _evidences(coefficients, colours, readings, noise, down, across, grids, chosen, found):
     """Set found (block, candidate) to each block's log evidence at its chosen disparities.
 
-    coefficients: (block, shot, pixel, v, u); colours, readings, noise: (block, shot, pixel).
-    chosen: (block, candidate) indices of disparities.
+    coefficients: (block, stored, shot, pixel, v, u); colours, readings, noise: (block, shot,
+    pixel). chosen: (block, candidate) indices of disparities.
     """
+    stored = coefficients.shape[1]
     blocks, shots, area = readings.shape
     n = shots * area
     fine, coarse = grids[0, 1] ** 2, grids[1, 1] ** 2
@@ -122,20 +123,24 @@ def _evidences(coefficients, colours, readings, noise, down, across, grids, chos
         for candidate in range(chosen.shape[1]):
             d = chosen[block, candidate]
             matrix = np.zeros((n, total))
-            at = 0
-            for grid in range(3):
-                _add_grid(
-                    coefficients[block],
-                    down[d],
-                    across[d],
-                    grids[grid, 0],
-                    grids[grid, 1],
-                    matrix,
-                    at,
-                )
-                at += grids[grid, 1] ** 2
-            coloured = matrix[:, fine:] * CHROMA_SPREAD
-            chroma = coloured @ coloured.T
+            chroma = np.zeros((n, n))
+            for c in range(stored):
+                own = np.zeros((n, total))
+                at = 0
+                for grid in range(3):
+                    _add_grid(
+                        coefficients[block, c],
+                        down[d],
+                        across[d],
+                        grids[grid, 0],
+                        grids[grid, 1],
+                        own,
+                        at,
+                    )
+                    at += grids[grid, 1] ** 2
+                matrix += own
+                coloured = own[:, fine:] * CHROMA_SPREAD
+                chroma += coloured @ coloured.T
             matrix[:, :fine] *= FINE_SPREAD
             matrix[:, fine : fine + coarse] *= COARSE_SPREAD
             matrix[:, fine + coarse :] *= MEAN_SPREAD
@@ -143,9 +148,10 @@ def _evidences(coefficients, colours, readings, noise, down, across, grids, chos
             scale = 0.0
             for i in range(n):
                 scale += covariance[i, i] / n
+            scale = max(scale, 1e-12)
             for i in range(n):
                 for j in range(n):
-                    if colour[i] == colour[j]:
+                    if stored > 1 or colour[i] == colour[j]:
                         covariance[i, j] += chroma[i, j]
                 relative = noise[block].reshape(n)[i] / max(level * level, 1e-12)
                 covariance[i, i] += scale * (FLOOR_SHARE**2 + relative)
@@ -172,9 +178,9 @@ def log_evidence(
 ) -> NDArray[np.float64]:
     """Return the log evidence of every block at its disparities, (block, candidate).
 
-    coefficients: (block, shot, side^2, v, u), Psi's of what each pixel sees. colours, readings,
-    noise: (block, shot, side^2), noise the variance of a reading. chosen: (block, candidate),
-    indices into the prior's disparities.
+    coefficients: (block, stored, shot, side^2, v, u), Psi's: stored 1, of the colour that each
+    pixel sees, or 3, of all. colours, readings, noise: (block, shot, side^2), noise the variance of
+    a reading. chosen: (block, candidate), indices into the prior's disparities.
     """
     found = np.empty(chosen.shape)
     _evidences(

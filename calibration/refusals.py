@@ -1,6 +1,6 @@
-"""Whiteboards that no Psi may be made of: saturated, dark, without the mask, of a bench that moved.
+"""Whiteboards that no Psi may be made of, each named with its remedy as a CalibrationError.
 
-Each is named with its remedy as a CalibrationError.
+Saturated, dark, lit darks, without the mask, of another camera, of a bench or a board that moved.
 """
 
 from __future__ import annotations
@@ -8,65 +8,289 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibration.board_angle import BoardAngle
 from calibration.boards import Board, BoardSet
-from calibration.choice import HeldOut
+from calibration.choice import HeldOut, predicted_by_shadow
 from calibration.errors import CalibrationError
+from calibration.fit import Fit
 from calibration.frames import MeanFrame
+from calibration.placement import SCALARS, Placement, Tolerances, designed_placement
+from calibration.registration import register
+from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import DARKEST_REFERENCE_DN
+from emmc_rig.model.camera import Camera
 
+Array = NDArray[np.floating]
 BRIGHTEST_MASK = 0.95
 """No mask that codes lets nearly all light through everywhere."""
+LEAST_CONTRAST = 0.6
+"""Of a mask's dark cells over its clear ones through one view; without it falloff leaves 0.9."""
 LEAST_GAIN_SHARE = 0.5
 """Of the noise per DN that other frames have: a full pixel is without shot noise."""
-LARGEST_MISS = 0.1
+PLATEAU_WIDTH, PLATEAU_SHARE = 0.3, 0.03
+"""Deviations of shot noise about the brightest pixels, and the share of pixels there: of normal
+noise it is below 0.01."""
+LARGEST_LEAK = 0.01
+"""Of a whiteboard's light in a dark frame; the dark current of a hot sensor is a tenth of it."""
+LARGEST_MISS = 0.06
 """Of a held-out whiteboard's level; a bench of 64 rays, the grainiest that was tried, has 4 %."""
 BRIGHTNESS_DIFFERS = 0.05
+ALIKE_BRIGHTNESS, ALIKE_UM = 0.2, 5.0
+"""By how much one whiteboard may differ from the others with the mask in one place: a lamp that
+flickers, a mask that creeps."""
+CLEAREST = 1.05
+"""What clear cells let through, of no mask; beyond 1 only by the fit's error."""
+BRIGHTEST_VIEWS = 1.12
+"""The same of the middle view and the corners' on average, whose falloff is not fitted."""
+UNLIKELY = 4.0
+"""Times the tolerances of the fit."""
+LARGEST_GRADIENT = {True: 0.03, False: 0.1}
+"""Over the picture, of the open aperture and of one view, whose falloff is but modelled."""
+LARGEST_UNEVENNESS = 0.25
+SURE = 5.0
+MIRRORED = 0.02
+"""By which the views in another order must correlate better with the design's."""
+SAMPLED = 3_000
+ORDERS = {
+    "mirrored left to right": lambda opened: opened[:, ::-1],
+    "mirrored top to bottom": lambda opened: opened[::-1],
+    "turned by 180 degrees": lambda opened: opened[::-1, ::-1],
+    "with rows and columns exchanged": lambda opened: opened.T,
+}
 
 
 def refuse_unfit(sets: Sequence[BoardSet]) -> None:
-    """Raise CalibrationError for references that are dark or saturated."""
+    """Raise CalibrationError for darks that are lit, and for frames dark or saturated."""
     for one in sets:
+        _refuse_lit_darks(one)
         for (_, lamp), frame in one.references.items():
             above = frame.mean_dn - one.dark_at(frame.exposure_s).mean_dn
-            if float(np.percentile(above, 99)) < DARKEST_REFERENCE_DN:
+            brightest = max(np.median(above[y::2, x::2]) for y, x in np.ndindex(2, 2))
+            if float(brightest) < DARKEST_REFERENCE_DN:
                 raise CalibrationError(
                     f"the reference whiteboard under the {lamp} lamp is less than "
                     f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? Else raise it, "
                     "or the exposure"
                 )
-        reference = one.references.get((0, "white"))
-        seen = [
-            _gain(board.frame, one)
-            for board in one.frames
-            if board.frame.count > 1 and _light_dn(board.frame, one) > DARKEST_REFERENCE_DN
-        ]
-        if reference is None or reference.count < 2 or not seen:
-            continue
-        if _gain(reference, one) < LEAST_GAIN_SHARE * float(np.median(seen)):
+        for board in one.frames:
+            if np.median(_above_dn(board.frame, one)) < DARKEST_REFERENCE_DN / 10:
+                raise CalibrationError(
+                    f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
+                )
+        _refuse_saturated(one)
+
+
+def _refuse_lit_darks(boards: BoardSet) -> None:
+    first, last = boards.dark, max(boards.darks, key=lambda frame: frame.exposure_s)
+    reference = boards.references.get((0, "white"))
+    if reference is None or last.exposure_s == first.exposure_s:
+        return
+    seconds = last.exposure_s - first.exposure_s
+    rate = float(np.median(last.mean_dn) - np.median(first.mean_dn)) / seconds
+    black = float(np.median(first.mean_dn)) - rate * first.exposure_s
+    lit = (float(np.median(reference.mean_dn)) - black) / reference.exposure_s
+    if rate * last.exposure_s > DARKEST_REFERENCE_DN and rate > LARGEST_LEAK * lit:
+        raise CalibrationError(
+            f"the dark frames have {rate / lit:.0%} of the whiteboard's light: switch the lamp off "
+            "and cover the camera for darks, and capture them again"
+        )
+
+
+def _refuse_saturated(boards: BoardSet) -> None:
+    named = {
+        f"the reference whiteboard, {lamp} lamp": frame
+        for (_, lamp), frame in boards.references.items()
+    }
+    named |= {board.name: board.frame for board in boards.frames}
+    lit = {
+        name: frame
+        for name, frame in named.items()
+        if np.mean(_above_dn(frame, boards)) > DARKEST_REFERENCE_DN
+    }
+    gains = {name: _gain(frame, boards) for name, frame in lit.items() if frame.count > 1}
+    if not gains:
+        return
+    typical = float(np.median(list(gains.values())))
+    for name, frame in lit.items():
+        less = gains.get(name, typical) < LEAST_GAIN_SHARE * typical
+        if less or _plateau(_above_dn(frame, boards), typical, frame.count) > PLATEAU_SHARE:
             raise CalibrationError(
-                "the reference whiteboard is saturated below the white level: its noise is less "
-                f"than {LEAST_GAIN_SHARE:.0%} of what its light has; shorten the exposure "
-                f"({reference.exposure_s:g} s) or dim the lamp"
+                f"{name}: saturated below the white level, its brightest pixels have less noise "
+                f"than their light makes; shorten the exposure ({frame.exposure_s:g} s) or dim the "
+                "lamp"
             )
+
+
+def _above_dn(frame: MeanFrame, boards: BoardSet) -> Array:
+    return frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn
 
 
 def _gain(frame: MeanFrame, boards: BoardSet) -> float:
     """Return the noise's variance per DN of light."""
-    return (frame.variance_dn2 - boards.dark.variance_dn2) / _light_dn(frame, boards)
+    light = float(np.mean(_above_dn(frame, boards)))
+    return (frame.variance_dn2 - boards.dark.variance_dn2) / light
 
 
-def _light_dn(frame: MeanFrame, boards: BoardSet) -> float:
-    return float(np.mean(frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn))
+def _plateau(above_dn: Array, gain: float, count: int) -> float:
+    """Return the share of pixels that are as bright as the brightest, to far below shot noise."""
+    top = float(np.percentile(above_dn, 99.5))
+    noise = float(np.sqrt(max(gain * top, 1e-9) / count))
+    return float(np.mean(np.abs(above_dn - top) < PLATEAU_WIDTH * noise))
 
 
 def refuse_without_mask(board: Board) -> None:
-    """Raise CalibrationError for an open whiteboard that reads as if no mask were in the beam."""
+    """Raise CalibrationError for a whiteboard that reads as if no mask were in the beam."""
     readings = board.reading[board.usable]
-    if readings.size and np.percentile(readings, 2) > BRIGHTEST_MASK:
+    if readings.size == 0:
+        return
+    if board.views_open.all():
+        bare = np.percentile(readings, 2) > BRIGHTEST_MASK
+    else:
+        each = [readings[board.channels[board.usable] == c] for c in np.unique(board.channels)]
+        dark, clear = np.mean([np.percentile(one, (2, 98)) for one in each if one.size], axis=0)
+        bare = board.views_open.sum() == 1 and dark > LEAST_CONTRAST * clear
+    if bare:
         raise CalibrationError(
             f"{board.name}: it reads {np.median(readings):.2f} of the whiteboard without masks, "
-            "and no pixel much less: is the mask in the beam?"
+            "and no pixel much less than another: is the mask in the beam?"
+        )
+
+
+def refuse_another_mask(boards: Sequence[Board], camera: Camera, mask: ShadowMask) -> Placement:
+    """Return where the mask is registered; raises CalibrationError where it is not the design's.
+
+    boards: the first is registered; of those of single views the order is checked.
+    """
+    placement = register(boards[0], mask, designed_placement(camera)).placement
+    shadow = Shadow(mask, placement)
+    single = [board for board in boards if board.views_open.sum() == 1]
+    clearest = [np.percentile(b.reading[b.usable], 98) * b.views_open.size for b in single]
+    if single and np.mean(clearest) > BRIGHTEST_VIEWS:
+        _raise_dim_references(float(np.mean(clearest)))
+    rng = np.random.default_rng(0)
+    own, others = [], []
+    for board in single:
+        usable = np.argwhere(board.usable)
+        pixels = usable[rng.integers(len(usable), size=min(SAMPLED, len(usable)))]
+        own.append(_correlation(board, shadow, pixels, board.views_open))
+        orders = [turned(board.views_open) for turned in ORDERS.values()]
+        others.append(
+            [
+                _correlation(board, shadow, pixels, one)
+                if one.shape == board.views_open.shape
+                else -1
+                for one in orders
+            ]
+        )
+    if single:
+        means = np.mean(others, axis=0)
+        if means.max() > np.mean(own) + MIRRORED:
+            raise CalibrationError(
+                "the views are not those that the whiteboards are named for: they are "
+                f"{list(ORDERS)[int(np.argmax(means))]}; check the axes of the aperture's stage"
+            )
+    return placement
+
+
+def _correlation(
+    board: Board, shadow: Shadow, pixels: NDArray[np.int64], views_open: NDArray[np.bool_]
+) -> float:
+    y, x = pixels.T
+    channels = board.channels[y, x]
+    drawn = shadow.readings(pixels, channels, views_open, board.stage_um, board.shot)
+    reading = board.reading[y, x].astype(np.float64)
+    for c in np.unique(channels):
+        drawn[channels == c] -= drawn[channels == c].mean()
+        reading[channels == c] -= reading[channels == c].mean()
+    return float(drawn @ reading / max(np.linalg.norm(drawn) * np.linalg.norm(reading), 1e-12))
+
+
+def _raise_dim_references(clear: float) -> None:
+    raise CalibrationError(
+        f"the mask would let {clear:.2f} times as much light through as no mask: the references "
+        "were taken with less light, or not through the whole aperture; capture all whiteboards "
+        "again, in one go"
+    )
+
+
+def refuse_odd_fit(fit: Fit, boards: Sequence[Board], tolerances: Tolerances) -> None:
+    """Raise CalibrationError for a fit that no bench has, and for whiteboards unlike the others."""
+    at = fit.placement
+    if at.clear > max(CLEAREST, 1 + SURE * fit.deviation("clear")):
+        _raise_dim_references(at.clear)
+    usual = Placement(aperture=at.aperture).vector()[: len(SCALARS)]
+    off = (at.vector()[: len(SCALARS)] - usual) / tolerances.deviations((1, 1))[: len(SCALARS)]
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > UNLIKELY:
+        raise CalibrationError(
+            f"the fitted mask has {SCALARS[worst]} {getattr(at, SCALARS[worst]):.4g}, "
+            f"{abs(off[worst]):.1f} times as far from the design as benches are: these whiteboards "
+            "are of another camera or mask, or its description is wrong"
+        )
+    for one, board in zip(fit.boards, boards, strict=True):
+        alike = sum(np.allclose(board.stage_um, other.stage_um) for other in boards) > 1
+        moved_um = float(np.hypot(*one.moved_um))
+        if abs(one.brightness - 1) > max(ALIKE_BRIGHTNESS, SURE * one.brightness_deviation):
+            raise CalibrationError(
+                f"{one.name}: {one.brightness:.2f} times as bright as the others tell: was the "
+                "aperture where it should be, the mask in the beam, and the lamp the same? "
+                "Capture it again"
+            )
+        if alike and moved_um > max(ALIKE_UM, SURE * one.moved_deviation_um):
+            raise CalibrationError(
+                f"{one.name}: the mask stands {moved_um:.1f} um from where the others have it: it "
+                "moved between them, or this one is of another day; capture all again, in one go"
+            )
+
+
+def refuse_tilted_board(shadow: Shadow, boards: Sequence[Board], model: float = 1.0) -> None:
+    """Raise CalibrationError where brightness changes over the picture against the references.
+
+    model: how much rougher the shadow is than a fitted one.
+    """
+    for board in boards:
+        across, deviation = _gradient(shadow, board)
+        limit = model * LARGEST_GRADIENT[bool(board.views_open.all())]
+        worst = int(np.argmax(np.abs(across)))
+        if abs(across[worst]) > max(limit, SURE * deviation):
+            raise CalibrationError(
+                f"{board.name}: its brightness against the reference changes by "
+                f"{abs(across[worst]):.0%} from {('top to bottom', 'left to right')[worst]}: the "
+                "white board was tilted or shaded, or the lamp moved, between the two; capture "
+                "all whiteboards again, in one go"
+            )
+
+
+def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
+    """Return by how much a whiteboard's brightness changes down and across, and how sure."""
+    predicted = predicted_by_shadow(shadow, board)
+    y, x = np.argwhere(board.usable).T
+    rows, columns = board.reading.shape
+    at = predicted[y, x]
+    levels = [np.where(board.channels[y, x] == c, at, 0) for c in np.unique(board.channels)]
+    terms = np.stack([at * (y / rows - 0.5), at * (x / columns - 0.5), *levels], axis=1)
+    value = board.reading[y, x].astype(np.float64)
+    keep = np.ones(len(value), dtype=bool)
+    for _ in range(3):
+        normal = terms[keep].T @ terms[keep] + 1e-12 * np.eye(terms.shape[1])
+        found = np.linalg.solve(normal, terms[keep].T @ value[keep])
+        left = value - terms @ found
+        keep = np.abs(left) < 4 * 1.4826 * np.median(np.abs(left)) + 1e-12
+    level = float(np.mean(found[2:]))
+    spread = float(np.std(left[keep])) * float(np.sqrt(np.linalg.inv(normal)[:2, :2].max()))
+    return found[:2] / level, spread / level
+
+
+def refuse_uneven_board(board: BoardAngle) -> None:
+    """Raise CalibrationError for a white board that is far from even over angle."""
+    uneven = float(np.ptp(board.radiance))
+    if board.uneven and uneven > LARGEST_UNEVENNESS:
+        raise CalibrationError(
+            f"the white board is uneven by {uneven:.0%} over the directions into the aperture: it "
+            "is tilted, glossy or lit from one side, or other whiteboards are of another day; "
+            "face it to the camera, light it evenly and capture all again"
         )
 
 

@@ -51,7 +51,7 @@ def register(board: Board, mask: ShadowMask, start: Placement) -> Registration:
     best = Registration(start, -1.0)
     for turn in ROTATIONS_DEG:
         placement = replace(start, rotation_rad=start.rotation_rad + np.deg2rad(turn))
-        found = _correlated(board, mask, placement)
+        found = correlated(board, mask, placement)
         if found.correlation > best.correlation:
             best = found
         if best.correlation >= CLEAR_CORRELATION:
@@ -76,18 +76,27 @@ def _otherwise(board: Board, mask: ShadowMask, start: Placement) -> Iterator[tup
     """Yield how else the mask may sit in the bench, and the correlation there."""
     for how, turned in ORIENTATIONS.items():
         other = replace(mask, cells=np.ascontiguousarray(turned(mask.cells)))
-        yield how, _correlated(board, other, start).correlation
+        yield how, correlated(board, other, start).correlation
 
 
-def _correlated(board: Board, mask: ShadowMask, start: Placement) -> Registration:
-    """Return the start moved to the best shift, and the correlation coefficient there."""
+def correlated(
+    board: Board,
+    mask: ShadowMask,
+    start: Placement,
+    reach_um: float = SEARCH_UM,
+    crop_px: int = CROP_PX,
+) -> Registration:
+    """Return the start moved to the best shift, and the correlation coefficient there.
+
+    reach_um: shifts tried, along either axis. crop_px: the middle of the picture that is used.
+    """
     rows, columns = board.reading.shape
-    height, width = min(rows, CROP_PX), min(columns, CROP_PX)
+    height, width = min(rows, crop_px), min(columns, crop_px)
     # Colour filters repeat: an even corner keeps what each pixel sees.
     top, left = (rows - height) // 2, (columns - width) // 2
     crop = slice(top, top + height), slice(left, left + width)
     pixel_um = mask.pitch_um * mask.binning
-    margin = int(np.ceil(SEARCH_UM / pixel_um))
+    margin = int(np.ceil(reach_um / pixel_um))
     y, x = np.mgrid[top - margin : top + height + margin, left - margin : left + width + margin]
     pixels = np.stack([y.ravel(), x.ravel()], axis=1)
     shadow = Shadow(mask, start)

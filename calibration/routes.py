@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from calibration.choice import (
     prediction_variance,
     worst,
 )
-from calibration.colours import crosstalk, in_three_colours, mixing, other_colours
+from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.combine import combined
 from calibration.defects import Defects, View, find_defects, loss_variance
 from calibration.errors import CalibrationError
@@ -36,9 +37,16 @@ from calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
-from calibration.placement import Tolerances, designed_placement
-from calibration.refusals import refuse_another_bench, refuse_unfit, refuse_without_mask
-from calibration.registration import register
+from calibration.placement import Tolerances
+from calibration.refusals import (
+    refuse_another_bench,
+    refuse_another_mask,
+    refuse_odd_fit,
+    refuse_tilted_board,
+    refuse_uneven_board,
+    refuse_unfit,
+    refuse_without_mask,
+)
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera
@@ -48,6 +56,8 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
+ROUGHER = 3.0
+"""Times what a fitted mask misses: what one that is but registered does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +90,7 @@ class Outcome:
 
     frames: exposures that each route used. findings: what is wrong with the bench and was taken
     into account. advice: what to measure again. unwatched: what no whiteboard was there to tell,
-    and what that may cost.
+    and what that may cost. crosstalk: of the colour filters, where it matters.
     """
 
     chosen: str
@@ -94,6 +104,7 @@ class Outcome:
     advice: tuple[str, ...]
     findings: tuple[str, ...] = ()
     unwatched: tuple[str, ...] = ()
+    crosstalk: Crosstalk | None = None
 
     @property
     def calibration(self) -> Calibration:
@@ -140,6 +151,9 @@ def calibrate(
         raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
     for board in judges:
         refuse_without_mask(board)
+    stage_um = shot_stages(camera)[0]
+    if few is None or pinholes is not None:
+        _refuse_unlike_the_design(camera, design, pinholes or held_out, judges, good)
     calibrations: dict[str, Calibration] = {}
     bare: dict[str, Calibration] = {}
     judged: dict[str, HeldOut] = {}
@@ -150,10 +164,13 @@ def calibrate(
             raise CalibrationError("the parametric route was given no whiteboards")
         on_stage("parametric fit")
         seen = as_readings(few, design.layout, good)
+        for board in seen:
+            refuse_without_mask(board)
         plain = shadow_mask(camera, design.size)
-        mask = plain if seen_colours is None else mixing(plain, seen_colours)
+        mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
         advice += fit_advice(fit)
+        refuse_odd_fit(fit, seen, tolerances or Tolerances())
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and design.binning == 1:
             on_stage("defects of the mask")
@@ -166,6 +183,7 @@ def calibrate(
                 calibrations[name] = _counting_misfit(bare[name], one)
                 judged[name] = _judged(name, one.shadow, judges, seen)
                 frames[name] = few.exposures
+        refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings(mixed or parametric)
     if {"free", "combined"} & set(routes):
         if pinholes is None:
@@ -173,7 +191,6 @@ def calibrate(
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes.pinholes(), design), good=good)
         calibrations["free"] = free
-        stage_um = shot_stages(camera)[0]
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
             raise CalibrationError(
@@ -181,8 +198,6 @@ def calibrate(
                 "first shot: hold one out there"
             )
         judged["free"] = _judged_measured("free", free, still[0], design.binning)
-        if parametric is None:
-            advice += _unlike_the_design(camera, design, still[0])
         frames["free"] = pinholes.exposures
         best = mixed or parametric
         if "combined" in routes and best is not None and few is not None:
@@ -219,6 +234,7 @@ def calibrate(
     if turned:
         boards = {turn: as_readings(one, design.layout, good)[0] for turn, one in turned.items()}
         board = board_over_angle(calibrations[chosen.route].psi, boards)
+        refuse_uneven_board(board)
         findings += angle_findings(board)
         if board.uneven:
             calibrations = {name: without(board, one) for name, one in calibrations.items()}
@@ -234,6 +250,7 @@ def calibrate(
         tuple(advice),
         tuple(findings),
         tuple(unwatched(_missing(sets, levels, design, bool(turned)))),
+        seen_colours,
     )
 
 
@@ -253,20 +270,31 @@ def _missing(
     return [name for name, known in watched.items() if not known]
 
 
-def _unlike_the_design(camera: Camera, design: ImagingMatrix, board: Board) -> list[str]:
-    """Return what a whiteboard says against the mask's design, which the free route can do without.
+def _refuse_unlike_the_design(
+    camera: Camera,
+    design: ImagingMatrix,
+    boards: BoardSet,
+    judges: Sequence[Board],
+    good: NDArray[np.bool_],
+) -> None:
+    """Raise CalibrationError for whiteboards of another mask, and of a board that was tilted.
 
-    Nothing for cameras whose mask the parametric route does not know.
+    Nothing for cameras whose mask is not modelled. Of those through the pinhole the middle view
+    and the corners' are enough.
     """
     try:
         mask = shadow_mask(camera, design.size)
     except CalibrationError:
-        return []
-    try:
-        register(board, mask, designed_placement(camera))
-    except CalibrationError as fault:
-        return [f"{fault}; this Psi is measured without the design, be sure that it is this camera"]
-    return []
+        return
+    v, u = camera.views
+    wanted = [(v // 2, u // 2), *product((0, v - 1), (0, u - 1))]
+    some = [one for one in boards.frames if one.shot == 0 and one.pinhole in wanted]
+    some.sort(key=lambda one: wanted.index(one.pinhole or wanted[0]))
+    seen = as_readings(boards.with_frames(some), design.layout, good) or list(judges)
+    for board in seen:
+        refuse_without_mask(board)
+    placement = refuse_another_mask(seen, camera, mask)
+    refuse_tilted_board(Shadow(mask, placement), judges, ROUGHER)
 
 
 def _mixed(

@@ -136,7 +136,9 @@ def _shares(
     return np.diff(np.hstack([ends[0], below, ends[1]]), axis=1)
 
 
-def share_tables(mask: ShadowMask, placement: Placement) -> tuple[NDArray[np.float64], float]:
+def share_tables(
+    mask: ShadowMask, placement: Placement, derivatives: bool = True
+) -> tuple[NDArray[np.float64], float]:
     """Return (kind, place, cell) and the reach of a footprint in cells.
 
     kind: the shares, and their derivatives by position in cells, by rho and by blur_um.
@@ -152,6 +154,8 @@ def share_tables(mask: ShadowMask, placement: Placement) -> tuple[NDArray[np.flo
     def at(places: Array, ratio: float, blur_um: float) -> Array:
         return _shares(mask, ratio, blur_um, reach, count, places)
 
+    if not derivatives:
+        return at(places, ratio, blur_um)[None].astype(np.float64), reach
     small, turn, soft = 1e-5, 1e-6, 1e-4 * mask.cell_um
     tables = np.stack(
         [
@@ -377,7 +381,7 @@ class Shadow:
 
     def __init__(self, mask: ShadowMask, placement: Placement) -> None:
         self.mask, self.placement = mask, placement
-        self._tables, self._reach = share_tables(mask, placement)
+        self._tables, self._reach = share_tables(mask, placement, derivatives=False)
         self._turns = _turns(placement)
         self._aperture = np.array(placement.aperture, dtype=np.float64)
         span = np.array([(count - 1) / 2 * mask.aperture_cell_um for count in mask.views])
@@ -516,6 +520,8 @@ class Shadow:
         by_view: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         mask, at = self.mask, self.placement
+        if slopes and len(self._tables) == 1:
+            self._tables = share_tables(mask, at)[0]
         out = np.empty(len(pixels))
         slope = np.empty((slopes, len(SCALARS) + self._aperture.size))
         each = np.zeros((views, self._aperture.size))

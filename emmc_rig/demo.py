@@ -146,7 +146,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 dictionary,
                 settings.solver,
                 usable,
-                lambda p: watcher.step(_told(p)),
+                lambda p: watcher.step(_progress_words(p)),
             )
 
         result, verdict = light_field(calibration.psi)
@@ -222,7 +222,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     return metrics
 
 
-def _told(progress: Progress) -> str:
+def _progress_words(progress: Progress) -> str:
     if progress.relative_change is None:
         return f"{progress.step} of {progress.total} patches"
     return f"change {progress.relative_change:.1e}"

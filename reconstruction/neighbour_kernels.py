@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from emmc_rig.model.bands import row_kernel
 
 
-@njit(cache=True, parallel=True)
-def neighbour_range(values, colours, good, radius, tail, fewest, low, high):
+@row_kernel("values", 0)
+def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low, high):
     """Set low and high (y, x) to quantiles `tail` and 1 - `tail` of each pixel's neighbours.
 
     values (y, x), colours (y, x) uint8, good (y, x) bool: neighbours are the good pixels of the
@@ -15,7 +16,7 @@ def neighbour_range(values, colours, good, radius, tail, fewest, low, high):
     `fewest` of them the range is endless.
     """
     rows, columns = values.shape
-    for y in prange(rows):
+    for y in range(begin, end):
         sorted_ = np.empty((2 * radius + 1) ** 2, values.dtype)
         for x in range(columns):
             count = 0

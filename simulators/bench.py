@@ -17,11 +17,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats.qmc import Sobol
 
+from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
 from emmc_rig.model.geometry import centred_grid
 from simulators.flaws import (
@@ -113,8 +114,10 @@ def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, inde
     return at_x, at_y
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@row_kernel("readings", 0, fastmath=True)
 def trace(
+    begin,
+    end,
     scene,
     finer,
     response,
@@ -147,7 +150,7 @@ def trace(
     board = scene.shape[2] == 1
     f, g = finer
     even = falloff.shape[3] == 1
-    for y in prange(rows):
+    for y in range(begin, end):
         passed = np.empty((3, columns), np.float32)
         total = np.zeros(columns)
         seen = np.zeros(columns)

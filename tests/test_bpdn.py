@@ -85,7 +85,12 @@ def test_atoms_leave_the_lasso_path_again():
     eta = 1e-3 * np.abs(atoms @ data).max()
     code = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta))
     assert code.steps > np.count_nonzero(code.weights)
-    least = objective(atoms, data, eta, coordinate_descent(atoms, data, eta, 100_000))
+    used, sign = atoms[code.weights != 0], np.sign(code.weights[code.weights != 0])
+    exact = np.zeros(len(atoms))
+    exact[code.weights != 0] = np.linalg.solve(used @ used.T, used @ data - eta * sign)
+    np.testing.assert_array_equal(np.sign(exact), np.sign(code.weights))
+    assert np.abs(atoms @ (data - exact @ atoms)).max() <= eta * (1 + 1e-6)  # so it is the minimum
+    least = objective(atoms, data, eta, exact)
     assert objective(atoms, data, eta, code.weights) <= least * (1 + 1e-5)
 
 

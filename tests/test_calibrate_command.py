@@ -29,6 +29,7 @@ from emmc_rig.study.checks.rows import target_row
 from emmc_rig.study.checks.scenes import moved_truth
 
 SIZE = ["--size", "32x40", "--rays", "64"]
+QUICK = DriftSettings(blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6)
 
 
 @pytest.fixture(scope="module")
@@ -259,10 +260,7 @@ def test_a_capture_after_the_mask_has_moved_is_told_and_psi_mended(calibrated, t
     frames = frames_of(tmp_path / "frames", camera, moved)
     out = tmp_path / "mended"
     out.mkdir()
-    quick = DriftSettings(
-        blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6
-    )
-    told = run_drift(known, frames, out, quick)
+    told = run_drift(known, frames, out, QUICK)
     assert told["drifted"]
     assert "Psi no longer fits" in told["words"]
     metrics = json.loads((out / "metrics.json").read_text())
@@ -274,7 +272,32 @@ def test_a_capture_after_the_mask_has_moved_is_told_and_psi_mended(calibrated, t
     assert true_error(after, true, good) < 0.3 * true_error(before, true, good)
 
 
-def test_drift_refuses_frames_of_another_size_and_a_free_psi(run, calibrated, tmp_path):
+def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_written(
+    run, calibrated, tmp_path
+):
+    _, camera, truth = calibrated
+    known = tmp_path / "free"
+    known.mkdir()
+    run_calibrate(CalibrateSettings("small", camera, (48, 64), "free", truth=truth), known)
+    moved = moved_truth(truth, (40.0, -8.0, 0.0, 0.0, 0.0))
+    out = tmp_path / "mended"
+    out.mkdir()
+    told = run_drift(known, frames_of(tmp_path / "frames", camera, moved), out, QUICK)
+    assert told["drifted"]
+    assert told["values"]["shift_x_um"] == pytest.approx(40.0, abs=1.0)
+    before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
+    true = WhiteboardBench(camera, (48, 64), moved).true_psi()
+    good = np.ones((48, 64), dtype=bool)
+    assert true_error(after, true, good) < 0.2 * true_error(before, true, good)
+    far = moved_truth(truth, (300.0, 0.0, 0.0, 0.0, 0.0))
+    frames = frames_of(tmp_path / "far", camera, far)
+    code, _, error = run("calibrate", "--drift", frames, "--known", known, "--out", tmp_path / "x")
+    assert code == 1
+    assert "searched: shifts up to 8 pixels" in " ".join(error.split())
+    assert not (tmp_path / "x").exists()
+
+
+def test_drift_refuses_frames_of_another_size(run, calibrated, tmp_path):
     known, camera, truth = calibrated
     frames = frames_of(tmp_path / "frames", camera, truth)
     with h5py.File(frames / "frames.h5", "a") as file:

@@ -20,7 +20,7 @@ from drivers.raw import decode_raw
 from emmc_rig.capture.checks import check, figures
 from emmc_rig.capture.command import (
     begun_session,
-    disk_faults_told,
+    disk_faults_named,
     estimated,
     new_session,
     planned_frames,
@@ -466,7 +466,7 @@ def test_a_full_disk_is_told_in_one_line_with_what_is_safe():
     rig = still_rig()
     session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
     line = "disk is full; make room, then run the same"
-    with pytest.raises(AppError, match=line) as told, disk_faults_told(session):
+    with pytest.raises(AppError, match=line) as told, disk_faults_named(session):
         Sequencer(session, plan, rig).run()
     assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(told.value)
     assert rig.attendant.lamp == "off"
@@ -482,7 +482,7 @@ def test_a_read_only_disk_is_told_in_one_line():
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     disk.before = refuse
-    with pytest.raises(AppError, match="disk is read-only") as told, disk_faults_told(session):
+    with pytest.raises(AppError, match="disk is read-only") as told, disk_faults_named(session):
         Sequencer(session, plan, rig).run()
     assert "\n" not in str(told.value)
     assert rig.stage.moves == 0

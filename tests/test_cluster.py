@@ -18,11 +18,15 @@ from programs import program
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.progress import Silent
 from emmc_rig.reconstruct import block_tasks
 from emmc_rig.reconstruct import pool as pools
 from emmc_rig.reconstruct.block_tasks import BlockTask, Capture
 from emmc_rig.reconstruct.pool import WorkersError, opened_pool
 from emmc_rig.reconstruct.solve import reconstruct_folder
+from emmc_rig.study.stability import sweeping
+from emmc_rig.study.stability.fault_sweep import stability_settings
+from emmc_rig.study.stability.sweeping import run_stability
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tiles import Grid
 from reconstruction.tv import TVSettings
@@ -83,6 +87,20 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
         reconstruct_folder(frames, new, "tv", settings=SETTINGS, pool=pool)
     there, here = ((tmp_path / at / "light_field.h5").read_bytes() for at in ("there", "here"))
     assert there == here
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
+    chosen = stability_settings(
+        True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",), screening="off"
+    )
+    monkeypatch.setattr(sweeping, "_write", lambda *_: None)
+    ran = [
+        run_stability(chosen, tmp_path / name, Silent(), cluster=address).curves
+        for name, address in (("here", None), ("there", cluster.scheduler_address))
+    ]
+    for here, there in zip(*ran, strict=True):
+        assert there.levels == pytest.approx(here.levels, abs=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -140,7 +140,7 @@ def test_binned_pixels_run_the_loop(tmp_path):
 def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path, scene):
     folder = Path(os.environ["EMMC_LIGHTFIELDS"]) / scene
     camera = find_camera("rgbw-bayer-3shots")
-    metrics = run_demo(DemoSettings(str(folder), "rgbw-bayer-3shots", camera, (160, 200)), tmp_path)
+    metrics = run_demo(DemoSettings(str(folder), "rgbw-bayer-3shots", camera, (96, 120)), tmp_path)
     assert metrics["psnr_db"] > metrics["replicate_psnr_db"] + 1
 
 

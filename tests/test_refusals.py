@@ -1,93 +1,223 @@
 """Whiteboards that no Psi may be made of are named, each for what is wrong with it."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from calibration.errors import CalibrationError
 from calibration.routes import calibrate
-from emmc_rig.calibrate.bench import ORDINARY_BENCH, BenchTruth, Setting, WhiteboardBench
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
+from emmc_rig.calibrate.board_plan import STAGE_KINDS_UM, held_out_settings
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)
-CAMERA = find_camera("rgbw-bayer-1shot")
-TRUTH = BenchTruth(rays_per_view=32)
+CAMERA = Camera.model_validate(
+    {
+        "title": "test",
+        "views": [3, 3],
+        "lens": {"aperture_cell_mm": 8.0},
+        "sensor": {"cfa": "rggb"},
+        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
+        "more_shots_step_um": {"code": (270, 162)},
+    }
+)
+TRUTH = BenchTruth(rays_per_view=128)
+VIEW = (0, 1)
+OPEN = [Setting(stage_um=stage_um) for stage_um in STAGE_KINDS_UM]
 PINHOLES = [Setting(pinhole=view, repeats=1) for view in np.ndindex(CAMERA.views)]
+HELD_OUT = held_out_settings(CAMERA)
+ROUTES = ("parametric", "mixed", "free", "combined")
 
 
-@pytest.fixture(scope="module")
+@cache
 def design():
     return build_imaging_matrix(CAMERA, SIZE)
 
 
-def bench(truth=TRUTH, camera=CAMERA, **changes):
-    """Return a bench; changes: methods that it has instead of its own."""
-    made = WhiteboardBench(camera, SIZE, truth)
-    for name, change in changes.items():
-        setattr(made, name, change(getattr(made, name)))
-    return made
+class FaultyBench(WhiteboardBench):
+    """A bench whose readings are changed: fault(reading, setting, masks_in, how many before)."""
+
+    fault = None
+    taken = 0
+    longer = 1.0
+
+    def reading(self, setting, masks_in=True):
+        self.taken += 1
+        read = super().reading
+        if self.fault is None:
+            return read(setting, masks_in)
+        return self.fault(read, setting, masks_in, self.taken)
+
+    def board_exposure_s(self):
+        return self.longer * super().board_exposure_s()
 
 
-def boards(stands):
-    """Return pinholes and held-out whiteboards of a bench."""
-    every = stands.capture([*PINHOLES, Setting()])
-    return every.with_frames(every.frames[:-1]), every.with_frames(every.frames[-1:])
-
-
-def closed(reading):
-    return lambda setting, masks_in=True: reading(setting, masks_in) * (not masks_in)
-
-
-def dark(reading):
-    return lambda setting, masks_in=True: 0 * reading(setting, masks_in)
-
-
-def without_masks(reading):
-    return lambda setting, masks_in=True: reading(setting, False)
-
-
-def half_open(reading):
-    def read(setting, masks_in=True):
-        window = (3, 0) if masks_in and setting.pinhole is None else (0, 0)
-        return reading(replace(setting, window=window), masks_in)
-
-    return read
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"reading": dark}, "is the lamp on"),
-        ({"reading": closed}, "is the lamp on, and the aperture open"),
-        ({"reading": without_masks}, "is the mask in the beam"),
-        ({"reading": half_open}, "was the aperture wholly open"),
-        ({"board_exposure_s": lambda own: lambda: 3 * own()}, "is saturated below the white level"),
-    ],
-)
-def test_unfit_whiteboards_are_refused_for_what_they_are(design, changes, words):
-    pinholes, held_out = boards(bench(**changes))
-    with pytest.raises(CalibrationError, match=words):
-        calibrate(CAMERA, design, ["free"], held_out, pinholes=pinholes)
-
-
-def test_a_whiteboard_of_another_day_is_refused_for_the_mask_that_moved(design):
-    moved = replace(TRUTH, mounting=replace(ORDINARY_BENCH.mounting, offset_um=(120.0, 80.0)))
-    pinholes, _ = boards(bench())
-    _, held_out = boards(bench(moved))
-    with pytest.raises(CalibrationError, match="moved between them"):
-        calibrate(CAMERA, design, ["free"], held_out, pinholes=pinholes)
-
-
-def test_whiteboards_of_another_mask_are_refused_by_the_design_and_doubted_without(design):
-    mask = CAMERA.masks["mask"]
-    pattern = mask.pattern.model_copy(update={"seed": 99})
-    other = CAMERA.model_copy(
-        update={"masks": {"mask": mask.model_copy(update={"pattern": pattern})}}
+def psi_of(fault=None, camera=CAMERA, truth=TRUTH, longer=1.0, other=None, routes=ROUTES):
+    """Calibrate what a bench captures; other: one that half of the pinholes are taken from."""
+    bench = FaultyBench(camera, SIZE, truth)
+    bench.fault, bench.longer = fault, longer
+    every = bench.capture([*OPEN, *PINHOLES, *HELD_OUT])
+    frames = list(every.frames)
+    first, last = len(OPEN), len(OPEN) + len(PINHOLES)
+    if other is not None:
+        middle = (first + last) // 2
+        frames[middle:last] = other.capture([*OPEN, *PINHOLES]).frames[middle:last]
+    turned = {90.0: bench.capture([Setting(repeats=4, board_turn_deg=90.0)])}
+    few, pinholes, held_out = (
+        every.with_frames(some) for some in (frames[:last], frames[first:last], frames[last:])
     )
-    pinholes, held_out = boards(bench(camera=other))
-    with pytest.raises(CalibrationError, match="not the mask of the design"):
-        calibrate(CAMERA, design, ["mixed"], held_out, few=pinholes)
-    free = calibrate(CAMERA, design, ["free"], held_out, pinholes=pinholes)
-    assert any("not the mask of the design" in line for line in free.advice)
+    return calibrate(CAMERA, design(), routes, held_out, few, pinholes, turned=turned)
+
+
+def with_mask(**changes):
+    mask = CAMERA.masks["code"].model_copy(update=changes)
+    return CAMERA.model_copy(update={"masks": {"code": mask}})
+
+
+def with_sensor(**changes):
+    return CAMERA.model_copy(update={"sensor": CAMERA.sensor.model_copy(update=changes)})
+
+
+def other_pattern():
+    pattern = CAMERA.masks["code"].pattern
+    return with_mask(pattern=pattern.model_copy(update={"seed": 99}))
+
+
+def moved(um):
+    x, y = TRUTH.mounting.offset_um
+    mounting = replace(TRUTH.mounting, offset_um=(x + um, y))
+    return WhiteboardBench(CAMERA, SIZE, replace(TRUTH, mounting=mounting))
+
+
+def when(chosen, change):
+    """Return a fault of the frames chosen (by setting, masks in), others as they are."""
+
+    def fault(read, setting, masks_in, taken):
+        if chosen(setting, masks_in):
+            return change(read, setting, masks_in)
+        return read(setting, masks_in)
+
+    return fault
+
+
+def unlit(read, setting, masks_in):
+    return 0 * read(setting, masks_in)
+
+
+def bare(read, setting, masks_in):
+    return read(setting, False)
+
+
+def tilted(read, setting, masks_in):
+    return read(setting, masks_in) * (1 + 0.1 * np.linspace(-0.5, 0.5, SIZE[1]))
+
+
+def brighter(times):
+    return lambda read, setting, masks_in: times * read(setting, masks_in)
+
+
+def bright_part(read, setting, masks_in):
+    return read(setting, masks_in) * np.where(np.arange(SIZE[1]) < 8, 2.5, 1.0)
+
+
+def through(**changes):
+    """Return a change of the setting itself."""
+    return lambda read, setting, masks_in: read(replace(setting, **changes), masks_in)
+
+
+def mirrored(read, setting, masks_in):
+    v, u = setting.pinhole
+    return read(replace(setting, pinhole=(v, CAMERA.views[1] - 1 - u)), masks_in)
+
+
+def every(setting, masks_in):
+    return setting.lamp != "off"
+
+
+def references(setting, masks_in):
+    return setting.lamp != "off" and not masks_in
+
+
+def boards(setting, masks_in):
+    return masks_in
+
+
+def of_view(setting, masks_in):
+    return masks_in and setting.pinhole == VIEW
+
+
+def pinholes(setting, masks_in):
+    return masks_in and setting.pinhole is not None
+
+
+def elsewhere(setting, masks_in):
+    return masks_in and setting.stage_um == STAGE_KINDS_UM[1]
+
+
+def darks(setting, masks_in):
+    return setting.lamp == "off"
+
+
+def coloured(setting, masks_in):
+    return setting.lamp not in ("off", "white")
+
+
+def dim_light(read, setting, masks_in):
+    return 0.02 * read(replace(setting, lamp="white"), masks_in)
+
+
+BAD = {
+    "another mask": ({"camera": other_pattern()}, "not the mask of the design"),
+    "another cell": ({"camera": with_mask(cell_um=40.0)}, "not the mask of the design"),
+    "another distance": ({"camera": with_mask(distance_mm=0.3)}, "are of another camera or mask"),
+    "other filters": ({"camera": with_sensor(cfa="grbg")}, "of another camera, whose colour"),
+    "half of another day": ({"other": moved(12.0)}, "it moved between them, or"),
+    "half of a moved bench": ({"other": moved(120.0)}, "times as bright as the others tell"),
+    "dimmer references": ({"fault": when(references, brighter(0.8))}, "taken with less light"),
+    "saturated": ({"longer": 3.0}, "reference whiteboard, white lamp: saturated below the white"),
+    "one view saturated": ({"fault": when(of_view, brighter(75))}, r"\(0, 1\).*: saturated below"),
+    "a part saturated": ({"fault": when(every, bright_part)}, "saturated below the white level"),
+    "lamp off": ({"fault": when(every, unlit)}, "reference .* is the lamp on"),
+    "lamp off once": ({"fault": when(of_view, unlit)}, r"\(0, 1\).* is dark; is the lamp on"),
+    "lamp on in darks": ({"fault": when(darks, dim_light)}, "the dark frames have 2%"),
+    "lamp without colours": ({"fault": when(coloured, through(lamp="white"))}, "did not change"),
+    "mask missing": ({"fault": when(every, bare)}, "is the mask in the beam"),
+    "mask missing once": ({"fault": when(of_view, bare)}, r"\(0, 1\).*is the mask in the beam"),
+    "mask missing elsewhere": ({"fault": when(elsewhere, bare)}, "is the mask in the beam"),
+    "aperture closed": ({"fault": when(boards, unlit)}, "and the aperture open"),
+    "aperture half closed": (
+        {"fault": when(references, through(pinhole=(1, 1)))},
+        "not through the whole aperture",
+    ),
+    "views mirrored": ({"fault": when(pinholes, mirrored)}, "they are mirrored left to right"),
+    "board tilted": ({"fault": when(boards, tilted)}, "10% from left to right: the white board"),
+    "board tilted throughout": (
+        {"truth": replace(TRUTH, board=BoardFlaws(angle_spread=0.5))},
+        "uneven by .* it is tilted",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_whiteboards_that_give_no_psi_are_refused_for_what_they_are(name):
+    changes, words = BAD[name]
+    with pytest.raises(CalibrationError, match=words):
+        psi_of(**changes)
+
+
+FREE = ("another mask", "other filters", "views mirrored", "lamp off once", "board tilted")
+
+
+@pytest.mark.parametrize("name", [*FREE, "aperture half closed"])
+def test_they_are_refused_where_every_coefficient_is_measured_as_well(name):
+    changes, words = BAD[name]
+    with pytest.raises(CalibrationError, match=words):
+        psi_of(**changes, routes=("free",))
+
+
+def test_whiteboards_of_a_bench_as_it_may_be_are_not_refused():
+    truth = replace(TRUTH, board=BoardFlaws(angle_spread=0.1, place_spread=0.1, parallax_px=1.0))
+    assert psi_of(truth=truth).judged["combined"].relative_error < 0.02

@@ -64,6 +64,7 @@ def page(browser, report):
     WebDriverWait(browser, 15).until(
         lambda driver: driver.execute_script("return document.documentElement.dataset.ready")
     )
+    settled(browser)
     yield browser
     assert complaints(browser) == []
 

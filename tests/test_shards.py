@@ -1,5 +1,6 @@
 """Zarr groups that workers write shard by shard: the numbers of the HDF5 files, and read again."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from emmc_rig.files import psi as psis
 from emmc_rig.files import shards
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.files.frames import read_frames
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.reconstruct.inputs import open_frames
@@ -69,7 +71,9 @@ def test_psi_in_shards_gives_the_bytes_of_psi_in_a_file(frames, tmp_path, monkey
     sharded = tmp_path / "sharded"
     sharded.mkdir()
     simulate_into(sharded, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0, as_zarr=True)
-    assert not (sharded / "psi.h5").exists()
+    assert sorted(path.name for path in sharded.iterdir()) == [
+        "frames.zarr", "metrics.json", "psi.zarr",
+    ]  # fmt: skip
     weights = zarr.open_group(sharded / "psi.zarr", mode="r")["weights"]
     assert weights.shards == (1, 5, 5, 32, 1, 32)
     results = [reconstructed(one, tmp_path / f"from-{one.name}") for one in (frames, sharded)]
@@ -96,6 +100,18 @@ def test_a_missing_part_of_psi_is_one_line_and_others_are_read(frames, name, mon
     assert (code, "psi.zarr: a file of it is missing; copy" in err) == (1, True), err
     assert "Traceback" not in err
     assert not (frames / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("gone", "says"),
+    [("readings/c", "a file of it is missing; copy"), ("usable", "damaged or incomplete")],
+)
+def test_frames_in_shards_that_lost_a_part_are_refused(tmp_path, gone, says):
+    pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    simulate_into(tmp_path, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0, as_zarr=True)
+    shutil.rmtree(tmp_path / "frames.zarr" / gone)
+    with pytest.raises(AppError, match=f"frames.zarr: .*{says}"):
+        read_frames(tmp_path)
 
 
 def test_without_the_extra_or_without_the_array_one_line_says_so(tmp_path, monkeypatch):

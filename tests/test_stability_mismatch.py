@@ -52,10 +52,10 @@ def test_a_moved_mask_is_detected_and_psi_corrected_from_the_readings_alone():
     assert psi.relative_difference(moved.true_psi) < 0.2 * before
 
 
-def test_a_sensor_without_colours_is_refused_in_words():
-    camera = find_camera("rgbw-mono").with_shots(1).model_copy(update={"views": (3, 3)})
-    moved = trial(FAULTS["mask-shift"], 0.5, "deep-occlusions", camera, SIZE, 0, 3)
-    with pytest.raises(NotApplicableError, match="colour filter"):
+def test_a_camera_without_a_mask_before_its_sensor_is_refused_in_words():
+    camera = find_camera("conventional").model_copy(update={"views": (3, 3)})
+    moved = trial(FAULTS["exposure"], 500.0, "deep-occlusions", camera, SIZE, 0, 3)
+    with pytest.raises(NotApplicableError, match="one mask between lens and sensor"):
         corrected(moved, DRIFT)
 
 

@@ -82,7 +82,7 @@ def opened(browser, address):
     browser.get(address)
     WebDriverWait(browser, 30).until(
         lambda driver: driver.execute_script(
-            "return document.getElementById('viewer').dataset.ready"
+            "return document.getElementById('viewer').dataset.complete"
         )
     )
     return browser

@@ -1,4 +1,4 @@
-"""Whiteboards of a simulated bench that is wrong in every way the calibration is not told of.
+"""Whiteboards of a simulated bench that is with every flaw, none of them known to the calibration.
 
 The only part of the calibration that knows a simulator: whoever reads whiteboards from a rig or a
 session makes the same `BoardSet`.

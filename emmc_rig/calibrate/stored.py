@@ -79,8 +79,13 @@ def _fit_figures(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def save_calibration(path: Path, calibration: Calibration, known: Parametric | None) -> None:
-    """Write what turns frames into readings, how sure Psi is, and the placement, as HDF5."""
+def save_calibration(
+    path: Path, calibration: Calibration, known: Parametric | None, seen: Array | None = None
+) -> None:
+    """Write what turns frames into readings, how sure Psi is, and the placement, as HDF5.
+
+    seen: what every filter sees of the colours, (filter, colour).
+    """
     with h5py.File(path, "w") as file:
         file.attrs["gain_dn_per_electron"] = calibration.gain.gain_dn_per_electron
         file.attrs["dark_variance_dn2"] = calibration.gain.dark_variance_dn2
@@ -89,6 +94,8 @@ def save_calibration(path: Path, calibration: Calibration, known: Parametric | N
         file["white_dn_per_s"] = calibration.white_dn_per_s
         if calibration.good is not None:
             file["good"] = calibration.good
+        if seen is not None:
+            file["crosstalk"] = seen
         if known is not None:
             for name in SCALARS:
                 file.attrs[name] = getattr(known.fit.placement, name)
@@ -104,4 +111,5 @@ def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
         outcome.chosen
     )
     chosen.psi.save(folder / PSI)
-    save_calibration(folder / CALIBRATION, chosen, known)
+    seen = None if outcome.crosstalk is None else outcome.crosstalk.seen
+    save_calibration(folder / CALIBRATION, chosen, known, seen)

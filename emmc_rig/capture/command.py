@@ -202,7 +202,7 @@ def refuse_other_camera(session: Session, rig: Rig) -> None:
 
 
 @contextmanager
-def disk_faults_told(session: Session) -> Iterator[None]:
+def disk_faults_named(session: Session) -> Iterator[None]:
     """Turn what the disk raises into one line."""
     try:
         yield
@@ -220,7 +220,7 @@ def disk_faults_told(session: Session) -> Iterator[None]:
 
 
 @contextmanager
-def way_on_told(wish: Wish, session: Session) -> Iterator[None]:
+def way_on_named(wish: Wish, session: Session) -> Iterator[None]:
     """Say with a fault how to go on; a session without a frame goes, for there is nothing to keep.
 
     A fault of the plan's is mended in the plan, which may hold for a session that has begun.
@@ -255,7 +255,7 @@ def run_capture(
 ) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
 
-    agreed: is told what it will take, once nothing speaks against it. Raises AppError or a
+    agreed: gets what it will take, once nothing speaks against it. Raises AppError or a
     `DriverError`.
     """
     control = control or Control()
@@ -293,10 +293,10 @@ def run_capture(
         exposures = Exposures(wish.plan, earlier)
         with interruptible(control, watcher.tell):
             while True:
-                with disk_faults_told(session):
+                with disk_faults_named(session):
                     if edit is not None:
                         session = session.amend(_frozen(wish, edit.frames), edit.changes)
-                    with way_on_told(wish, session):
+                    with way_on_named(wish, session):
                         if wish.until_db not in (None, session.target_db):
                             session.note("until", target_db=wish.until_db, wall=wall_time())
                         control.preview = partial(_edit_words, wish, session, rig)
@@ -435,7 +435,7 @@ def capture(
         rig: what `emmc_rig.rig` returns; a session has its own.
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
-        watcher: is told what is captured.
+        watcher: gets what is captured.
         on_event: is called with each `emmc_rig.capture.events.Event`, as `frame.written` or
             `shot.done`; one that raises is not called again.
         suspend: is asked before each frame, returns why the capture has to wait, "" to go on.
@@ -447,11 +447,11 @@ def capture(
     """
     description = None if rig is None else rig.description
     folder = None if out is None else Path(out)
-    told = watcher or CaptureWatcher()
+    watching = watcher or CaptureWatcher()
     if on_event is not None:
-        told = EventWatcher(on_event, told)
+        watching = EventWatcher(on_event, watching)
     captured = capture_session(
-        Path(plan), description, folder, until_db, told, ask, suspend=suspend
+        Path(plan), description, folder, until_db, watching, ask, suspend=suspend
     )
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]

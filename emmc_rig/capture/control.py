@@ -70,7 +70,7 @@ class Control:
 
 
 @contextmanager
-def interruptible(control: Control, told: Callable[[str], None]) -> Iterator[None]:
+def interruptible(control: Control, say: Callable[[str], None]) -> Iterator[None]:
     """Let Ctrl-C stop after the present frame, and the second one, SIGTERM or SIGHUP now.
 
     "Now" raises `KeyboardInterrupt` in the main thread. Elsewhere than there nothing is changed.
@@ -82,7 +82,7 @@ def interruptible(control: Control, told: Callable[[str], None]) -> Iterator[Non
     def interrupt(number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and not control.stopping:
             control.stop()
-            told("stopping after this frame; Ctrl-C again stops now")
+            say("stopping after this frame; Ctrl-C again stops now")
             return
         raise KeyboardInterrupt
 

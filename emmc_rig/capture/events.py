@@ -52,7 +52,7 @@ OnEvent = Callable[[Event], None]
 
 
 class EventWatcher(CaptureWatcher):
-    """A `CaptureWatcher` that makes events of what it is told, and tells another watcher too.
+    """A `CaptureWatcher` that makes events of what is captured, and calls another watcher too.
 
     on_event: called from the thread in which it happens, one call at a time. One that raises is
     not called again: a capture does not end for that.

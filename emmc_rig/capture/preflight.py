@@ -1,4 +1,4 @@
-"""What the rig can never do is told before anything moves."""
+"""Checks before anything moves: what the rig can never do."""
 
 from __future__ import annotations
 

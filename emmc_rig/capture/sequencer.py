@@ -57,7 +57,7 @@ from emmc_rig.session.session import Session, wall_time
 from emmc_rig.session.verify import verify_frames
 
 TOLD_BYTES = 1_000_000_000
-"""Hashing more takes long enough to be told."""
+"""Hashing more takes long enough to be reported."""
 TELL_LEFT_S = 1.0
 """Between two times that the time left is said."""
 ALL_TAKEN = "all frames are taken: finish, or take some once more"
@@ -78,7 +78,7 @@ class RunEnd:
 
 @dataclass
 class _Applied:
-    """What the devices were last told; empty: nothing is known."""
+    """What was last sent to the devices; empty: nothing is known."""
 
     bench: tuple | None = None
     lamp: str | None = None
@@ -88,7 +88,7 @@ class _Applied:
 
 
 Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
-"""What to take next, asked again once that is on the disk; it is told the seconds of the run."""
+"""What to take next, asked again once that is on the disk; it gets the seconds of the run."""
 
 
 class Sequencer:
@@ -242,7 +242,7 @@ class Sequencer:
         self._applied = _Applied()
 
     def _take_all(self, frames: tuple[PlannedFrame, ...]) -> bool:
-        """Take the frames; returns False when the capture was told to stop.
+        """Take the frames; returns False when the capture was asked to stop.
 
         Ends early where metering the scene asked for more frames than were known of.
         """
@@ -671,7 +671,7 @@ class Sequencer:
                         self._camera.close()
 
     def _note_stop(self, error: BaseException) -> None:
-        """Tell the journal why; where it cannot be written any more that is told already."""
+        """Write the reason to the journal; where that fails, the failure is reported already."""
         if isinstance(error, Exception | KeyboardInterrupt):
             with suppress(Exception):
                 reason = str(error) or "stopped at once by the user"

@@ -199,7 +199,7 @@ def _page(
 ) -> Iterator[CaptureWatcher]:
     """Serve the page of a capture, and say where, until the block ends; yield what it watches by.
 
-    other: is told too.
+    other: called too.
     """
     from emmc_rig.live.server import application, new_token, served
     from emmc_rig.live.session_page import SessionPage

@@ -63,6 +63,9 @@ def chart(
     stated: Annotated[
         bool, typer.Option("--stated", help="instead: PSNR and deviation as stated, and as true")
     ] = False,
+    trends: Annotated[
+        bool, typer.Option("--trends", help="instead: PSNR against noise, shots, other methods")
+    ] = False,
     until: Annotated[
         list[float] | None,
         typer.Option("--until", min=1, help="PSNR, dB, at which --next-shot stops; may repeat"),
@@ -85,7 +88,7 @@ def chart(
         "kernels": kernels, "solvers": solvers, "peers": peers, "ablation": ablation,
         "constants": constants,
         "next-shot": next_shot, "guard": guard, "live": live, "pages": pages,
-        "stated": stated,
+        "stated": stated, "trends": trends,
     }  # fmt: skip
     for name in (name for name, wanted in instead.items() if wanted):
         _benchmark(

@@ -30,6 +30,10 @@ SizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of --workers"),
+]
 DictionaryOption = Annotated[
     str | None,
     typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
@@ -51,3 +55,9 @@ RigSizeOption = Annotated[
     str | None,
     typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of the simulated light field"),
 ]
+
+
+def check_workers(workers: int | None, cluster: str | None) -> None:
+    """Raise BadParameter where both are given."""
+    if workers is not None and cluster is not None:
+        raise typer.BadParameter("--workers are of this machine, --cluster has its own: give one")

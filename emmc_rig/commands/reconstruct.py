@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from emmc_rig.commands.options import DictionaryOption
+from emmc_rig.commands.options import ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 
@@ -49,10 +49,7 @@ def reconstruct(
         int | None,
         typer.Option("--workers", min=1, help="processes that share blocks and captures"),
     ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of them"),
-    ] = None,
+    cluster: ClusterOption = None,
     as_zarr: Annotated[
         bool, typer.Option("--zarr", help="light field and maps as result.zarr, by all workers")
     ] = False,
@@ -89,8 +86,7 @@ def reconstruct(
         return
     if not frames:
         raise typer.BadParameter("name a folder of frames, or --list the methods")
-    if workers is not None and cluster is not None:
-        raise typer.BadParameter("--workers are of this machine, --cluster has its own: give one")
+    check_workers(workers, cluster)
     if memory is not None and cluster is not None:
         raise typer.BadParameter("--memory is of this machine; a cluster's workers have their own")
     chosen, why = load_settings(settings), None

@@ -31,7 +31,7 @@ def simulate(
     size: SizeOption = None,
     out: OutOption = Path("emmc-frames"),
     as_zarr: Annotated[
-        bool, typer.Option("--zarr", help="Psi as psi.zarr, in shards, in place of psi.h5")
+        bool, typer.Option("--zarr", help="frames and Psi as Zarr groups of shards")
     ] = False,
 ) -> None:
     """Make frames of a light field through any camera, without a rig."""
@@ -63,10 +63,11 @@ def simulate_into(
     frames.h5 holds `frames_dn` (shot, y, x) uint16, `readings`, their standard `deviation`, which
     pixels are `usable`, and `noise_free` readings. Quick, and an inverse crime when the same Psi
     reconstructs them; the demo traces rays instead. sensor_psnr_db compares readings with noise to
-    those without, peak 1, as the paper's Figure 5. as_zarr: write psi.zarr in place of psi.h5.
+    those without, peak 1, as the paper's Figure 5. as_zarr: write
+    frames.zarr and psi.zarr in their place.
     """
     import emmc_rig as emmc
-    from emmc_rig.files.frames import FRAMES, PSI
+    from emmc_rig.files.frames import FRAMES, FRAMES_GROUP, PSI
     from emmc_rig.files.psi import PSI_GROUP, save_shards
     from emmc_rig.files.results import save_frames, write_metrics
     from emmc_rig.model.lightfield import psnr_db
@@ -75,7 +76,7 @@ def simulate_into(
     psi = camera.psi(scene.size)
     frames = camera.expose(scene, seed, psi)
     save_frames(
-        folder / FRAMES,
+        folder / (FRAMES_GROUP if as_zarr else FRAMES),
         frames.frames_dn,
         frames.readings,
         camera.exposures_s(),

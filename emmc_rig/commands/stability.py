@@ -8,10 +8,12 @@ from typing import Annotated, Any
 import typer
 
 from emmc_rig.commands.options import (
+    ClusterOption,
     DictionaryOption,
     ScenesOption,
     SeedOption,
     SizeOption,
+    check_workers,
 )
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
@@ -67,6 +69,7 @@ def stability(
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="processes that share the trials")
     ] = None,
+    cluster: ClusterOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="folder to write (default: emmc-stability, -verdicts, -worst)"),
@@ -81,6 +84,7 @@ def stability(
     if faults:
         _list_faults()
         return
+    check_workers(workers, cluster)
     if verdicts:
         place = out or Path("emmc-verdicts")
         _verdicts(place, fast, scene, camera, fault, method, parse_size(size), seed)
@@ -103,7 +107,7 @@ def stability(
         wanted = [name for name, on in switches.items() if on]
         beside = measure_beside(settings, wanted, out, bars)
         outcome = run_stability(
-            settings, out, bars, beside.sections, beside.metrics, workers=workers
+            settings, out, bars, beside.sections, beside.metrics, workers=workers, cluster=cluster
         )
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"

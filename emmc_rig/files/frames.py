@@ -1,28 +1,38 @@
-"""Folders of frames, as `emmc-rig simulate` and `demo` write them: frames.h5, beside it psi.h5."""
+"""Folders of frames, as `simulate` and `demo` write them: frames.h5 or frames.zarr, and Psi."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from emmc_rig.errors import AppError
+from emmc_rig.files.shards import stored_shards
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 
 FRAMES, PSI = "frames.h5", "psi.h5"
+FRAMES_GROUP = "frames.zarr"
+AGAIN = "make the frames again"
 
 
 def read_frames(folder: Path) -> Frames:
-    """Read frames.h5 of a folder; raises AppError when it is missing, damaged or incomplete."""
+    """Read the frames of a folder; raises AppError when they are missing, damaged or incomplete."""
     path = folder / FRAMES
-    if not path.is_file():
+    sharded = (folder / FRAMES_GROUP).is_dir()
+    if sharded:
+        path = folder / FRAMES_GROUP
+    elif not path.is_file():
         raise AppError(
             f"{folder}: holds no {FRAMES}; name a folder that `emmc-rig demo`, `simulate` or "
             "`capture` wrote"
         )
-    with stored_arrays(path, AppError, "make the frames again") as stored:
+    with (stored_shards if sharded else stored_arrays)(path, AppError, AGAIN) as stored:
         names = ("readings", "deviation", "usable")
         readings, deviation, usable = (stored.array(name) for name in names)
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")
+    if sharded and np.isnan(readings).any():
+        raise AppError(f"{path}: a file of it is missing; copy the folder again, or {AGAIN}")
     return Frames(readings, deviation, usable)

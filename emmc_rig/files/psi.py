@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.files.frames import PSI
-from emmc_rig.files.shards import CHUNK, SHARD, created_group, opened_group
+from emmc_rig.files.shards import CHUNK, SHARD, StoredGroup, created_group, stored_shards
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.reading import shown_path, stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
@@ -80,10 +80,13 @@ class SavedPsi:
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        with stored_arrays(self._path, SensingError, AGAIN) as stored:
+        with self._file() as stored:
             if stored.attributes.get("format") != FORMAT or "weights" not in stored:
                 raise SensingError(f"{self._path}: not an imaging matrix of this program")
             yield stored
+
+    def _file(self) -> AbstractContextManager[Any]:
+        return stored_arrays(self._path, SensingError, AGAIN)
 
 
 class ShardedPsi(SavedPsi):
@@ -103,28 +106,8 @@ class ShardedPsi(SavedPsi):
             )
         return values
 
-    @contextmanager
-    def _opened(self) -> Iterator[_Group]:
-        group = opened_group(self._path, SensingError, AGAIN)
-        if group.attrs.get("format") != FORMAT or "weights" not in group:
-            raise SensingError(f"{shown_path(self._path)}: not an imaging matrix of this program")
-        yield _Group(group)
-
-
-class _Group:
-    """A Zarr group, read as `StoredArrays` are."""
-
-    def __init__(self, group: Any) -> None:
-        self._group, self.attributes = group, group.attrs
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._group
-
-    def dataset(self, name: str) -> Any:
-        return self._group[name]
-
-    def array(self, name: str) -> NDArray:
-        return np.asarray(self._group[name][...])
+    def _file(self) -> AbstractContextManager[StoredGroup]:
+        return stored_shards(self._path, SensingError, AGAIN)
 
 
 def open_psi(path: Path) -> SavedPsi:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import WrongUsageError
+from emmc_rig.files.shards import ENDING, save_arrays
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
@@ -71,8 +72,14 @@ def save_frames(
     exposures_s: NDArray[np.floating],
     **more: NDArray,
 ) -> None:
-    """Write frames (shot, y, x) as HDF5: frames_dn, readings, exposures_s (shot,), and more."""
+    """Write frames (shot, y, x): frames_dn, readings, exposures_s (shot,), and more.
+
+    path: a Zarr group where it ends in .zarr, else an HDF5 file.
+    """
     arrays = {"frames_dn": frames_dn, "readings": readings, "exposures_s": exposures_s, **more}
+    if path.suffix == ENDING:
+        save_arrays(path, arrays)
+        return
     with h5py.File(path, "w") as file:
         for name, array in arrays.items():
             file[name] = array

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,7 +39,8 @@ def create_array(
 ) -> list[Place]:
     """Create an array with `axes` axes before (y, x); return the places of its shards.
 
-    A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK.
+    A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK. Floating
+    values read as NaN where the file of a shard is missing.
     """
     after = shape[axes + 2 :]
     group.create_array(
@@ -46,6 +49,7 @@ def create_array(
         dtype=dtype,
         chunks=(*(1,) * axes, CHUNK, CHUNK, *after),
         shards=(*shape[:axes], SHARD, SHARD, *after),
+        fill_value=np.nan if dtype.kind == "f" else 0,
     )
     rows, columns = shape[axes : axes + 2]
     return [
@@ -55,14 +59,49 @@ def create_array(
     ]
 
 
-def opened_group(folder: Path, error: type[Exception], remedy: str) -> Any:
-    """Return a group, not read; raises `error` where there is none, AppError without Zarr."""
+def save_arrays(folder: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays (shot, y, x) as a group into a folder that must not exist; others as attributes.
+
+    Raises AppError without Zarr.
+    """
+    group = created_group(folder)
+    for name, values in arrays.items():
+        if values.ndim == 3:
+            create_array(group, name, values.shape, values.dtype, 1)
+            group[name][...] = values
+        else:
+            group.attrs[name] = values.tolist()
+
+
+class StoredGroup:
+    """The arrays of a Zarr group, read as `emmc_rig.model.reading.StoredArrays` are."""
+
+    def __init__(self, group: Any) -> None:
+        self._group, self.attributes = group, group.attrs
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._group
+
+    def dataset(self, name: str) -> Any:
+        """Return an array, not read."""
+        return self._group[name]
+
+    def array(self, name: str) -> NDArray:
+        """Return an array, all of it."""
+        return np.asarray(self._group[name][...])
+
+
+@contextmanager
+def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator[StoredGroup]:
+    """Yield the arrays of a group; raises `error` where one is not there, AppError without Zarr."""
     zarr = _zarr()
     try:
-        return zarr.open_group(folder, mode="r")
+        yield StoredGroup(zarr.open_group(folder, mode="r"))
+    except error:
+        raise
     except (OSError, KeyError, ValueError, TypeError) as fault:
-        why = f"{shown_path(folder)}: is no Zarr group ({one_line(fault)}); {remedy}"
-        raise error(why) from fault
+        why = f"no Zarr group, damaged or incomplete ({one_line(fault)})"
+        raise error(f"{shown_path(folder)}: {why}; {remedy}") from fault
 
 
 def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:

@@ -92,7 +92,7 @@ class Driving:
         self._moves.put(steps)
 
     def stop(self) -> None:
-        """Stop all axes now, in the middle of a move too; returns when the stage was told so."""
+        """Stop all axes now, during a move too; returns when the stage has the command."""
         self._stopped_by_hand = True
         self._stop_sent.clear()
         self._stop_wanted.set()

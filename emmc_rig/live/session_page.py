@@ -40,7 +40,7 @@ class _EndedError(Exception):
 class SessionPage(EventWatcher):
     """A `emmc_rig.live.server.Page`, and the watcher of the capture that it shows.
 
-    folder: of the session. other: is told too. computes: reconstructs after each shot what is on
+    folder: of the session. other: called too. computes: reconstructs after each shot what is on
     the disk; where the capture itself does (`--until`) its light field is shown.
     """
 

@@ -1,4 +1,4 @@
-"""Fused loops of the imaging matrix, over rows of pixels in parallel.
+"""Fused loops of the imaging matrix, over rows of pixels in parallel: see `row_kernel`.
 
 Axes: weights (shot, v, u, y, stored colour, x); frames (shot, pixel_y, pixel_x); light fields as
 said at each. With one stored colour, `colour` (shot, y, x) says which it is. A pixel sums
@@ -10,7 +10,9 @@ loops then run along x.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from emmc_rig.model.bands import row_kernel
 
 
 @njit(cache=True, fastmath=True)
@@ -71,11 +73,11 @@ def correct_row(inverse, frames, binning, row, seen):
             seen[shot, x] = corrected[x // binning]
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def project(weights, colour, light_field, binning, frames):
+@row_kernel("frames", 1, fastmath=True)
+def project(begin, end, weights, colour, light_field, binning, frames):
     """Set frames = Psi light_field, a light field in its natural order (v, u, y, x, colour)."""
     shots, views_v, views_u, _, stored, width = weights.shape
-    for row in prange(frames.shape[1]):
+    for row in range(begin, end):
         total = np.empty(width, frames.dtype)
         for shot in range(shots):
             total[:] = 0
@@ -102,14 +104,14 @@ def project(weights, colour, light_field, binning, frames):
                 frames[shot, row, x // binning] += total[x]
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def back_project(weights, colour, frames, binning, light_field):
+@row_kernel("frames", 1, fastmath=True)
+def back_project(begin, end, weights, colour, frames, binning, light_field):
     """Set light_field = Psi^T frames, a contiguous one in natural order (v, u, y, x, colour).
 
     The first shot sets the samples and the others add to them: every row is written once.
     """
     shots, views_v, views_u, _, stored, width = weights.shape
-    for row in prange(frames.shape[1]):
+    for row in range(begin, end):
         spread = np.empty((shots, 3, width), frames.dtype)
         for part in range(binning):
             y = row * binning + part
@@ -144,14 +146,14 @@ def back_project(weights, colour, frames, binning, light_field):
                                 samples[3 * x + 2] = for_blue[x] * blue[x]
 
 
-@njit(cache=True, parallel=True)
-def data_step(weights, colour, inverse, frames, binning, light_field):
+@row_kernel("frames", 1)
+def data_step(begin, end, weights, colour, inverse, frames, binning, light_field):
     """Replace light_field z by z - Psi^T (Psi Psi^T + Lambda)^-1 (Psi z - frames), in place.
 
     inverse: (shot, shot, pixel_y, pixel_x), the inverted blocks.
     """
     shots, views_v, views_u, _, _, width = weights.shape
-    for row in prange(frames.shape[1]):
+    for row in range(begin, end):
         seen = np.zeros((shots, width), frames.dtype)
         for shot in range(shots):
             for part in range(binning):
@@ -167,36 +169,40 @@ def data_step(weights, colour, inverse, frames, binning, light_field):
                         spread_row(weights, colour, seen[shot], shot, y, v, u, lines)
 
 
-@njit(cache=True, parallel=True)
-def gram(weights, colour, binning, blocks):
+@row_kernel("blocks", 2)
+def gram(begin, end, weights, colour, binning, blocks):
     """Set blocks (shot, shot, pixel_y, pixel_x), float64, to those of Psi Psi^T."""
     shots, views_v, views_u, _, stored, width = weights.shape
-    for row in prange(blocks.shape[2]):
+    total = np.empty(width)
+    for row in range(begin, end):
         for a in range(shots):
             for b in range(a + 1):
-                blocks[a, b, row, :] = 0
+                total[:] = 0
                 for part in range(binning):
                     y = row * binning + part
                     for v in range(views_v):
                         for u in range(views_u):
                             for c in range(stored):
+                                one, other = weights[a, v, u, y, c], weights[b, v, u, y, c]
                                 for x in range(width):
                                     if stored == 3 or colour[a, y, x] == colour[b, y, x]:
-                                        blocks[a, b, row, x // binning] += np.float64(
-                                            weights[a, v, u, y, c, x]
-                                        ) * np.float64(weights[b, v, u, y, c, x])
-                blocks[b, a, row, :] = blocks[a, b, row, :]
+                                        total[x] += np.float64(one[x]) * np.float64(other[x])
+                for x in range(blocks.shape[3]):
+                    value = 0.0
+                    for sample in range(x * binning, (x + 1) * binning):
+                        value += total[sample]
+                    blocks[a, b, row, x] = blocks[b, a, row, x] = value
 
 
-@njit(cache=True, parallel=True)
-def invert_blocks(blocks, ridge, inverse, failed):
+@row_kernel("blocks", 2)
+def invert_blocks(begin, end, blocks, ridge, inverse, failed):
     """Set inverse to (blocks + diag(ridge))^-1 per pixel, by Cholesky in float64.
 
     ridge: (shot, pixel_y, pixel_x), may be infinite (a measurement not to use).
     failed: (pixel_y,) counts the pixels of each row whose block is not positive definite.
     """
     shots = blocks.shape[0]
-    for row in prange(blocks.shape[2]):
+    for row in range(begin, end):
         lower = np.zeros((shots, shots))
         solved = np.zeros((shots, shots))
         for x in range(blocks.shape[3]):

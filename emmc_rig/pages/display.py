@@ -71,15 +71,15 @@ def png_of(image: NDArray[np.uint8]) -> str:
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
-def sprite(views: NDArray[np.uint8], most_bytes: int) -> str:
-    """All views of (v, u, y, x, c) in one JPEG, each padded to whole JPEG blocks.
+def sprite(views: NDArray[np.uint8], most_bytes: int, tile: int = TILE_MULTIPLE_PX) -> str:
+    """All views of (v, u, y, x, c) in one JPEG, each padded to whole tiles.
 
     most_bytes: the finest quality that stays below is taken.
 
     Colour is kept at full resolution: half-resolution chroma bleeds from view to view.
     """
     rows, columns, height, width, colours = views.shape
-    padding = [(0, -height % TILE_MULTIPLE_PX), (0, -width % TILE_MULTIPLE_PX)]
+    padding = [(0, -height % tile), (0, -width % tile)]
     padded = np.pad(views, [(0, 0), (0, 0), *padding, (0, 0)], mode="edge")
     tiled = padded.transpose(0, 2, 1, 3, 4).reshape(
         rows * padded.shape[2], columns * padded.shape[3], colours

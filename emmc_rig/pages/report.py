@@ -31,7 +31,7 @@ from emmc_rig.pages.display import (
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import Card, data_address, fragment, verdict_head
 from emmc_rig.pages.psi_panels import psi_panels
-from emmc_rig.pages.viewer import viewer_data
+from emmc_rig.pages.viewer import poster, viewer_data
 
 Array = NDArray[np.floating]
 
@@ -140,6 +140,7 @@ def render(content: ReportContent) -> str:
             "data": _page_data(content, shown, curve, errors),
             "viewer-data": viewer_data(export, atlases=False),
         },
+        poster=poster(export, PART_PIXELS),
         scripts=("viewer.js", "report.js"),
     )
 

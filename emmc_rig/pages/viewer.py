@@ -80,8 +80,22 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
         about=[content.caption] if content.caption else [],
         caveats=(), sections=(), lead="", summary=verdict_head(content.metrics),
         styles=("viewer.css",), scripts=("viewer.js",),
-        data={"viewer-data": viewer_data(content, lossless=lossless)},
+        data={"viewer-data": viewer_data(content, lossless=lossless)}, poster=poster(content),
     )  # fmt: skip
+
+
+def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, object]:
+    """Return the centre view, shown until the light field can be turned, and the canvas's size.
+
+    most_pixels: of all views together.
+    """
+    views, (rows, columns) = content.light_field, content.light_field.shape[:2]
+    centre = views[rows // 2, columns // 2][None, None]
+    shown = reduced(centre, most_pixels // (rows * columns))
+    curve = DisplayCurve.fitted_to(views if content.truth is None else content.truth)
+    codes = three_colours(curve.encode(shown))
+    picture = sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3), tile=1)
+    return {"picture": picture, "height": shown.shape[2], "width": shown.shape[3]}
 
 
 def viewer_data(content: Export, atlases: bool = True, lossless: bool = False) -> dict[str, object]:

@@ -175,8 +175,8 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
         wired = validated(WiredRig, read, spec, AppError)
-        told = {name: getattr(wired, name) for name in LATER}
-        return _described(SIMULATED, imaged.model_copy(update=told))
+        wiring = {name: getattr(wired, name) for name in LATER}
+        return _described(SIMULATED, imaged.model_copy(update=wiring))
     config = validated(RealRig, read, spec, AppError)
     described = _described("real", config)
     beside = Path(spec).parent / config.stage

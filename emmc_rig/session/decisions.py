@@ -58,12 +58,12 @@ def metered_words(entry: Entry) -> str:
     by_exposure: dict[float, list[str]] = {}
     for shot, exposure_s in entry["exposures_s"].items():
         by_exposure.setdefault(exposure_s, []).append(shot)
-    told = ", ".join(
+    exposures = ", ".join(
         f"shots {', '.join(shots)} by {exposure_s:.3g} s"
         for exposure_s, shots in by_exposure.items()
     )
     longer = f"; {len(entry['asked'])} longer frames, for the dark parts" if entry["asked"] else ""
-    return f"metered: {told}{longer}"
+    return f"metered: {exposures}{longer}"
 
 
 def decided_words(entry: Entry) -> str:

@@ -161,15 +161,15 @@ def compared(ones: Sequence[Session]) -> list[tuple[str, list[str]]]:
 
     Raises AppError for a session that cannot be read.
     """
-    rows = [_said(one) for one in ones]
+    rows = [_described(one) for one in ones]
     names = list(dict.fromkeys(name for row in rows for name in row))
     table = [(name, [row.get(name, "") for row in rows]) for name in names]
     return [(name, values) for name, values in table if len(set(values)) > 1]
 
 
-def _said(session: Session) -> dict[str, str]:
+def _described(session: Session) -> dict[str, str]:
     """Return figures and settings of a session, by names for people."""
-    told = summary(session.folder)
+    listed = summary(session.folder)
     shots = shot_exposures(session)
     exposures_s = sorted(
         {
@@ -180,14 +180,14 @@ def _said(session: Session) -> dict[str, str]:
     )
     retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
     return {
-        "begun": told.created,
-        "state": told.state,
-        "frames": f"{told.stored} of {told.planned}",
+        "begun": listed.created,
+        "state": listed.state,
+        "frames": f"{listed.stored} of {listed.planned}",
         "retries": str(retries),
         "exposures of shots, s": ", ".join(f"{one:.3g}" for one in exposures_s),
         "brightest readings, of white": ", ".join(f"{one.level:.0%}" for one in shots),
-        "verdict": told.verdict or "not reconstructed",
-        "PSNR stated, dB": "" if told.stated_db is None else f"{told.stated_db:.2f}",
+        "verdict": listed.verdict or "not reconstructed",
+        "PSNR stated, dB": "" if listed.stated_db is None else f"{listed.stated_db:.2f}",
         **_flat(session.rig, "rig"),
         **_flat(parse_yaml(session.plan_yaml, str(session.folder), AppError) or {}, "plan"),
     }

@@ -134,7 +134,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
         view, window = frames[0].view, frames[0].window
         found[kind].append(BoardFrame(mean, stage_um, bench.shot, view, bench.lamp, window))
     references = {key: _mean(session, frames) for key, frames in _references(session).items()}
-    # The white lamp's first: the sensor's gain is told by it.
+    # The white lamp's first: the sensor's gain follows from it.
     references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
     darks = _board_darks(session)
     every = BoardSet(darks, references, ())

@@ -76,8 +76,13 @@ class EvidencePatches:
     stride: int
     spacing: int = 1
 
-    def grid(self, pixels: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows and the columns of corners that cover a sensor of `pixels`."""
+    def grid(
+        self, pixels: tuple[int, int], first: int = 0
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows and the columns of corners that cover a sensor of `pixels`.
+
+        first: the corner after that at 0, if it is not a stride further.
+        """
         span = (self.side - 1) * self.spacing + 1
         if min(pixels) < span:
             raise ReconstructionError(
@@ -85,7 +90,7 @@ class EvidencePatches:
                 "use a larger window"
             )
         along = [
-            np.unique(np.append(np.arange(0, whole - span + 1, self.stride), whole - span))
+            np.unique([0, *range(first, whole - span + 1, self.stride), whole - span])
             for whole in pixels
         ]
         return along[0], along[1]

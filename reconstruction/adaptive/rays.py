@@ -17,9 +17,9 @@ import numpy as np
 from numba import get_num_threads, njit
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out
-from reconstruction.adaptive.bands import in_bands
 
 Array = NDArray[np.floating]
 

@@ -4,11 +4,16 @@ The likelihood of disparities is evaluated for wide patches of every third pixel
 where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
 fine search then evaluates only what the coarse one left possible there, so that cost grows with the
 disparities a scene really has.
+
+Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
+make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
+patches believe, one between the other, is averaged: +0.1 dB.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -60,7 +65,8 @@ class Volume:
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
     disparity); evidence: theirs, log-likelihoods, -inf where not evaluated. kind: (row, column) of
     the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
-    at_end: share of deciding patches at the range's ends.
+    at_end: share of deciding patches at the range's ends. between: the same of a grid between these
+    patches, of the same disparities.
     """
 
     disparities: NDArray[np.float64]
@@ -70,6 +76,12 @@ class Volume:
     kind: NDArray[np.int64]
     decisive: NDArray[np.bool_]
     at_end: float = 0.0
+    between: Volume | None = None
+
+    @property
+    def grids(self) -> tuple[Volume, ...]:
+        """Return this and the one between, if there is one: beliefs are their mean."""
+        return (self,) if self.between is None else (self, self.between)
 
 
 def reading_side(shots: int) -> int:
@@ -186,13 +198,51 @@ def fine(
     step_px: float,
     slope_px: float,
     jump: float,
+    interleaved: bool = True,
 ) -> Volume:
-    """Return the search of `step_px` among what the rough one left possible."""
+    """Return the search of `step_px` among what the rough one left possible.
+
+    interleaved: whether a second grid of patches lies between the first, see `Volume.between`.
+    """
     side = reading_side(data.psi.shots)
     patches = EvidencePatches(side, min(stride, side))
     low, high = rough.disparities[[0, -1]]
     labels = np.arange(np.floor(low / step_px), np.ceil(high / step_px) + 1) * step_px
-    rows, columns = patches.grid(data.psi.frames_shape[1:])
+    firsts = (0, patches.stride // 2) if interleaved and patches.stride > 1 else (0,)
+    parts = [_on_grid(data, patches, first, prior, rough, labels) for first in firsts]
+    used = np.any([np.isfinite(part.evidence).any(axis=(0, 1)) for part in parts], axis=0)
+    labels = labels[used]
+    # Large disparities average texture away: patches with hardly any fit them a little better.
+    rare = np.log1p(np.abs(labels) / RARE_PX).astype(np.float32)
+    # Where patches overlap they count the same readings again.
+    own = np.float32((patches.stride / side) ** 2)
+    pairs = compatibility(labels, slope_px * patches.stride, jump)
+    between = None
+    for part in reversed(parts):
+        evidence = part.evidence[..., used]
+        likely = evidence - np.where(part.decisive[..., None], np.float32(0), rare)
+        between = replace(
+            part,
+            disparities=labels,
+            evidence=evidence,
+            probability=posteriors(likely * own, pairs),
+            between=between,
+        )
+    assert between is not None
+    return between
+
+
+def _on_grid(
+    data: Data,
+    patches: EvidencePatches,
+    first: int,
+    prior: TexturePrior,
+    rough: Volume,
+    labels: NDArray[np.float64],
+) -> Volume:
+    """Return the evidence on a grid of patches (`EvidencePatches.grid`), without probabilities."""
+    side = patches.side
+    rows, columns = patches.grid(data.psi.frames_shape[1:], first)
     evidence = np.full((len(rows), len(columns), len(labels)), -np.inf, dtype=np.float32)
     kind = np.zeros((len(rows), len(columns)), dtype=np.int64)
     deciding = np.zeros((len(rows), len(columns)), dtype=bool)
@@ -210,43 +260,61 @@ def fine(
             part[..., chosen] = values
             evidence[here], kind[here] = part, found.kind.reshape(shape)
             deciding[here] = _deciding(values)
-    used = np.flatnonzero(np.isfinite(evidence).any(axis=(0, 1)))
-    evidence, labels = evidence[..., used], labels[used]
-    # Large disparities average texture away: patches with hardly any fit them a little better.
-    rare = np.log1p(np.abs(labels) / RARE_PX).astype(np.float32)
-    likely = evidence - np.where(deciding[..., None], np.float32(0), rare)
-    # Where patches overlap they count the same readings again.
-    own = np.float32((patches.stride / side) ** 2)
-    chances = posteriors(likely * own, compatibility(labels, slope_px * patches.stride, jump))
     centres = rows + (side - 1) / 2, columns + (side - 1) / 2
-    return Volume(labels, centres, chances, evidence, kind, deciding, rough.at_end)
+    return Volume(labels, centres, evidence, evidence, kind, deciding, rough.at_end)
 
 
-def _pixel_maps(
-    volume: Volume, size: tuple[int, int], binning: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return where in the grid of patches every sample (y, x) lies: columns and rows, (y, x)."""
-    along = []
-    for at, length in zip(volume.centres, size, strict=True):
-        pixel = (np.arange(length) + 0.5) / binning - 0.5
-        along.append(np.interp(pixel, at, np.arange(len(at))).astype(np.float32))
-    columns, rows = np.meshgrid(along[1], along[0])
-    return columns, rows
+Places = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
-def interpolated(grid: Array, columns: Array, rows: Array) -> NDArray[np.float32]:
-    """Return the values of a grid (y, x) at fractional columns and rows, linear, (any shape)."""
-    found = cv2.remap(grid, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, dtype=np.float32)
+def places(volume: Volume, rows: Array, columns: Array) -> Places:
+    """Return where in each of a volume's grids pixels lie: fractional columns and rows, (y, x).
+
+    rows, columns: of the pixels, (y,) and (x,), fractional where pixels hold several samples.
+    """
+    out = []
+    for grid in volume.grids:
+        y, x = (
+            np.interp(at, centres, np.arange(len(centres))).astype(np.float32)
+            for at, centres in zip((rows, columns), grid.centres, strict=True)
+        )
+        across, down = np.meshgrid(x, y)
+        out.append((across, down))
+    return out
+
+
+def interpolated(
+    volume: Volume, values: Callable[[Volume], Array], at: Places
+) -> NDArray[np.float32]:
+    """Return values (row, column) of a volume's grids at `places`: linear, and their mean."""
+    each = [
+        cv2.remap(
+            np.ascontiguousarray(values(grid), dtype=np.float32),
+            *where,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        for grid, where in zip(volume.grids, at, strict=True)
+    ]
+    return np.asarray(each[0] if len(each) == 1 else (each[0] + each[1]) / 2, dtype=np.float32)
+
+
+def _samples(volume: Volume, size: tuple[int, int], binning: int) -> Places:
+    """Return the places of every sample (y, x)."""
+    rows, columns = ((np.arange(length) + 0.5) / binning - 0.5 for length in size)
+    return places(volume, rows, columns)
 
 
 def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
     """Return the variance of the disparity of every sample (y, x) over what the patches believe."""
-    mean = volume.probability @ volume.disparities
-    square = volume.probability @ np.square(volume.disparities)
-    spread = np.maximum(square - np.square(mean), 0).astype(np.float32)
-    columns, rows = _pixel_maps(volume, size, binning)
-    return interpolated(spread, columns, rows)
+    at = _samples(volume, size, binning)
+    mean, square = (
+        interpolated(
+            volume, lambda grid, power=power: grid.probability @ grid.disparities**power, at
+        )
+        for power in (1, 2)
+    )
+    return np.maximum(square - np.square(mean), 0)
 
 
 def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
@@ -254,13 +322,12 @@ def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np
 
     Probabilities are interpolated between the patches' centres.
     """
-    columns, rows = _pixel_maps(volume, size, binning)
+    at = _samples(volume, size, binning)
     best = np.full(size, -1.0, dtype=np.float32)
     which = np.zeros(size, dtype=np.int64)
 
     def spread(label: int) -> NDArray[np.float32]:
-        layer = np.ascontiguousarray(volume.probability[..., label])
-        return interpolated(layer, columns, rows)
+        return interpolated(volume, lambda grid: grid.probability[..., label], at)
 
     for label in range(len(volume.disparities)):
         chance = spread(label)

@@ -24,6 +24,9 @@ class AdaptiveSettings(Settings):
     )
     step_px: float = Field(default=0.125, gt=0, description="between disparities compared")
     stride: int = Field(default=6, ge=1, description="pixels between patches that are compared")
+    interleaved: bool = Field(
+        default=True, description="compare a second grid of patches too, between the first"
+    )
     lengths_px: tuple[Length, ...] = Field(
         default=(3.0, 1.5), min_length=1, description="correlation lengths of a patch's texture"
     )
@@ -77,13 +80,14 @@ class AdaptiveSettings(Settings):
 
 
 def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
-    """Return the settings of `adaptive-fast`: one texture of patches, fewer disparities and steps.
+    """Return the settings of `adaptive-fast`: one texture and one grid of patches, fewer
+    disparities and steps.
 
     Patches 8 pixels apart instead cost 0.5 dB on 96x96 crops of group A.
     """
     quick = settings.texture.model_copy(
         update={"steps": 8, "refine_steps": 5, "block_step": 6, "sweeps": ()}
     )
-    coarser = {"step_px": 0.25, "lengths_px": (2.0,)}
+    coarser = {"step_px": 0.25, "lengths_px": (2.0,), "interleaved": False}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
     return settings.model_copy(update=coarser | fewer)

@@ -17,8 +17,8 @@ import numpy as np
 from numba import get_num_threads, njit
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.lightfield import OPPONENT
-from reconstruction.adaptive.bands import in_bands
 
 Array = NDArray[np.floating]
 SIDE = 8

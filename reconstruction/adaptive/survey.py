@@ -152,7 +152,9 @@ def _searched(
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)
-    volume = search.fine(data, fine, rough, settings.stride, settings.step_px, *smooth)
+    volume = search.fine(
+        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
+    )
     on_searched(2)
     return volume
 

@@ -22,11 +22,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, cubic
-from reconstruction.adaptive.bands import in_bands
 from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.search import Volume, interpolated
+from reconstruction.adaptive.search import Volume, interpolated, places
 
 Array = NDArray[np.floating]
 FREEDOM = 3.0
@@ -167,13 +167,7 @@ def swept(
     pixels = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k).mean(axis=(2, 4))
     guide = np.ascontiguousarray(np.moveaxis(pixels, 0, -1).astype(np.float32))
     rows, columns = (np.arange(0, length, STRIDE) for length in psi.frames_shape[1:])
-    at = np.meshgrid(
-        *(
-            np.interp(here, centres, np.arange(len(centres))).astype(np.float32)
-            for here, centres in zip((rows, columns), volume.centres, strict=True)
-        ),
-        indexing="ij",
-    )
+    at = places(volume, rows.astype(float), columns.astype(float))
     half = max(psi.light_field_shape[:2]) // 2
     likeliest = volume.disparities[volume.probability.argmax(axis=-1)]
     low, high = np.percentile(likeliest, (RARE, 100 - RARE))
@@ -181,12 +175,10 @@ def swept(
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
     evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
-    for label, (disparity, belief) in enumerate(
-        zip(labels, np.moveaxis(volume.probability[..., within], -1, 0), strict=True)
-    ):
-        of_plane = frames - plane_frames(psi, texture, disparity, margin)
+    for label, known in enumerate(np.flatnonzero(within)):
+        of_plane = frames - plane_frames(psi, texture, labels[label], margin)
         likelihood = _likelihood(of_plane, variance, weight, guide)[::STRIDE, ::STRIDE]
-        believed = interpolated(np.ascontiguousarray(belief), at[1], at[0])
+        believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
         evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
     chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
     return replace(
@@ -195,4 +187,5 @@ def swept(
         centres=(rows.astype(float), columns.astype(float)),
         probability=chances,
         evidence=evidence,
+        between=None,
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from reconstruction.adaptive.bands import in_bands
+from emmc_rig.model.bands import in_bands
 
 Array = NDArray[np.floating]
 REACH = 0.75

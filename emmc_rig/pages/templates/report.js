@@ -484,25 +484,31 @@ function prepareControls() {
   if (data.error) byId("error-scale").textContent = `${data.error.scale} and more`;
 }
 
+// Draws what is below the fold when it comes near the screen, or goes to the printer.
+function whenSeen(element, draw) {
+  const seen = () => { watch.disconnect(); removeEventListener("beforeprint", seen); draw(); };
+  const watch = new IntersectionObserver(
+    (entries) => entries.some((one) => one.isIntersecting) && seen(), { rootMargin: "300px" });
+  watch.observe(element);
+  addEventListener("beforeprint", seen);
+}
+
 async function main() {
   prepareControls();
+  await viewerShown; // what is seen first comes first
   const frames = [
     frameViewer(byId("shots"), data.shots, "Captured frames"),
     frameViewer(byId("whiteboards"), data.whiteboards, "Whiteboard frames"),
   ];
-  sources.estimate = await decoded(data.estimate);
-  if (data.truth) {
-    sources.truth = await decoded(data.truth);
-    sources.errorViews = await decoded(data.error.views);
-    sources.errorMean = await decoded(data.error.mean);
-  }
+  const named = data.truth ? { errorMean: data.error.mean, errorViews: data.error.views, truth: data.truth } : {};
+  for (const [name, picture] of Object.entries({ ...named, estimate: data.estimate }))
+    sources[name] = await decoded(picture);
   listen();
   drawViews();
   drawEpi();
   drawError();
   byId("refocus-value").textContent = (+byId("refocus-slider").value).toFixed(2);
-  drawRefocus("quick"); // keeps the small views, so that the slider's first move is quick too
-  drawRefocus("full");
+  whenSeen(byId("refocus"), () => drawRefocus("full"));
   await Promise.all(frames);
   document.documentElement.dataset.ready = "yes";
 }

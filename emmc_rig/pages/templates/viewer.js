@@ -19,7 +19,8 @@ const decoded = (() => {
 })();
 
 // A light field to turn, focus and look into. The shader is the twin of model/novel_view.py.
-(() => {
+// Fulfilled when it can be turned; truth and maps are decoded after that.
+const viewerShown = (() => {
 const data = JSON.parse(document.getElementById("viewer-data").textContent);
 if (!data.estimate) { // a part of a report, which holds the views already
   const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
@@ -35,6 +36,7 @@ const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus
 const state = { ...home(), overlay: -1, x: width >> 1, y: height >> 1 };
 const picture = byId("picture");
 let renderer, atlases = {}, depth, overlayLevels = [];
+const breath = () => new Promise((done) => setTimeout(done)); // lets the page answer in between
 
 const VERTEX = `#version 300 es
 void main() {
@@ -132,25 +134,36 @@ void main() {
   }
 }`;
 
-// The largest code within a view step's shift of every pixel: by blocks, of nine in one square.
-function nearestAround(pixels) {
+// Put into green the largest code within a view step's shift of every pixel: by blocks, of nine in one square.
+function addNearest(codes) {
   const side = Math.ceil(Math.max(Math.abs(data.disparity.low), Math.abs(data.disparity.high), 1)) + 1;
   const across = Math.ceil(width / side), down = Math.ceil(height / side);
-  const blocks = new Uint8Array(across * down), around = new Uint8Array(across * down);
-  for (let y = 0, i = 0; y < height; y++)
-    for (let x = 0; x < width; x++, i += 4) {
-      const block = Math.floor(y / side) * across + Math.floor(x / side);
-      if (pixels[i] > blocks[block]) blocks[block] = pixels[i];
+  const blocks = new Uint8Array(across * down), around = new Uint8Array(across);
+  const eachRun = (y, visit) => {
+    for (let block = 0, x = 0; x < width; block++, x += side)
+      visit(block, y * width + x, y * width + Math.min(x + side, width));
+  };
+  for (let y = 0; y < height; y++) {
+    const row = Math.floor(y / side) * across;
+    eachRun(y, (block, from, to) => {
+      let most = blocks[row + block];
+      for (let i = from; i < to; i++) if (codes[4 * i] > most) most = codes[4 * i];
+      blocks[row + block] = most;
+    });
+  }
+  for (let y = 0; y < height; y++) {
+    const row = Math.floor(y / side);
+    if (y % side === 0) {
+      around.fill(0);
+      for (let j = Math.max(row - 1, 0); j <= Math.min(row + 1, down - 1); j++)
+        for (let x = 0; x < across; x++)
+          for (let i = Math.max(x - 1, 0); i <= Math.min(x + 1, across - 1); i++)
+            around[x] = Math.max(around[x], blocks[j * across + i]);
     }
-  for (let y = 0; y < down; y++)
-    for (let x = 0; x < across; x++)
-      for (let j = Math.max(y - 1, 0); j <= Math.min(y + 1, down - 1); j++)
-        for (let i = Math.max(x - 1, 0); i <= Math.min(x + 1, across - 1); i++)
-          around[y * across + x] = Math.max(around[y * across + x], blocks[j * across + i]);
-  const all = new Uint8Array(width * height);
-  for (let y = 0, i = 0; y < height; y++)
-    for (let x = 0; x < width; x++, i++) all[i] = around[Math.floor(y / side) * across + Math.floor(x / side)];
-  return all;
+    eachRun(y, (block, from, to) => {
+      for (let i = from; i < to; i++) codes[4 * i + 1] = around[block];
+    });
+  }
 }
 
 function webgl(canvas) {
@@ -178,30 +191,24 @@ function webgl(canvas) {
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
     ]) gl.texParameteri(kind, name, value);
   }
-  function layers(unit, format, sources, pixels) {
+  function layers(unit, many) {
     texture(unit, gl.TEXTURE_2D_ARRAY);
-    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, width, height, count * sources.length);
-    sources.forEach((source, k) => {
-      const context = source.getContext("2d");
-      for (let view = 0; view < count; view++) {
-        const tile = context.getImageData(
-          (view % columns) * tileWidth, Math.floor(view / columns) * tileHeight, width, height);
-        pixels(tile, k * count + view);
-      }
-    });
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA8, width, height, many);
   }
-  const sources = atlases.truth ? [atlases.estimate, atlases.truth] : [atlases.estimate];
-  layers(0, gl.RGBA8, sources, (tile, layer) =>
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGBA, gl.UNSIGNED_BYTE, tile.data));
-  // Half floats are filtered finer than bytes, and hold every code of a byte.
-  layers(1, gl.RG16F, [depth], (tile, layer) => {
-    const codes = new Float32Array(2 * width * height), nearest = nearestAround(tile.data);
-    for (let i = 0; i < width * height; i++) {
-      codes[2 * i] = tile.data[4 * i] / 255;
-      codes[2 * i + 1] = nearest[i] / 255;
-    }
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RG, gl.FLOAT, codes);
-  });
+  function upload(unit, atlas, view, layer, prepare) {
+    const codes = atlas.getContext("2d").getImageData(
+      (view % columns) * tileWidth, Math.floor(view / columns) * tileHeight, width, height).data;
+    prepare?.(codes);
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.texSubImage3D(
+      gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGBA, gl.UNSIGNED_BYTE, codes);
+  }
+  layers(0, data.truth ? 2 * count : count);
+  layers(1, count);
+  for (let view = 0; view < count; view++) {
+    upload(0, atlases.estimate, view, view);
+    upload(1, depth, view, view, addNearest);
+  }
   texture(2, gl.TEXTURE_2D);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   gl.uniform1i(at("views"), 0);
@@ -211,11 +218,17 @@ function webgl(canvas) {
   gl.uniform2f(at("size"), width, height);
   gl.uniform2f(at("range"), data.disparity.low, data.disparity.high);
   gl.uniform1f(at("gamma"), data.gamma);
-  gl.uniform1i(at("compared"), atlases.truth ? 1 : 0);
   const [shown, position, focus, aperture, wipe, opacity] =
     ["shown", "position", "focus", "aperture", "wipe", "opacity"].map(at);
   return {
     kind: "WebGL2",
+    async compare(truth) {
+      for (let view = 0; view < count; view++) {
+        upload(0, truth, view, count + view);
+        if (view % columns === columns - 1) await breath();
+      }
+      gl.uniform1i(at("compared"), 1);
+    },
     draw() {
       const across = Math.ceil(width / detail), down = Math.ceil(height / detail);
       if (canvas.width !== across) Object.assign(canvas, { width: across, height: down });
@@ -256,6 +269,7 @@ function plain(canvas) {
   }
   return {
     kind: "plain canvas",
+    async compare() {},
     draw() {
       scene(atlases.estimate);
       if (atlases.truth && state.wipe > 0) {
@@ -371,6 +385,7 @@ function colourOf(colours, at, kinds) {
 
 function choose(overlay) {
   state.overlay = overlay < data.overlays.length ? overlay : -1;
+  if (!overlayLevels[state.overlay]) state.overlay = -1; // until they are decoded
   for (const input of byId("overlays").querySelectorAll("input")) input.checked = +input.value === state.overlay;
   const legend = byId("legend"), one = data.overlays[state.overlay];
   legend.hidden = !one;
@@ -551,10 +566,6 @@ function full() {
 }
 
 function prepareControls() {
-  picture.width = width;
-  picture.height = height;
-  picture.style.aspectRatio = `${width} / ${height}`;
-  byId("stage").style.maxWidth = `calc(80vh * ${width / height})`;
   byId("aperture").max = farthest;
   byId("focus").min = data.focus.low;
   byId("focus").max = data.focus.high;
@@ -571,24 +582,36 @@ function prepareControls() {
 
 async function main() {
   prepareControls();
-  atlases.estimate = await decoded(data.estimate);
-  if (data.truth) atlases.truth = await decoded(data.truth);
-  depth = await decoded(data.disparity.atlas);
-  const laid = await Promise.all(data.overlays.map((one) => decoded(one.picture)));
-  overlayLevels = laid.map((canvas) => canvas.getContext("2d").getImageData(0, 0, width, height));
+  [atlases.estimate, depth] = await Promise.all([data.estimate, data.disparity.atlas].map(decoded));
   const wanted = new URLSearchParams(location.search).get("renderer");
   renderer = (wanted === "plain" ? null : webgl(picture)) ?? plain(picture);
   listen();
   draw();
-  const stage = document.getElementById("viewer");
-  stage.dataset.renderer = renderer.kind;
-  stage.dataset.ready = "yes";
+  byId("poster").remove();
+  const viewer = document.getElementById("viewer");
+  viewer.dataset.renderer = renderer.kind;
+  viewer.dataset.ready = "yes";
   // For tests: set a state, draw it now, and how long a drawing takes.
-  stage.show = (more, pixels = 1) => { set(more); detail = pixels; draw(); renderer.finish(); };
+  viewer.show = (more, pixels = 1) => { set(more); detail = pixels; draw(); renderer.finish(); };
+  compare().then(() => { viewer.dataset.complete = "yes"; }, failed);
 }
 
-main().catch((error) => {
+// What is laid over the estimate and compared with it.
+async function compare() {
+  await breath();
+  const laid = await Promise.all(data.overlays.map((one) => decoded(one.picture)));
+  overlayLevels = laid.map((canvas) => canvas.getContext("2d").getImageData(0, 0, width, height));
+  if (data.truth) {
+    const truth = await decoded(data.truth);
+    await renderer.compare(truth);
+    atlases.truth = truth;
+  }
+  draw();
+}
+
+function failed(error) {
   byId("status").textContent = `The light field could not be drawn (${error}).`;
   console.error(error);
-});
+}
+return main().catch(failed);
 })();

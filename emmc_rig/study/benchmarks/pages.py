@@ -10,7 +10,6 @@ import os
 import shutil
 import statistics
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -33,7 +32,19 @@ NOISE = 0.01
 FRAMES, PATIENCE_S = 12, 120
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
 OPTIONS = ("--headless=new", "--no-sandbox", "--hide-scrollbars", "--window-size=1600,1000")
-SHOWN = "return document.getElementById('viewer').dataset.ready === 'yes'"
+EMPTY = "<!doctype html><title>empty</title><p>empty</p>"
+WATCH = """new PerformanceObserver((list) => {
+  for (const one of list.getEntries()) window.seen = one.startTime;
+}).observe({ type: "largest-contentful-paint", buffered: true });
+addEventListener("DOMContentLoaded", () => {
+  const viewer = document.getElementById("viewer");
+  const look = () => { if (!viewer || viewer.dataset.ready) window.turns = performance.now(); };
+  look();
+  if (viewer) new MutationObserver(look).observe(viewer, { attributeFilter: ["data-ready"] });
+});"""
+"""Notes by the page's own clock when its largest picture is seen, and when it can be turned."""
+TIMES = """const viewer = document.getElementById("viewer");
+return window.seen && (!viewer || viewer.dataset.complete) ? [window.seen, window.turns] : null"""
 TURN = """const show = document.getElementById('viewer').show, times = [];
 for (let k = 0; k <= arguments[0]; k++) {
   const begun = performance.now();
@@ -47,7 +58,8 @@ DETAILS = (1, 2, 4)
 
 @dataclass(frozen=True)
 class PageTiming:
-    """One page of one size. shown_s: from the address to the first picture, median of three.
+    """One page of one size. seen_s, turns_s: from the address to the centre view's picture, and
+    until the light field can be turned, medians of three.
 
     frame_ms: of a view between views, by every which pixel.
     """
@@ -55,7 +67,8 @@ class PageTiming:
     page: str
     size: tuple[int, int]
     megabytes: float
-    shown_s: float
+    seen_s: float
+    turns_s: float
     frame_ms: dict[int, float]
 
 
@@ -78,6 +91,7 @@ def _browser() -> Iterator[Any]:
         browser = webdriver.Chrome(options, webdriver.ChromeService(driver))
         try:
             browser.set_script_timeout(PATIENCE_S)
+            browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
             yield browser
         finally:
             browser.quit()
@@ -105,27 +119,36 @@ def pages_of(camera: Camera, size: tuple[int, int], scene: str, seed: int) -> di
     return {"report": render(report), "viewer": render_viewer(export)}
 
 
-def page_timing(browser: Any, page: str, size: tuple[int, int], path: Path) -> PageTiming:
-    """Open a page three times, and turn its light field."""
+def _opened_s(browser: Any, path: Path) -> list[float]:
+    """Open a page three times; return when it was seen, and when it could be turned."""
     from selenium.webdriver.support.ui import WebDriverWait
 
-    shown_s = []
+    times = []
     for _ in range(3):
-        began_s = time.perf_counter()
         browser.get(path.as_uri())
-        WebDriverWait(browser, PATIENCE_S, 0.02).until(lambda it: it.execute_script(SHOWN))
-        shown_s.append(time.perf_counter() - began_s)
+        waiting = WebDriverWait(browser, PATIENCE_S, 0.2)
+        times.append(waiting.until(lambda it: it.execute_script(TIMES)))
+    return [statistics.median(one) / 1000 for one in zip(*times, strict=True)]
+
+
+def page_timing(browser: Any, page: str, size: tuple[int, int], path: Path) -> PageTiming:
+    """Open a page, and turn its light field."""
+    seen_s, turns_s = _opened_s(browser, path)
     frame_ms = {
         every: statistics.median(browser.execute_script(TURN, FRAMES, every)) for every in DETAILS
     }
-    return PageTiming(page, size, path.stat().st_size / 1e6, statistics.median(shown_s), frame_ms)
+    return PageTiming(page, size, path.stat().st_size / 1e6, seen_s, turns_s, frame_ms)
 
 
 def timings(
     camera: Camera, sizes: Sequence[tuple[int, int]], scene: str, seed: int, folder: Path
 ) -> Iterator[PageTiming]:
-    """Write the pages into a folder, and measure each."""
+    """Write the pages into a folder, and measure an empty one and each."""
     with _browser() as browser:
+        empty = folder / "empty.html"
+        write_text(empty, EMPTY)
+        seen_s, turns_s = _opened_s(browser, empty)
+        yield PageTiming("empty page", (0, 0), len(EMPTY) / 1e6, seen_s, turns_s, {})
         for size in sizes:
             for name, text in pages_of(camera, size, scene, seed).items():
                 path = folder / f"{name}-{size[0]}x{size[1]}.html"
@@ -140,8 +163,8 @@ def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     for one in timings(asked.described, sizes, scene, asked.seed, folder.absolute()):
         found.append(asdict(one))
         frames = ", ".join(f"{ms:.0f} ms at 1/{every}" for every, ms in one.frame_ms.items())
-        show.line(
-            f"{one.page} of {one.size[0]}x{one.size[1]}: {one.megabytes:.2f} MB, shown after "
-            f"{one.shown_s:.2f} s; a view between views {frames}"
-        )
+        times = f"seen after {one.seen_s:.2f} s"
+        if frames:
+            times += f", turns after {one.turns_s:.2f} s; a view between views {frames}"
+        show.line(f"{one.page}, {one.size[0]}x{one.size[1]}: {one.megabytes:.2f} MB, {times}")
     return {"scene": scene, "pages": found, "load": os.getloadavg()[0], "cores": os.cpu_count()}

@@ -71,6 +71,7 @@ BENCHMARKS = {
     "stated": Benchmark("stated", CFA),
     "ablation": Benchmark("ablation", journal="ablation.jsonl"),
     "constants": Benchmark("constants", journal="constants.jsonl"),
+    "trends": Benchmark("trends", CFA, "trends.jsonl"),
     "next-shot": Benchmark("next_shot", journal="next_shots.jsonl"),
 }
 

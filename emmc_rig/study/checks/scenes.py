@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import Drift, displacement_px, drifted, find_drift
+from calibration.drift import Captures, Drift, displacement_px, drifted, find_drift
 from calibration.parametric import psi_at, shot_stages
 from calibration.residuals import ResidualCheck, check_residuals
 from calibration.routes import calibrate
@@ -30,7 +30,6 @@ from emmc_rig.calibrate.board_plan import (
     plan_light,
 )
 from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
@@ -198,17 +197,10 @@ def _drift_of(
     white = captured.bench.camera.sensor.noise.white_level_dn
     usable = calibration.usable(captured.frames_dn, white)
     variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
-    if design.colour is None:
-        raise AppError("a drift is estimated on sensors with a colour filter only")
-    return find_drift(
-        readings,
-        variance,
-        usable,
-        design.colour,
-        shadow.mask,
-        shadow.placement,
-        shot_stages(captured.bench.camera),
-    )
+    colour, k = design.colour, design.binning
+    taken = Captures(readings, variance, usable, None if colour is None else colour[:, ::k, ::k])
+    stages = shot_stages(captured.bench.camera)
+    return find_drift(taken, shadow.mask, shadow.placement, stages)
 
 
 def moved_truth(truth: BenchTruth, drift: tuple[float, ...]) -> BenchTruth:
@@ -254,7 +246,7 @@ def check_drift(settings: CalibrateSettings) -> tuple[list[Row], dict]:
                 kind: _reconstructed(psi, calibration, captured) for kind, psi in matrices.items()
             }
             db = {kind: one[0] for kind, one in done.items()}
-            left = np.array(list(found.values.values()))[:5] - np.array(drift)
+            left = np.array(list(found.values.values()))[: len(drift)] - np.array(drift)
             left_px = displacement_px(shadow.mask, shadow.placement, left)
             name = Path(spec).name
             detail[f"{what}, {name}"] = {

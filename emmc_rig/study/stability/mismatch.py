@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from calibration.drift import DriftSettings, find_drift
+from calibration.drift import Captures, DriftSettings, find_drift
 from calibration.errors import CalibrationError
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
@@ -88,25 +88,16 @@ def corrected(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, boo
     """
     psi = moved.psi
     camera = Camera.model_validate_json(psi.camera_json)
-    if psi.colour is None:
-        raise NotApplicableError("a drift is estimated on sensors with a colour filter")
     noise, light = camera.sensor.noise, pixel_light(camera, psi.size)
     variance = noise.variance(moved.readings, camera.exposures_s()[:, None, None], light)
     try:
         mask, stages = shadow_mask(camera, psi.size), shot_stages(camera)
-        found = find_drift(
-            moved.readings,
-            variance,
-            moved.usable,
-            psi.colour,
-            mask,
-            designed_placement(camera),
-            stages,
-            settings,
-        )
+        colour = None if psi.colour is None else psi.colour[:, :: psi.binning, :: psi.binning]
+        taken = Captures(moved.readings, variance, moved.usable, colour)
+        found = find_drift(taken, mask, designed_placement(camera), stages, settings)
     except CalibrationError as fault:
         raise NotApplicableError(str(fault)) from fault
-    if not found.drifted:
+    if found.refused or not found.drifted:
         return psi, False
     return psi_at(Shadow(mask, found.placement), psi.layout, stages), True
 

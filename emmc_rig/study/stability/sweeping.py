@@ -183,11 +183,13 @@ def run_stability(
     figures: Mapping[str, object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     workers: int | None = None,
+    cluster: str | None = None,
 ) -> StabilityOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
     more: sections of the page between the curves and where they came from. figures: of them, for
-    metrics.json. workers: processes that share the trials; None: this one. Raises SweepStopped at
+    metrics.json. workers: processes that share the trials; None: this one. cluster: the address of
+    a Dask scheduler whose workers share them, on a disk shared with them. Raises SweepStopped at
     Ctrl-C, AppError for wrong input and a folder that cannot be written, and the errors of the
     layers below; what is done is kept in each case.
     """
@@ -200,7 +202,8 @@ def run_stability(
         open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
     with sweep_folder(out, StabilitySweep.journal, "stability") as folder:
         sweep = StabilitySweep(settings, folder)
-        with opened_pool(workers) if workers else nullcontext() as pool:
+        shared = workers is not None or cluster is not None
+        with opened_pool(workers or 1, cluster) if shared else nullcontext() as pool:
             sweep.run(points, watcher, pool)
         left_out = [*sweep.unmeasured(), *sweep.failures()]
         found = curves(sweep.results)
