@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import gaussian_filter
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.boards import Board
 from calibration.colours import mixing
@@ -409,7 +409,7 @@ def find_drift(
     count = len(KINDS)
     mask_alone = drift[:count]
     statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
-    probability = float(chi2.sf(statistic, count))
+    probability = float(chdtrc(count, statistic))
     moved = displacement_px(mask, placement, mask_alone)
     reach = np.array(
         [settings.search_px * pixel_um] * 2

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame
@@ -114,9 +113,11 @@ def check_of(
     dark_dn, channels: (y, x), as `Levels.corrected`'s. turn_deg: of the white board.
     """
     board = f"{'masks in' if masks_in else 'without masks'}, turned by {turn_deg:g}"
+    # Hot pixels saturate, and would bend the mean. scipy.stats loads for a second: here only.
+    from scipy.stats import trim_mean
+
     above = (frame.mean_dn - dark_dn).astype(np.float64)
     means = tuple(
-        # Hot pixels saturate, and would bend the mean.
         float(trim_mean(above[channels == c], TRIMMED)) if (channels == c).any() else np.nan
         for c in range(CHANNELS)
     )

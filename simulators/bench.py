@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.bands import row_kernel
@@ -297,7 +297,7 @@ class Bench:
         self._sensor, self._board, self._lamp, self._seconds = sensor, board, lamp, seconds
         axes = 4 if self._errors.edge_blur_um == 0 else 6
         self._points = ray_points(views, rays_per_view, axes)
-        self._points[..., 4:] = norm.ppf(self._points[..., 4:])
+        self._points[..., 4:] = ndtri(self._points[..., 4:])
         lens = camera.lens
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
         self._falloff = optics.falloff(size, views, lengths_um)

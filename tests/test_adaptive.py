@@ -20,7 +20,7 @@ from reconstruction.adaptive.models import MODELS
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
-from reconstruction.adaptive.search import Volume, per_pixel
+from reconstruction.adaptive.search import Volume, per_pixel, variance_per_pixel
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.texture import fitted
@@ -280,6 +280,31 @@ def test_weak_textures_that_prefer_no_disparity_do_not_make_the_evidence_flat():
     assert method._decided(volume) == 1
     assert method._decided(replace(volume, decisive=kind < 0)) == 0
     assert method._decided(replace(volume, kind=np.ones((4, 5), int))) is None
+
+
+def test_corners_of_a_second_grid_lie_between_and_cover_the_same_pixels():
+    patches = EvidencePatches(side=8, stride=6)
+    rows, columns = patches.grid((30, 32), first=3)
+    assert rows.tolist() == [0, 3, 9, 15, 21, 22]
+    assert columns.tolist() == [0, 3, 9, 15, 21, 24]
+    assert patches.grid((30, 32))[0].tolist() == [0, 6, 12, 18, 22]
+
+
+def test_beliefs_of_two_grids_are_averaged_where_they_disagree():
+    labels, own = np.array([0.0, 0.25, 1.0]), np.zeros((2, 2, 3), np.float32)
+    own[..., 0] = 1
+    other = np.zeros((2, 2, 3), np.float32)
+    other[..., 1:] = 0.8, 0.2
+    at, kind = (np.array([1.0, 5.0]),) * 2, np.zeros((2, 2), int)
+    between = Volume(labels, (at[0] + 1, at[1] + 1), other, other, kind, kind == 0)
+    volume = Volume(labels, at, own, own, kind, kind == 0, between=between)
+    # 0 is the likeliest, 1/2, and 0.25, 0.4, lies beside it; 1 is another surface.
+    expected = 0.25 * 0.4 / 0.9
+    np.testing.assert_allclose(per_pixel(volume, (7, 7), 1), expected, rtol=1e-5)
+    mean = 0.4 * 0.25 + 0.1
+    variance = 0.4 * 0.25**2 + 0.1 - mean**2
+    np.testing.assert_allclose(variance_per_pixel(volume, (7, 7), 1), variance, rtol=1e-5)
+    assert np.all(per_pixel(replace(volume, between=None), (7, 7), 1) == 0)
 
 
 def quick():

@@ -26,7 +26,6 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.result_figure import FigureSettings, draw_results
 from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.missed import missed_readings
@@ -34,6 +33,8 @@ from reconstruction.verdict.rules import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from emmc_rig.pages.result_figure import FigureSettings
 
 
 def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
@@ -177,12 +178,16 @@ class Result:
 
         truth: the true light field (v, u, y, x, c). settings: what is shown of each.
         """
+        from emmc_rig.pages.result_figure import draw_results  # matplotlib loads for a second
+
         results = [self._export(truth), *(one._export() for one in others)]
         return draw_results(results, settings).figure
 
     def show(self) -> Figure:
         """Return `figure()`, in a window where matplotlib has one; notebooks show it themselves."""
         from matplotlib import pyplot
+
+        from emmc_rig.pages.result_figure import draw_results
 
         figure = draw_results([self._export()], figure=pyplot.figure()).figure
         if getattr(type(figure.canvas), "required_interactive_framework", None):

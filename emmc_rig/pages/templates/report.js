@@ -484,15 +484,6 @@ function prepareControls() {
   if (data.error) byId("error-scale").textContent = `${data.error.scale} and more`;
 }
 
-// Draws what is below the fold when it comes near the screen, or goes to the printer.
-function whenSeen(element, draw) {
-  const seen = () => { watch.disconnect(); removeEventListener("beforeprint", seen); draw(); };
-  const watch = new IntersectionObserver(
-    (entries) => entries.some((one) => one.isIntersecting) && seen(), { rootMargin: "300px" });
-  watch.observe(element);
-  addEventListener("beforeprint", seen);
-}
-
 async function main() {
   prepareControls();
   await viewerShown; // what is seen first comes first
@@ -508,7 +499,7 @@ async function main() {
   drawEpi();
   drawError();
   byId("refocus-value").textContent = (+byId("refocus-slider").value).toFixed(2);
-  whenSeen(byId("refocus"), () => drawRefocus("full"));
+  (window.requestIdleCallback ?? setTimeout)(() => drawRefocus("full")); // below what is seen first
   await Promise.all(frames);
   document.documentElement.dataset.ready = "yes";
 }
