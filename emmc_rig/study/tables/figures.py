@@ -238,8 +238,7 @@ def _busiest(epi: Array, width: int) -> int:
 def _figure_8(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> PaperFigure:
     seen, (method,) = _Seen(part, run, corner=True), part.pictured
     (piece,) = seen.pieces
-    codes = seen.curve.encode(seen.true.corner)
-    tiles = [Tile("true", codes, [CloseUp(piece.of(codes), FRAMES[0], piece)])]
+    tiles = [seen.corner("true", seen.true)]
     for capture in part.captures:
         cell = Cell(seen.scene, capture, method)
         found = seen.curve.encode(seen.kept(cell).corner)
@@ -253,7 +252,7 @@ def _figure_8(part: Part, run: TablesSweep, results: Mapping[Cell, dict]) -> Pap
     return seen.drawn(
         [Row(tiles)],
         f"By {METHOD_TITLES[method]}. Top-left view; below, {MASK_CELLS}x{MASK_CELLS} cells of the "
-        "mask, and the framed piece.",
+        "mask, and the framed piece; of the true view, that piece there and in the centre view.",
     )
 
 
