@@ -295,9 +295,9 @@ def test_beliefs_of_two_grids_are_averaged_where_they_disagree():
     own[..., 0] = 1
     other = np.zeros((2, 2, 3), np.float32)
     other[..., 1:] = 0.8, 0.2
-    at, kind = (np.array([1.0, 5.0]),) * 2, np.zeros((2, 2), int)
-    between = Volume(labels, (at[0] + 1, at[1] + 1), other, other, kind, kind == 0)
-    volume = Volume(labels, at, own, own, kind, kind == 0, between=between)
+    grid, kind = np.array([1.0, 5.0]), np.zeros((2, 2), int)
+    between = Volume(labels, (grid + 1, grid + 1), other, other, kind, kind == 0)
+    volume = Volume(labels, (grid, grid), own, own, kind, kind == 0, between=between)
     # 0 is the likeliest, 1/2, and 0.25, 0.4, lies beside it; 1 is another surface.
     expected = 0.25 * 0.4 / 0.9
     np.testing.assert_allclose(per_pixel(volume, (7, 7), 1), expected, rtol=1e-5)
