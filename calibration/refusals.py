@@ -35,8 +35,8 @@ noise it is below 0.01."""
 LARGEST_LEAK = 0.01
 """Of a whiteboard's light in a dark frame; the dark current of a hot sensor is a tenth of it."""
 LARGEST_MISS = 0.08
-"""Of a held-out whiteboard's level; a bench of 64 rays, the grainiest that was tried, has 6 % where 3x3 views are
-fitted to 32x40 samples, else 4 %."""
+"""Of a held-out whiteboard's level; a bench of 64 rays, the grainiest that was tried, has 4 %, with
+3x3 views of 32x40 samples 6 %."""
 BRIGHTNESS_DIFFERS = 0.05
 ALIKE_BRIGHTNESS, ALIKE_UM = 0.2, 5.0
 """By how much one whiteboard may differ from the others with the mask in one place: a lamp that
