@@ -67,7 +67,7 @@ def refuse_unfit(sets: Sequence[BoardSet]) -> None:
     for one in sets:
         _refuse_lit_darks(one)
         for (_, lamp), frame in one.references.items():
-            above = frame.mean_dn - one.dark_at(frame.exposure_s).mean_dn
+            above = _above_dn(frame, one)
             brightest = max(np.median(above[y::2, x::2]) for y, x in np.ndindex(2, 2))
             if float(brightest) < DARKEST_REFERENCE_DN:
                 raise CalibrationError(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from emmc_rig.errors import AppError
-from emmc_rig.files.shards import stored_shards
+from emmc_rig.files.shards import stored_shards, whole
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 
@@ -29,10 +27,11 @@ def read_frames(folder: Path) -> Frames:
         )
     with (stored_shards if sharded else stored_arrays)(path, AppError, AGAIN) as stored:
         names = ("readings", "deviation", "usable")
-        readings, deviation, usable = (stored.array(name) for name in names)
+        arrays = [stored.array(name) for name in names]
+    if sharded:
+        arrays = [whole(values, path, AppError, AGAIN) for values in arrays]
+    readings, deviation, usable = arrays
     usable = usable.astype(bool)
     if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
         raise AppError(f"{path}: readings, deviation and usable differ in shape")
-    if sharded and np.isnan(readings).any():
-        raise AppError(f"{path}: a file of it is missing; copy the folder again, or {AGAIN}")
     return Frames(readings, deviation, usable)

@@ -12,15 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.files.frames import PSI
-from emmc_rig.files.shards import CHUNK, SHARD, StoredGroup, created_group, stored_shards
+from emmc_rig.files.shards import (
+    CHUNK,
+    SHARD,
+    StoredGroup,
+    created_group,
+    missing_value,
+    stored_shards,
+    whole,
+)
 from emmc_rig.model.errors import SensingError
-from emmc_rig.model.reading import shown_path, stored_arrays
+from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"
-NO_COLOUR = 255
-"""Where the colours of a Zarr group are missing."""
 
 
 class SavedPsi:
@@ -98,13 +104,7 @@ class ShardedPsi(SavedPsi):
         return self.window(*(slice(0, length) for length in self.size))
 
     def _whole(self, values: NDArray) -> NDArray:
-        gone = np.isnan(values) if values.dtype.kind == "f" else values == NO_COLOUR
-        if gone.any():
-            raise SensingError(
-                f"{shown_path(self._path)}: a file of it is missing; copy the folder again, or "
-                f"{AGAIN}"
-            )
-        return values
+        return whole(values, self._path, SensingError, AGAIN)
 
     def _file(self) -> AbstractContextManager[StoredGroup]:
         return stored_shards(self._path, SensingError, AGAIN)
@@ -126,14 +126,14 @@ def save_shards(psi: ImagingMatrix, folder: Path) -> None:
     shots, v, u, _, stored, _ = psi.weights.shape
     arrays = {
         "weights": (psi.weights, (1, 1, 1, CHUNK, stored, CHUNK),
-                    (shots, v, u, SHARD, stored, SHARD), np.nan),
-        "colour": (psi.colour, (1, CHUNK, CHUNK), (shots, SHARD, SHARD), NO_COLOUR),
+                    (shots, v, u, SHARD, stored, SHARD)),
+        "colour": (psi.colour, (1, CHUNK, CHUNK), (shots, SHARD, SHARD)),
     }  # fmt: skip
-    for name, (values, chunks, shards, missing) in arrays.items():
+    for name, (values, chunks, shards) in arrays.items():
         if values is not None:
             made = group.create_array(
                 name, shape=values.shape, dtype=values.dtype, chunks=chunks, shards=shards,
-                fill_value=missing,
+                fill_value=missing_value(values.dtype),
             )  # fmt: skip
             made[...] = values
     group.attrs.update(

@@ -15,6 +15,7 @@ from emmc_rig.model.lightfield import check_light_field
 from emmc_rig.model.reading import one_line, shown_path
 
 ENDING = ".zarr"
+MISSING_BYTE = 255
 CHUNK, SHARD = 128, 512
 """Samples a side of what is read at once, and of one file."""
 
@@ -34,13 +35,28 @@ def created_group(folder: Path) -> Any:
     return _zarr().create_group(folder, zarr_format=3)
 
 
+def missing_value(dtype: np.dtype) -> float:
+    """Return what is read where the file of a shard is missing: NaN, of bytes MISSING_BYTE."""
+    return np.nan if dtype.kind == "f" else MISSING_BYTE if dtype == np.uint8 else 0
+
+
+def whole(values: NDArray, folder: Path, error: type[Exception], remedy: str) -> NDArray:
+    """Return values that were read from floats or bytes; raises `error` where some are missing."""
+    gone = np.isnan(values) if values.dtype.kind == "f" else values == MISSING_BYTE
+    if gone.any():
+        raise error(
+            f"{shown_path(folder)}: a file of it is missing; copy the folder again, or {remedy}"
+        )
+    return values
+
+
 def create_array(
     group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype, axes: int
 ) -> list[Place]:
     """Create an array with `axes` axes before (y, x); return the places of its shards.
 
-    A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK. Floating
-    values read as NaN where the file of a shard is missing.
+    A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK. Where the
+    file of a shard is missing, values are as `whole` expects.
     """
     after = shape[axes + 2 :]
     group.create_array(
@@ -49,7 +65,7 @@ def create_array(
         dtype=dtype,
         chunks=(*(1,) * axes, CHUNK, CHUNK, *after),
         shards=(*shape[:axes], SHARD, SHARD, *after),
-        fill_value=np.nan if dtype.kind == "f" else 0,
+        fill_value=missing_value(dtype),
     )
     rows, columns = shape[axes : axes + 2]
     return [
@@ -62,11 +78,12 @@ def create_array(
 def save_arrays(folder: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write arrays (shot, y, x) as a group into a folder that must not exist; others as attributes.
 
-    Raises AppError without Zarr.
+    What is true or false is written as bytes. Raises AppError without Zarr.
     """
     group = created_group(folder)
     for name, values in arrays.items():
         if values.ndim == 3:
+            values = values.astype(np.uint8) if values.dtype == bool else values
             create_array(group, name, values.shape, values.dtype, 1)
             group[name][...] = values
         else:

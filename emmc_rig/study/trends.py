@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from emmc_rig.model.errors import CameraError
 from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.running import Asked, Show
@@ -67,7 +65,7 @@ class TrendSweep(Sweep[Point]):
         setup = self._setup(point)
         return {
             "scene": point.scene,
-            "sum": float(np.sum(setup.scene_seen().light_field, dtype=np.float64)),
+            "content": setup.content(),
             "size": setup.size,
             "seed": setup.seed,
             "camera": setup.camera.model_dump(mode="json"),
@@ -84,7 +82,7 @@ class TrendSweep(Sweep[Point]):
 
 
 def fall_db(better_and_better: Sequence[float]) -> float:
-    """Return by how much the PSNR falls at most from one capture to any better one; 0 if never."""
+    """Return by how much the PSNR falls at most to any better capture; below 0: it always rises."""
     return max(
         (
             worse - better

@@ -68,6 +68,14 @@ class Setup:
             return _opened(self.scene, self.size, views, self.seed, self.zoom)
         return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
 
+    def content(self) -> list[float] | None:
+        """Return what identifies a measured scene beside its name; a built-in one has its seed."""
+        if self.is_built_in:
+            return None
+        seen = self.scene_seen().light_field
+        squares = np.square(seen, dtype=np.float64)
+        return [float(np.sum(one, dtype=np.float64)) for one in (seen, squares)]
+
     def with_camera(self, **changed: object) -> Setup:
         """Return the setup with some fields of the camera replaced."""
         return dataclasses.replace(self, camera=self.camera.model_copy(update=changed))

@@ -272,9 +272,4 @@ def _settings(point: Point, binning: int = 1) -> MethodSettings:
 def _content(
     scene: str, camera: str, size: tuple[int, int] | None, seed: int
 ) -> list[float] | None:
-    """Return what identifies a measured scene beside its name; a built-in one has its seed."""
-    setup = Setup(scene, find_camera(camera), size, seed)
-    if setup.is_built_in:
-        return None
-    seen = setup.scene_seen().light_field
-    return [float(np.sum(seen, dtype=np.float64)), float(np.sum(np.square(seen, dtype=np.float64)))]
+    return Setup(scene, find_camera(camera), size, seed).content()
