@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from moved_mask import CAMERA
 
 from calibration.drift import (
     KINDS,
@@ -32,21 +33,11 @@ from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
+from emmc_rig.model.camera import build_imaging_matrix, psi_layout
 from simulators.bench import MountingErrors
 from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
 
 SIZE = (64, 80)
-CAMERA = Camera.model_validate(
-    {
-        "title": "test",
-        "views": [3, 3],
-        "lens": {"aperture_cell_mm": 8.0},
-        "sensor": {"cfa": "rggb"},
-        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
-        "more_shots_step_um": {"code": (270, 162)},
-    }
-)
 MOUNTING = MountingErrors((12.0, -7.0), 0.05, 1.0005, edge_blur_um=2.0)
 QUICK = DriftSettings(blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6)
 

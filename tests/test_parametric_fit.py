@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from moved_mask import CAMERA
 
 from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
@@ -22,22 +23,12 @@ from emmc_rig.calibrate.bench import (
     Setting,
     WhiteboardBench,
 )
-from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.camera import build_imaging_matrix
 from simulators.bench import MountingErrors
 
 SIZE = (44, 60)
 VIEWS = (3, 3)
 MOUNTING = MountingErrors((31.0, -22.0), 0.15, 1.002, 0.0008, 0.05, 1.0, 3.0)
-CAMERA = Camera.model_validate(
-    {
-        "title": "test",
-        "views": VIEWS,
-        "lens": {"aperture_cell_mm": 8.0},
-        "sensor": {"cfa": "rggb"},
-        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
-        "more_shots_step_um": {"code": (270, 162)},
-    }
-)
 FEW = [
     Setting(repeats=4),
     Setting(stage_um=(270.0, 162.0), repeats=4),

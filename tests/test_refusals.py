@@ -5,25 +5,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from moved_mask import CAMERA
 
 from calibration.errors import CalibrationError
 from calibration.routes import calibrate
 from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
 from emmc_rig.calibrate.board_plan import STAGE_KINDS_UM, held_out_settings
-from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.camera import build_imaging_matrix
 from simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)
-CAMERA = Camera.model_validate(
-    {
-        "title": "test",
-        "views": [3, 3],
-        "lens": {"aperture_cell_mm": 8.0},
-        "sensor": {"cfa": "rggb"},
-        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
-        "more_shots_step_um": {"code": (270, 162)},
-    }
-)
 TRUTH = BenchTruth(rays_per_view=128)
 VIEW = (0, 1)
 OPEN = [Setting(stage_um=stage_um) for stage_um in STAGE_KINDS_UM]
