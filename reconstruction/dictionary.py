@@ -247,6 +247,12 @@ def lambertian_dictionary(
     return Dictionary.normalised(_coloured(sets), "lambertian")
 
 
+def usual_patch(binning: int) -> tuple[int, int]:
+    """Return rows and columns of a patch: 9 samples, or the nearest multiple of k below."""
+    side = 9 // binning * binning or binning
+    return side, side
+
+
 def plane_disparities(views: tuple[int, int], patch: tuple[int, int]) -> tuple[float, ...]:
     """Return disparities in steps of a pixel in the outermost view, +-2 or what a patch can show.
 

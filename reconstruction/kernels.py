@@ -26,10 +26,6 @@ NO_SHARE = np.zeros((0, 0), dtype=np.float32)
 NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
 
 
-NO_SHARE = np.zeros((0, 0), dtype=np.float32)
-NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
-
-
 class Data(NamedTuple):
     """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k.
 

@@ -10,8 +10,9 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -31,18 +32,23 @@ from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.flat import flat_psi
 from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
+from reconstruction.methods.surfaces import sparse_patches, takes_patches
 from reconstruction.methods.tv_dict import patched_weights
 from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.screening import screened
+from reconstruction.sparse import SparseSettings
 from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
 REACH = 48
 """Samples of halo for methods that carry information from sample to sample: steps of the
 variational methods move it by one, and what lies further hardly matters."""
-TEXTURE_REACH = 16
-"""Pixels of halo for `adaptive` beyond the parallax: patches, stacks of blocks, windows."""
+TEXTURE_REACH, PATCHED_REACH = 16, 40
+"""Pixels of halo for `adaptive` beyond the parallax: patches, stacks of blocks, windows; the second
+where sparse patches are averaged with, by windows twice as wide. With 16 a smooth scene of two
+shots lost 1.7 dB in blocks of 48 samples, and 5 in blocks of 80."""
 STEPS = 100
 """Of the variational methods, in every block alike; the rule by change would differ between
 blocks."""
@@ -384,6 +390,7 @@ def surveyed(
         words = found.notes[: len(found.notes) - bool(found.bad.any())]
         read, use = found.frames, found.usable
     halo, largest = REACH, 0.0
+    patched = name == "adaptive" and takes_patches(mosaic, settings.adaptive)
     if method.settings is AdaptiveSettings:
         firsts = np.cumsum([0, *(one.frames_shape[2] for one in windows)])
         disparities = []
@@ -394,7 +401,8 @@ def surveyed(
                     _sample_disparity(window, read[part], noise_sigma, use[part], settings, place)
                 )
         largest = max((one.largest_px for one in disparities), default=0.0)
-        halo = TEXTURE_REACH * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
+        reach = PATCHED_REACH if patched else TEXTURE_REACH
+        halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
         flat = flat_psi(mosaic)
         picture = smooth_guess(flat, read, use).astype(np.float32)
         noise = np.full(read.shape, noise_sigma**2)
@@ -412,9 +420,10 @@ def surveyed(
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    settled = _settled(
-        mosaic, read, noise_sigma, use, settings, name in ("tv-dict", "adaptive-dict")
-    )
+    sparse = settings.sparse if name == "tv-dict" else None
+    if patched:
+        sparse = sparse_patches(settings.sparse, k)
+    settled = _settled(mosaic, read, noise_sigma, use, settings, sparse)
     return Survey(settled, halo, left_out, gains, words, largest)
 
 
@@ -435,14 +444,17 @@ def _settled(
     noise_sigma: float,
     usable: NDArray[np.bool_],
     settings: MethodSettings,
-    patched: bool,
+    sparse: SparseSettings | None,
 ) -> MethodSettings:
-    """Return the settings with what a block would choose for itself chosen for all of them."""
+    """Return the settings with what a block would choose for itself chosen for all of them.
+
+    sparse: settings of the patches, of methods that draw total variation towards some.
+    """
     readings, tv = frames[usable], settings.tv
     if not readings.size:
         return settings
-    if patched:
-        tv = patched_weights(tv, settings.sparse, psi, readings, noise_sigma)
+    if sparse is not None:
+        tv = patched_weights(tv, sparse, psi, readings, noise_sigma)
     mu = tv.mu or choose_mu(psi, readings, noise_sigma, tv.order)
     guess = smooth_guess(psi, frames, usable)
     step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight, tv.order)
@@ -522,25 +534,40 @@ def summed_up(
     for key, extreme in (("lowest_px", min), ("highest_px", max)):
         if key in each:
             parameters[key] = extreme(each[key])
-    # Of what no place can be told for the whole, the verdict tells the block.
+    # Where the whole has no single place, the verdict names the block.
     for key in ("misfit_row", "misfit_column"):
         parameters.pop(key, None)
-    left_out = [line for one in solved for line in one.left_out]
-    words = dict.fromkeys(left_out)
+    count = len(solved)
     return Reconstruction(
         method=name,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         status=Status.IN_TILES,
-        advice="; ".join(dict.fromkeys(one.advice for one in solved if one.advice)),
+        advice="; ".join(in_few_words([[one.advice] for one in solved if one.advice], count)),
         steps=sum(one.steps for one in solved),
         objective=(),
         seconds=seconds,
         parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},
-        left_out=tuple(
-            f"{line}, in {left_out.count(line)} of {len(solved)} blocks" for line in words
-        ),
+        left_out=tuple(in_few_words([one.left_out for one in solved], count)),
         screening=survey.words,
     )
+
+
+def in_few_words(said: Sequence[Sequence[str]], blocks: int) -> list[str]:
+    """Return lines that blocks have in common, each once, with the range of its numbers.
+
+    said: the lines of each block; blocks: how many there are in all.
+    """
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for line in (line for lines in said for line in lines):
+        alike.setdefault(tuple(NUMBER.split(line)), []).append(line)
+    merged = []
+    for parts, lines in alike.items():
+        numbers = zip(*(NUMBER.findall(line) for line in lines), strict=True)
+        spans = [sorted(set(each), key=float) for each in numbers]
+        ends = [f"{span[0]} to {span[-1]}" if len(span) > 1 else span[0] for span in spans]
+        whole = "".join(part for pair in zip(parts, [*ends, ""], strict=True) for part in pair)
+        merged.append(f"{whole}, in {len(lines)} of {blocks} blocks")
+    return merged
 
 
 def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:

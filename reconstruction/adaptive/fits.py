@@ -21,29 +21,31 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """The models of surfaces, another if it is asked for, and total variation last if it is one.
+    """The models of surfaces, and last one without any: sparse patches, total variation, or none.
 
     light_fields: (v, u, y, x, c) of each; residuals: frames less what each predicts, (shot,
-    pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's scale.
+    pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's scale. patched:
+    whether the last are patches.
     """
 
     light_fields: list[Array]
     residuals: list[Array]
     scene: Scene
+    patched: bool
 
 
 def fitted_models(
     survey: Survey,
     settings: AdaptiveSettings,
     on_step: Callable[[int], None],
-    other: Callable[[NDArray[np.bool_]], Array] | None = None,
+    patches: Callable[[NDArray[np.bool_]], Array] | None = None,
 ) -> Fits:
-    """Return a fit for each of `settings.misfits`, what `other` finds, and total variation's.
+    """Return a fit for each of `settings.misfits`, and of patches, or of total variation.
 
     All fits but the last search the disparity again with their texture (`sweep`); where that leads
     astray the last one, which keeps what the patches agreed on, predicts held-out readings better.
-    on_step: called with the number of steps done. other: returns a light field by another method,
-    given which readings to fit.
+    on_step: called with the number of steps done. patches: returns their light field, given which
+    readings to fit.
     """
     given, bright, held, model = survey.given, survey.bright, survey.held, survey.model
     scale = np.float32(survey.scale)
@@ -85,13 +87,13 @@ def fitted_models(
         np.clip(seen, 0, 1, out=seen)
         light_fields.append(np.broadcast_to(seen, given.psi.light_field_shape))
     assert scene is not None
-    if other is not None:
-        light_fields.append(other(given.usable & ~held))
-        residuals.append(given.frames - given.psi.forward(light_fields[-1]))
-    if settings.free:
+    if patches is not None:
+        light_fields.append(patches(given.usable & ~held))
+    elif settings.free:
         light_fields.append(survey.plain)
-        residuals.append(given.frames - given.psi.forward(survey.plain))
-    return Fits(light_fields, residuals, scene)
+    for light_field in light_fields[len(settings.misfits) :]:
+        residuals.append(given.frames - given.psi.forward(light_field))
+    return Fits(light_fields, residuals, scene, patches is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +119,8 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
         shares[0] = 1
         return Mean(fits.light_fields[0], shares, None)
     k = given.psi.binning
-    shares = mixture.shares_of(fits.residuals, given.noise, held)
+    rule = mixture.beside_patches if fits.patched else mixture.shares_of
+    shares = rule(fits.residuals, given.noise, held)
     light_field = mixture.mean_light_field(fits.light_fields, shares, k)
     spread = mixture.spread(fits.light_fields, light_field, shares, k)
     fits.light_fields.clear()

@@ -11,9 +11,9 @@ Edges that views do not reach are separated from the scene first (`edges`).
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `texture`, `shrinkage`, `refine`, `sweep`).
-5. Textures that follow the readings more or less closely, and total variation, are averaged by
-   how well they predict readings kept from all of them (`fits`, `mixture`), which also calibrate
-   the standard deviation of the result (`uncertainty`).
+5. Textures that follow the readings more or less closely, and total variation or, from two shots
+   on, sparse patches, are averaged by how well they predict readings kept from all of them (`fits`,
+   `mixture`), which also calibrate the standard deviation of the result (`uncertainty`).
 6. The residual is explained by a light field of its own, if those readings speak for it (`rest`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
@@ -68,15 +68,15 @@ def reconstruct_adaptive(
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     disparity: Array | None = None,
-    other: Callable[[NDArray[np.bool_]], Array] | None = None,
+    patches: Callable[[NDArray[np.bool_]], Array] | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
-    it is known, in place of the one searched. other: returns a light field (v, u, y, x, c) to
-    average with, given which readings to fit. Raises ReconstructionError for inputs that do not
-    fit each other.
+    it is known, in place of the one searched. patches: returns a light field (v, u, y, x, c) of
+    sparse patches to average with in place of total variation's, given which readings to fit.
+    Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
     started = clock()
@@ -96,7 +96,7 @@ def reconstruct_adaptive(
     if edges is not None:
         given = replace(given, usable=given.usable & ~edges.within)
     survey = surveyed(given, settings, known, report)
-    fits = fitted_models(survey, settings, lambda step: report(2 + step), other)
+    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches)
     mean = averaged(survey, fits)
     light_field = (
         with_rest(survey, mean.light_field, settings) if settings.rest else (mean.light_field)
@@ -106,7 +106,7 @@ def reconstruct_adaptive(
     if edges is not None:
         light_field = faded(edges, given.psi, light_field, whole.frames, whole.usable)
     maps = _maps(survey, fits, mean, settings)
-    warnings = _warnings(survey, mean, misfit, settings)
+    warnings = _warnings(survey, fits, mean, misfit, settings)
     report(total)
     shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
     decided, explained = _decided(survey.volume), _explained(survey, fits, settings)
@@ -147,7 +147,7 @@ def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) ->
     size, k = survey.given.psi.size, survey.given.psi.binning
     kinds = texture_map(survey.volume, size, k)
     models = model_map(kinds, fits.scene)
-    if settings.free:
+    if settings.free or fits.patched:
         models[_free(mean).repeat(k, axis=0).repeat(k, axis=1)] = MODELS.index("free")
     maps = {
         "disparity": fits.scene.centre,
@@ -160,7 +160,7 @@ def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) ->
 
 
 def _free(mean: Mean) -> NDArray[np.bool_]:
-    """Return the pixels (y, x) that are mostly total variation's, the last of the models."""
+    """Return the pixels (y, x) that are mostly no surfaces', the last of the models."""
     return mean.shares[-1] > MOSTLY
 
 
@@ -187,7 +187,9 @@ def _decided(volume: search.Volume) -> float | None:
     return float(volume.decisive[textured].mean()) if textured.any() else None
 
 
-def _warnings(survey: Survey, mean: Mean, misfit: Misfit, settings: AdaptiveSettings) -> list[str]:
+def _warnings(
+    survey: Survey, fits: Fits, mean: Mean, misfit: Misfit, settings: AdaptiveSettings
+) -> list[str]:
     """Return what the user should know before trusting the result."""
     given, volume, decided = survey.given, survey.volume, _decided(survey.volume)
     warnings = []
@@ -208,7 +210,7 @@ def _warnings(survey: Survey, mean: Mean, misfit: Misfit, settings: AdaptiveSett
             f"the masks show in the readings at {max(float(strengths.min()), 0):.0%} of the "
             "strength that Psi says: Psi may not be theirs"
         )
-    free = float(np.mean(_free(mean))) if settings.free else 0.0
+    free = float(np.mean(_free(mean))) if settings.free and not fits.patched else 0.0
     if free > MOSTLY:
         warnings.append(
             f"held-out readings speak against surfaces in {free:.0%} of the picture, where total "

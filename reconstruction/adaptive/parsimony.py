@@ -115,7 +115,7 @@ def _fitted(disparity: Array, rows: Array, columns: Array) -> Array:
 def plane_bound_db(plane: Plane, volume: Volume, pixels: tuple[int, int], picture: Array) -> float:
     """Return the PSNR that the relief left out allows: what the patches' own disparities say.
 
-    picture: (y, x, c), its slopes tell what a wrong disparity costs.
+    picture: (y, x, c), its slopes show what a wrong disparity costs.
     """
     mean = volume.probability @ volume.disparities
     rows, columns = (np.rint(at).astype(int) for at in volume.centres)

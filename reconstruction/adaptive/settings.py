@@ -60,6 +60,9 @@ class AdaptiveSettings(Settings):
     free: bool = Field(
         default=True, description="average with total variation where it explains the frames"
     )
+    patches: int | None = Field(
+        default=2, ge=1, description="shots from which sparse patches take its place; none: never"
+    )
     rest: bool = Field(
         default=True, description="add a light field of the residual, where held-out readings agree"
     )
@@ -88,6 +91,6 @@ def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
     quick = settings.texture.model_copy(
         update={"steps": 8, "refine_steps": 5, "block_step": 6, "sweeps": ()}
     )
-    coarser = {"step_px": 0.25, "lengths_px": (2.0,), "interleaved": False}
+    coarser = {"step_px": 0.25, "lengths_px": (2.0,), "interleaved": False, "patches": None}
     fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
     return settings.model_copy(update=coarser | fewer)

@@ -26,11 +26,12 @@ def conjugate_gradients(
             break
         applied = apply(direction)
         step = np.float32(square / float(np.vdot(direction, applied)))
-        x += step * direction
-        residual -= step * applied
+        # Not x += ...: pyright follows what a loop rebinds, here for 12 s.
+        np.add(x, step * direction, out=x)
+        np.subtract(residual, step * applied, out=residual)
         before, square = square, float(np.vdot(residual, residual))
-        direction *= np.float32(square / before)
-        direction += residual
+        np.multiply(direction, np.float32(square / before), out=direction)
+        np.add(direction, residual, out=direction)
     return x
 
 

@@ -1,4 +1,4 @@
-"""What readings tell of textures on one or two planes, on periodic blocks: fast enough to search.
+"""What readings show of textures on one or two planes, on periodic blocks: fast enough to search.
 
 A texture T on a plane at disparity d reaches the ray of view u through sample x as T(x - d u) (see
 `adaptive.evidence`). On a torus of n x n samples T is a vector of n^2 values with a circulant prior
@@ -40,7 +40,7 @@ Array = NDArray[np.floating]
 SIDE = 16
 """Samples of a block along each axis: even, as colour filters repeat every two."""
 SEEN = 8
-"""Samples along each axis of the middle, whose readings tell the disparity."""
+"""Samples along each axis of the middle, whose readings show the disparity."""
 
 
 @dataclass(frozen=True)

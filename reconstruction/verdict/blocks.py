@@ -74,7 +74,7 @@ def _combined(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
 
 
 def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
-    """Return what one block tells: the weakest masks, the largest hole, the most motion, misfit."""
+    """Return figures of the worst block of each kind: masks, hole, motion, misfit."""
     found: dict[str, Any] = {}
     e = [(block, block.verdict.evidence) for block in blocks]
     weak = [

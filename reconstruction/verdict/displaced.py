@@ -24,7 +24,8 @@ STEP_PX = 0.25
 DISTANCE_STEP = 0.1
 VIGNETTING_STEP = 0.3
 ALIKE = 0.5
-"""Correlation below which the design says nothing about a Psi."""
+"""Correlation below which the design says nothing about a Psi. 2x flags two broken results fewer of
+13."""
 DECOYS_PX = (36, 12), (-24, 48), (36, -36), (-24, -24)
 """By how much derivatives are moved (y, x) so that they mean nothing: further than masks correlate,
 and by whole tiles of colour filters of 2, 3, 4 and 6 pixels."""

@@ -10,7 +10,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
 WINDOW_PX = 9
-"""Side of the square that a place is judged by: 81 readings a shot tell 1 from 1.25 times."""
+"""Side of the square that a place is judged by: 81 readings a shot distinguish 1 from 1.25."""
 
 
 def missed_readings(
