@@ -3,7 +3,7 @@
 What the camera lets through of a view stays when the board is turned by 90 degrees; what the board
 sends into it turns. With the board's radiance 1 + sum_k c_k t_k(u, v), t the gradients and the
 saddles over the aperture, the same open whiteboard after the turn reads
-sum_j psi_j (1 + sum_k c_k (t_k(turned u_j) - t_k(u_j))): linear in c, and the views' shadows tell
+sum_j psi_j (1 + sum_k c_k (t_k(turned u_j) - t_k(u_j))): linear in c, and the views' shadows show
 the terms apart. What no turn changes, a board brighter in the middle than at the rim of the
 aperture, stays in Psi.
 """
@@ -11,12 +11,13 @@ aperture, stays in Psi.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards import Board
+from calibration.choice import white_by_view
 from calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -25,6 +26,8 @@ SIGNIFICANT = 4.0
 LEAST_UNEVENNESS = 1e-3
 ROUNDS = 4
 CLIP = 4.0
+SAMPLED = 500_000
+"""Pixels at most: of more the board's unevenness is known to 1e-5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +65,16 @@ def board_over_angle(psi: ImagingMatrix, turned: Mapping[float, Board]) -> Board
     squares = count = 0.0
     for turn_deg, board in turned.items():
         change = _terms(views, turn_deg) - upright
-        white = np.ones(psi.light_field_shape, dtype=psi.weights.dtype)
-        even = psi.forward(white)[board.shot].astype(np.float64)
-        parts = [
-            psi.forward(white * term[:, :, None, None, None].astype(white.dtype))[board.shot]
-            for term in change
-        ]
-        channels = np.unique(board.channels)
-        levels = [np.where(board.channels == c, even, 0) for c in channels]
-        use = board.usable
-        columns = np.stack([*(part[use] for part in parts), *(one[use] for one in levels)], axis=1)
-        deviation = np.sqrt(board.variance[use].astype(np.float64))
-        scaled, value = columns / deviation[:, None], board.reading[use] / deviation
+        use = np.flatnonzero(board.usable)
+        if len(use) > SAMPLED:
+            use = np.sort(np.random.default_rng(0).choice(use, SAMPLED, replace=False))
+        seen = board.channels.ravel()[use]
+        by_view = np.stack([one.ravel()[use] for one in white_by_view(psi, board.shot)], axis=1)
+        even = by_view.sum(axis=1)
+        levels = [np.where(seen == c, even, 0) for c in np.unique(seen)]
+        columns = np.column_stack([by_view @ change.reshape(size, -1).T, *levels])
+        deviation = np.sqrt(board.variance.ravel()[use].astype(np.float64))
+        scaled, value = columns / deviation[:, None], board.reading.ravel()[use] / deviation
         weight = np.ones(len(value))
         left = value
         for _ in range(ROUNDS):
@@ -84,7 +85,7 @@ def board_over_angle(psi: ImagingMatrix, turned: Mapping[float, Board]) -> Board
             weight = (np.abs(left) < limit).astype(np.float64)
         squares += float((weight * left**2).sum())
         count += float(weight.sum())
-        # The levels of the colours are free: what is left tells the terms.
+        # The levels of the colours are free: what is left determines the terms.
         inside, outside = slice(0, size), slice(size, None)
         solved = np.linalg.solve(normal[outside, outside], normal[outside, inside])
         matrix += normal[inside, inside] - normal[inside, outside] @ solved
@@ -98,11 +99,12 @@ def board_over_angle(psi: ImagingMatrix, turned: Mapping[float, Board]) -> Board
     return BoardAngle(radiance / radiance.mean(), deviation, significance)
 
 
-def without(board: BoardAngle, known: Calibration) -> Calibration:
-    """Return a calibration as an even board would have given it."""
-    even = (1 / board.radiance)[None, :, :, None, None, None].astype(np.float32)
-    relative = (board.deviation / board.radiance)[None, :, :, None, None, None]
-    weights = known.psi.weights * even
-    deviation = np.sqrt(np.square(known.deviation * even) + np.square(weights * relative))
-    psi = replace(known.psi, weights=weights)
-    return replace(known, psi=psi, deviation=deviation.astype(np.float32))
+def take_out(board: BoardAngle, known: Calibration) -> None:
+    """Make a calibration what an even board would have given."""
+    weights, deviation = known.psi.weights, known.deviation
+    for shot, v, u in np.ndindex(*weights.shape[:3]):
+        radiance = board.radiance[v, u]
+        even = weights[shot, v, u] / radiance
+        spread = np.square(deviation[shot, v, u] / radiance)
+        spread += np.square(even * (board.deviation[v, u] / radiance))
+        weights[shot, v, u], deviation[shot, v, u] = even, np.sqrt(spread)

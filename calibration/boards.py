@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, photon_transfer
+from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from calibration.levels import Check, Levels
 from calibration.openings import CENTRED, Window, views_open
 from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
@@ -22,17 +23,29 @@ Array = NDArray[np.floating]
 class BoardFrame:
     """One whiteboard setting as captured: its mean frame, and how the bench stood.
 
-    stage_um: where the mask stage stood, x and y, from where the design centres the mask; with
-    the shot's own offset in it. pinhole: the one view (v, u) open, or None: those that the window
-    leaves open, moved by so many cells (x, y).
+    read: returns the mean frame; of a session, from its files each time, so that one whiteboard of
+    many is in memory. count: frames taken. stage_um: where the mask stage stood, x and y, from
+    where the design centres the mask; with the shot's own offset in it. pinhole: the one view (v,
+    u) open, or None: those that the window leaves open, moved by so many cells (x, y).
     """
 
-    frame: MeanFrame
+    read: Callable[[], MeanFrame]
+    count: int
     stage_um: tuple[float, float]
     shot: int = 0
     pinhole: tuple[int, int] | None = None
     lamp: str = "white"
     window: Window = CENTRED
+
+    @classmethod
+    def held(cls, frame: MeanFrame, *how: Any, **named: Any) -> BoardFrame:
+        """Return one whose mean frame is in memory; how, named: the fields from stage_um on."""
+        return cls(lambda: frame, frame.count, *how, **named)
+
+    @property
+    def frame(self) -> MeanFrame:
+        """Its mean frame, read now."""
+        return self.read()
 
     @property
     def name(self) -> str:
@@ -45,17 +58,17 @@ class BoardFrame:
 
 
 class _Lazily(Mapping[tuple[int, int, int, str], MeanFrame]):
-    """Frames changed as they are asked for, so that one at a time is held twice."""
+    """Frames read and changed as they are asked for, so that one is in memory."""
 
     def __init__(
         self,
-        frames: Mapping[tuple[int, int, int, str], MeanFrame],
+        frames: Mapping[tuple[int, int, int, str], BoardFrame],
         change: Callable[[MeanFrame], MeanFrame],
     ) -> None:
         self._frames, self._change = frames, change
 
     def __getitem__(self, key: tuple[int, int, int, str]) -> MeanFrame:
-        return self._change(self._frames[key])
+        return self._change(self._frames[key].frame)
 
     def __iter__(self) -> Iterator[tuple[int, int, int, str]]:
         return iter(self._frames)
@@ -70,7 +83,7 @@ class BoardSet:
 
     darks: lamp off, at one exposure or more; between two the dark current is drawn as a line.
     references[shot, lamp]: aperture open, masks out. checks: boards seen again and again, which
-    tell what lamp and response do meanwhile.
+    show what lamp and response do meanwhile.
     """
 
     darks: tuple[MeanFrame, ...]
@@ -109,8 +122,7 @@ class BoardSet:
         """How many frames were taken for it."""
         # One reference may serve several shots.
         references = {id(frame): frame for frame in self.references.values()}.values()
-        taken = [*self.darks, *references, *(one.frame for one in self.frames)]
-        return sum(frame.count for frame in taken)
+        return sum(one.count for one in (*self.darks, *references, *self.frames))
 
     def pinholes(self) -> Whiteboards:
         """Return what the free route takes: the frames through the pinhole."""
@@ -131,7 +143,7 @@ class BoardSet:
             {key: as_if_dark(frame) for key, frame in self.references.items()},
             _Lazily(
                 {
-                    (one.shot, *one.pinhole, one.lamp): one.frame
+                    (one.shot, *one.pinhole, one.lamp): one
                     for one in self.frames
                     if one.pinhole is not None
                 },
@@ -143,17 +155,27 @@ class BoardSet:
         """Return the same dark and reference frames with other whiteboards."""
         return replace(self, frames=tuple(frames))
 
-    def levelled(self, levels: Levels, channels: NDArray[np.uint8]) -> BoardSet:
-        """Return the frames as under a steady lamp and a straight response."""
+    def levelled(
+        self, levels: Levels, channels: NDArray[np.uint8], done: dict[int, MeanFrame]
+    ) -> BoardSet:
+        """Return the frames as under a steady lamp and a straight response.
+
+        done: references of other sets that were levelled, by the identity of what they were; those
+        of this one are added. Sets share them, and a large sensor's fill memory.
+        """
 
         def steady(frame: MeanFrame) -> MeanFrame:
             return levels.corrected(frame, self.dark_at(frame.exposure_s).mean_dn, channels)
 
-        references = {id(one): steady(one) for one in self.references.values()}
+        for one in self.references.values():
+            if id(one) not in done:
+                done[id(one)] = steady(one)
         return replace(
             self,
-            references={key: references[id(one)] for key, one in self.references.items()},
-            frames=tuple(replace(one, frame=steady(one.frame)) for one in self.frames),
+            references={key: done[id(one)] for key, one in self.references.items()},
+            frames=tuple(
+                replace(one, read=lambda one=one: steady(one.frame)) for one in self.frames
+            ),
         )
 
 
@@ -189,7 +211,14 @@ def gain_of(boards: BoardSet) -> SensorGain:
 def as_readings(
     boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
 ) -> list[Board]:
-    """Return the whiteboards as readings.
+    """Return the whiteboards as readings, as `each_reading` does."""
+    return list(each_reading(boards, layout, usable))
+
+
+def each_reading(
+    boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
+) -> Iterator[Board]:
+    """Yield the whiteboards as readings, each read as it is asked for.
 
     usable: (pixel_y, pixel_x), pixels known to be good; a pixel whose reference is not bright
     enough to divide by is left out as well. Raises CalibrationError for frames of another size,
@@ -198,48 +227,54 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found = []
     for one in boards.frames:
         reference = boards.references.get((one.shot, one.lamp)) or boards.references.get(
             (0, one.lamp)
         )
         if reference is None:
             raise CalibrationError(f"{one.name}: no reference whiteboard under that lamp")
-        for frame, what in ((one.frame, one.name), (reference, "reference"), (boards.dark, "dark")):
+        taken = one.frame
+        for frame, what in ((taken, one.name), (reference, "reference"), (boards.dark, "dark")):
             if frame.mean_dn.shape != expected:
                 raise CalibrationError(
                     f"{what}: a frame of {frame.mean_dn.shape[0]} x {frame.mean_dn.shape[1]} "
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        found.append(_board(one, reference, boards, gain, layout, good))
-    return found
+        yield _board(one, taken, reference, boards, gain, layout, good)
 
 
 def _board(
     one: BoardFrame,
+    frame: MeanFrame,
     reference: MeanFrame,
     boards: BoardSet,
     gain: SensorGain,
     layout: PsiLayout,
     good: NDArray[np.bool_],
 ) -> Board:
-    signal, signal_variance = _signal(one.frame, boards, gain)
-    white, white_variance = _signal(reference, boards, gain)
-    bright = white * reference.exposure_s > DARKEST_REFERENCE_DN
-    if bright.mean() < 0.5:
+    dark, dark_of_white = (boards.dark_at(each.exposure_s) for each in (frame, reference))
+    reading, variance = (np.empty(good.shape, dtype=np.float32) for _ in range(2))
+    bright = 0
+    for rows in bands(reading):
+        signal, signal_variance = _signal(frame, dark, gain, rows)
+        white, white_variance = _signal(reference, dark_of_white, gain, rows)
+        enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
+        bright += int(enough.sum())
+        safe = np.where(enough, white, 1)
+        ratio = signal / safe
+        spread = signal_variance / safe**2 + ratio**2 * white_variance / safe**2
+        reading[rows] = ratio
+        variance[rows] = np.where(enough & good[rows], spread, np.inf)
+    if bright < 0.5 * reading.size:
         raise CalibrationError(
             f"the reference whiteboard under the {one.lamp} lamp is less than "
             f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
         )
-    if float(np.median(signal)) * one.frame.exposure_s < DARKEST_REFERENCE_DN / 10:
+    if float(np.median(frame.mean_dn - dark.mean_dn)) < DARKEST_REFERENCE_DN / 10:
         raise CalibrationError(
             f"{one.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
         )
-    safe = np.where(bright, white, 1)
-    reading = signal / safe
-    variance = signal_variance / safe**2 + reading**2 * white_variance / safe**2
-    variance = np.where(bright & good, variance, np.inf)
     k = layout.binning
     if layout.colour is not None:
         channels = layout.colour[one.shot, ::k, ::k]
@@ -249,8 +284,8 @@ def _board(
         channels = np.full(reading.shape, 3, dtype=np.uint8)
     return Board(
         one.name,
-        reading.astype(np.float32),
-        variance.astype(np.float32),
+        reading,
+        variance,
         np.ascontiguousarray(channels),
         views_open(layout.views, one.pinhole, one.window),
         one.stage_um,
@@ -258,10 +293,11 @@ def _board(
     )
 
 
-def _signal(frame: MeanFrame, boards: BoardSet, gain: SensorGain) -> tuple[Array, Array]:
-    """Return DN per second above the dark, and its variance."""
-    dark = boards.dark_at(frame.exposure_s)
-    signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
+def _signal(
+    frame: MeanFrame, dark: MeanFrame, gain: SensorGain, rows: slice
+) -> tuple[Array, Array]:
+    """Return DN per second above the dark of some rows, and its variance."""
+    signal = (frame.mean_dn[rows] - dark.mean_dn[rows]).astype(np.float64)
     own = gain.gain_dn_per_electron * np.maximum(signal, 0) + dark.variance_dn2
     variance = own / frame.count + _dark_variance(dark) + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.boards import Board
 from calibration.errors import CalibrationError
+from calibration.frames import bands
 from calibration.shadow import Shadow
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -73,13 +74,23 @@ def _by_pixel(
 
     One plane is held at a time.
     """
-    rows, columns = board.reading.shape
-    total = np.zeros((rows, columns))
+    total = np.zeros(board.reading.shape)
     for v, u in np.argwhere(board.views_open):
-        for plane in np.moveaxis(coefficients[board.shot, v, u], 1, 0):
-            changed = change(plane.astype(np.float64))
-            total += changed.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
+        total += _of_pixels(change(coefficients[board.shot, v, u].astype(np.float64)), binning)
     return total
+
+
+def _of_pixels(view: Array, binning: int) -> Array:
+    """Return what a view's coefficients (y, stored colour, x) sum to, (pixel_y, pixel_x)."""
+    rows, colours, columns = view.shape
+    shape = (rows // binning, binning, colours, columns // binning, binning)
+    return view.reshape(shape).sum(axis=(1, 2, 4))
+
+
+def white_by_view(psi: ImagingMatrix, shot: int) -> Iterator[Array]:
+    """Yield what pixels read of a white board before each view in turn, (pixel_y, pixel_x)."""
+    for v, u in np.ndindex(psi.light_field_shape[:2]):
+        yield _of_pixels(psi.weights[shot, v, u].astype(np.float64), psi.binning)
 
 
 def judge(
@@ -89,20 +100,29 @@ def judge(
     usable = board.usable
     if not usable.any():
         raise CalibrationError(f"{board.name}: no usable pixel to judge by")
-    deviation = np.sqrt(board.variance.astype(np.float64) + predicted_variance)
-    residual = np.where(usable, board.reading - predicted, 0)
-    scaled = np.where(usable, residual / deviation, 0)
+    spread = np.broadcast_to(predicted_variance, usable.shape)
+    scaled = np.empty(usable.shape, dtype=np.float32)
+    missed = power = light = expected = 0.0
+    for rows in bands(scaled):
+        good = usable[rows]
+        reading, prediction = (
+            np.where(good, one[rows], np.float64(0)) for one in (board.reading, predicted)
+        )
+        residual = reading - prediction
+        variance = board.variance[rows].astype(np.float64) + spread[rows]
+        scaled[rows] = residual / np.sqrt(np.where(good, variance, 1.0))
+        missed, power = missed + float((residual**2).sum()), power + float((reading**2).sum())
+        light, expected = light + float(reading.sum()), expected + float(prediction.sum())
     squares = scaled[usable] ** 2
     limit = np.quantile(squares, 0.99)
-    level = float(np.sqrt(np.mean(board.reading[usable].astype(np.float64) ** 2)))
     return HeldOut(
         route,
-        float(squares.mean()),
-        float(squares[squares <= limit].mean()),
+        float(squares.mean(dtype=np.float64)),
+        float(squares[squares <= limit].mean(dtype=np.float64)),
         neighbour_correlation(scaled, usable),
-        float(np.sqrt(np.mean(residual[usable] ** 2))) / level,
-        scaled.astype(np.float32),
-        float(np.sum(board.reading[usable]) / max(float(np.sum(predicted[usable])), 1e-9)),
+        float(np.sqrt(missed / power)),
+        scaled,
+        light / max(expected, 1e-9),
     )
 
 

@@ -1,6 +1,6 @@
 """Crosstalk of a colour filter: what its pixels see of the other colours, and Psi in three of them.
 
-Under a lamp of one colour after another, the whiteboard without masks tells the share K[f, c] that
+Under a lamp of one colour after another, the whiteboard without masks gives the share K[f, c] that
 pixels behind filter f see of colour c. A mask of transmittances T_c then looks to them like
 sum_c K[f, c] T_c, which is what a fit under white light needs; and a coefficient of Psi has the
 part K[f, c] T_c in colour c. The parts in other colours than the pixel's own are the model's; its
@@ -10,7 +10,6 @@ own is what they leave of the coefficient measured.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,10 @@ from numpy.typing import NDArray
 from calibration.boards import BoardSet
 from calibration.defects import mask_with_losses
 from calibration.errors import CalibrationError
-from calibration.parametric import Stages, psi_at
+from calibration.parametric import Parametric, Stages, psi_at
 from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import LAMP_COLOURS, Calibration
-from emmc_rig.model.sensing import ImagingMatrix
-
-if TYPE_CHECKING:
-    from calibration.routes import Parametric
+from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]
 LEAST_CROSSTALK = 2e-3
@@ -110,25 +106,24 @@ def other_colours(
     known: Parametric,
     plain: ShadowMask,
     crosstalk: Crosstalk,
-    design: ImagingMatrix,
+    layout: PsiLayout,
     stages: Stages,
 ) -> OtherColours:
     """Return what the model says of the colours that a pixel's filter lets through beside its own.
 
     plain: the mask as designed. Raises CalibrationError where a pixel sums several samples.
     """
-    if design.binning != 1 or design.colour is None:
-        raise CalibrationError("crosstalk is told on sensors whose pixels are samples")
+    if layout.binning != 1 or layout.colour is None:
+        raise CalibrationError("crosstalk is measured only on sensors whose pixels are samples")
     at = known.fit.placement
     lost = None if known.defects is None else known.defects.lost
     mask = plain if lost is None else mask_with_losses(plain, at, lost)
-    layout = design.layout
     shots, v, u, y, _, x = layout.shape
     three = replace(layout, shape=(shots, v, u, y, 3, x), colour=None)
     through = 3 * psi_at(Shadow(mask, at), three, stages).weights
-    own = np.arange(3)[:, None] == design.colour[:, None, None, :, None, :]
+    own = np.arange(3)[:, None] == layout.colour[:, None, None, :, None, :]
     share, unsure = (
-        np.where(own, 0, np.moveaxis(matrix[design.colour], -1, 2)[:, None, None])
+        np.where(own, 0, np.moveaxis(matrix[layout.colour], -1, 2)[:, None, None])
         for matrix in (crosstalk.seen, crosstalk.deviation)
     )
     missed = np.zeros_like(through)

@@ -2,11 +2,11 @@
 
 The drift (shift, rotation, scale, distance, tilt; crosstalk of the colour filters; brightness of
 later shots against the first) that makes the evidence of blocks of the captures greatest (see
-`evidence`). Where to begin is told by the correlation of the open aperture's shadow with the
+`evidence`). Where to begin follows from the correlation of the open aperture's shadow with the
 captures over their local mean, at every shift and at turns and scales on a grid; from the best of
 these, and from where the mask was, Gauss-Newton steps on the blocks' scores climb, on the middle of
 the picture first. Its covariance is the sandwich of curvature and scores (White 1982), since the
-prior of the scene is but a model; a drift is told only where it is far outside that, and large
+prior of the scene is but a model; a drift is reported only where it is far outside that, and large
 enough to matter. A place that explains the captures no better than places where the mask cannot be
 is no place of the mask.
 """
@@ -126,16 +126,16 @@ class Drift:
 
     @property
     def refused(self) -> bool:
-        """Whether where the mask is now is not known, so that no Psi can be told to fit."""
+        """Whether where the mask is now is not known, so that no Psi is known to fit."""
         return self.beyond_search or self.recognised < LEAST_SURE
 
     @property
     def words(self) -> str:
-        """What to tell the user in one line."""
+        """The result in one line, for the user."""
         if self.recognised < LEAST_SURE:
             return (
                 f"the mask's shadow is not recognised in these captures ({self.searched}): it has "
-                "moved farther, is another, or the scene tells too little; take one whiteboard "
+                "moved farther, is another, or the scene shows too little; take one whiteboard "
                 "and calibrate again"
             )
         if self.beyond_search:
@@ -217,7 +217,7 @@ def _blocks(
     if len(found) < 8:
         raise CalibrationError(
             f"only {len(found)} blocks of {side} x {side} pixels are lit, unsaturated and without "
-            "bad pixels: a drift cannot be told from these captures"
+            "bad pixels: these captures cannot show a drift"
         )
     inside = np.moveaxis(np.mgrid[:side, :side], 0, -1).reshape(-1, 2)
     pixels = np.array(found)[:, None, :] + inside
@@ -564,6 +564,6 @@ def _curvature(search: _Search, drift: Array) -> NDArray[np.float64]:
     curvature = (curvature + curvature.T) / 2 + search.penalty
     scale = np.sqrt(np.diag(search.penalty))
     values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
-    # A direction that the captures do not tell is held by the prior alone.
+    # A direction that the captures do not determine is held by the prior alone.
     held = (vectors * np.maximum(values, 1.0)) @ vectors.T
     return np.asarray(held * np.outer(scale, scale), dtype=np.float64)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.board_angle import BoardAngle
+from calibration.fit import Fit
 from calibration.levels import Levels
-
-if TYPE_CHECKING:
-    from calibration.routes import Parametric
+from calibration.placement import Placement
 
 SIGNIFICANT = 5.0
 NOTEWORTHY = {
@@ -25,20 +23,27 @@ NOTEWORTHY = {
     ),
     "bow_um": (1.0, "the mask is bowed by {value:+.1f} +- {spread:.1f} um at the picture's corner"),
     "glass_um": (20.0, "{value:.0f} +- {spread:.0f} um of glass lie between mask and sensor"),
+    "clear": (
+        0.1,
+        "clear cells of the mask let {at:.0%} of the light through: if they should pass more, the "
+        "references had more light than the other whiteboards",
+    ),
     "distance_share": (0.02, "the mask's distance differs from the design by {percent:+.1f} %"),
 }
+USUAL = Placement()
 
 
-def mask_findings(known: Parametric | None) -> list[str]:
+def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[str]:
     """Return what of the mask's placement is off, and far outside its deviation."""
-    if known is None:
-        return []
     found = []
-    for name, (least, words) in NOTEWORTHY.items():
-        value, spread = getattr(known.fit.placement, name), known.fit.deviation(name)
+    for name in names:
+        least, words = NOTEWORTHY[name]
+        value = getattr(fit.placement, name) - getattr(USUAL, name)
+        spread = fit.deviation(name)
         if abs(value) > max(least, SIGNIFICANT * spread):
             found.append(
                 words.format(
+                    at=getattr(fit.placement, name),
                     value=value,
                     spread=spread,
                     percent=100 * value,
@@ -86,7 +91,7 @@ UNWATCHED = {
         "0.25 % of Psi for every 1 % of unevenness over the aperture",
     ),
 }
-"""What no whiteboard tells, and what that costs: `calibrate --check lamp,response,crosstalk,board
+"""What no whiteboard shows, and what that costs: `calibrate --check lamp,response,crosstalk,board
 --leave-out lamp,response,colours,turned --size 48x64 --rays 1024` misses 1.27, 0.36, 6.76, 2.54 %
 of Psi at 2, 1, 5, 10 %, where `shipped` has 0.32 %."""
 
@@ -103,5 +108,5 @@ def angle_findings(board: BoardAngle) -> list[str]:
         return []
     return [
         f"the white board is uneven by {np.ptp(board.radiance):.1%} over the directions into the "
-        "aperture: taken out; what is alike in every direction from its middle cannot be told"
+        "aperture: taken out; what is alike in every direction from its middle cannot be measured"
     ]

@@ -43,11 +43,13 @@ FIRST_WINDOW_PX = 64
 FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
 DECIDED = 0.7
-"""Of the prior's deviation: a parameter told no better stays at the design."""
+"""Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 MOST_MORE = 200
 LEAST_FIT_CORRELATION = 0.7
+SOFT_EDGES = 0.1
+"""Of a cell: how soft edges are taken to be where a fit begins."""
 OFFSETS = slice(0, 2)
 
 
@@ -287,7 +289,7 @@ def fit_placement(
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
     designed = designed_placement(camera)
-    soft = replace(designed, blur_um=0.1 * mask.cell_um)
+    soft = replace(designed, blur_um=SOFT_EDGES * mask.cell_um)
     if start is None:
         clearest = max(boards, key=_contrast)
         registered = register(clearest, mask, soft)
@@ -296,7 +298,7 @@ def fit_placement(
         placement = start
     centre = soft.vector()
     deviations = tolerances.deviations(camera.views)
-    # A stage sits where it was found; the prior is for what whiteboards do not tell.
+    # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     prior = 1 / deviations**2
     rng = np.random.default_rng(settings.seed)

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 
+Frame = NDArray[np.floating] | NDArray[np.integer]
+BAND_PIXELS = 2**20
+"""Worked on at once: a dozen temporary arrays of them take 100 MB."""
 LARGEST_CLIPPED_SHARE = 1e-3
 LARGEST_FLICKER = 0.02
 SURE = 6.0
@@ -47,8 +50,8 @@ def average(
     LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
     more than LARGEST_FLICKER of the brightest, and more than noise explains.
     """
-    total = squares = None
-    count = 0
+    total: NDArray[np.float64] | None = None
+    count, squares = 0, 0.0
     levels: list[float] = []
     for frame in frames:
         clipped = float(np.mean(frame >= white_level_dn))
@@ -57,22 +60,33 @@ def average(
                 f"{what}: {clipped:.1%} of the pixels are saturated; shorten the exposure "
                 f"({exposure_s:g} s) or dim the lamp"
             )
-        values = frame.astype(np.float64)
-        if total is None or squares is None:
-            total, squares = np.zeros_like(values), np.zeros_like(values)
-        if values.shape != total.shape:
-            raise CalibrationError(f"{what}: frames of {values.shape} and {total.shape} differ")
-        total += values
-        squares += values**2
+        if total is None:
+            total = np.zeros(frame.shape)
+        if frame.shape != total.shape:
+            raise CalibrationError(f"{what}: frames of {frame.shape} and {total.shape} differ")
+        total += frame
+        squares += _sum_of_squares(frame)
         count += 1
-        levels.append(float(values.mean()))
-    if total is None or squares is None:
+        levels.append(float(frame.mean(dtype=np.float64)))
+    if total is None:
         raise CalibrationError(f"{what}: no frame was taken")
     spread = np.nan
     if count > 1:
-        spread = float(np.mean(squares - total**2 / count) / (count - 1))
+        spread = (squares - _sum_of_squares(total) / count) / total.size / (count - 1)
         _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
     return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s, taken_s)
+
+
+def bands(frame: Frame) -> list[slice]:
+    """Return the rows of a frame (y, x) in bands of BAND_PIXELS; a small sensor is one."""
+    rows, columns = frame.shape
+    step = max(BAND_PIXELS // columns, 1)
+    return [slice(first, min(first + step, rows)) for first in range(0, rows, step)]
+
+
+def _sum_of_squares(values: Frame) -> float:
+    parts = (values[rows].astype(np.float64).ravel() for rows in bands(values))
+    return sum(float(np.einsum("i,i", part, part)) for part in parts)  # BLAS would start threads
 
 
 def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:

@@ -55,7 +55,7 @@ class Levels:
 
     drift: peak to peak of the lamp over the checks, the largest of the colours. residual: root
     mean square of the checks' logarithms, over their deviations. bend_known: more than one
-    exposure tells it. deviation: of the lamp's logarithm, typical; significance: of the largest
+    exposure shows it. deviation: of the lamp's logarithm, typical; significance: of the largest
     step of it from the first knot.
     """
 
@@ -87,6 +87,8 @@ class Levels:
 
         dark_dn: of its exposure; channels: (y, x), the colour that each pixel sees.
         """
+        if not (self.bent or self.drifting):
+            return frame
         above = frame.mean_dn - dark_dn
         if self.bent:
             above = above * np.exp(self.bend_per_dn * np.maximum(above, 0))

@@ -1,8 +1,8 @@
 """Which views a whiteboard opens: one by the pinhole, all by the plate's window, or a part of them.
 
 The window, moved by whole aperture cells, uncovers the views on one side alone: halves and corners
-of the aperture. Sums of fewer views tell single ones better than the whole, and are brighter than
-the pinhole: ten such whiteboards replace one of every view where the mask is known by design.
+of the aperture. Sums of fewer views determine single ones better than the whole, and are brighter
+than the pinhole: ten such whiteboards replace one of every view where the mask is known by design.
 """
 
 from __future__ import annotations

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.shadow import ANY_COLOUR, Shadow
+from calibration.defects import Defects
+from calibration.fit import Fit
+from calibration.misfit import Misfit
+from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
@@ -16,6 +19,30 @@ BAND_PIXELS = 2**16
 """Of Psi at once: its derivatives by 41 parameters take 20 MB."""
 Stages = Sequence[tuple[float, float]]
 SAMPLED = 3_000
+
+
+@dataclass(frozen=True, eq=False)
+class Parametric:
+    """What the parametric routes know of the bench: fit and mask, with its defects if sought.
+
+    misfit: of the model at whiteboards of few views, by view; None without any. of_defects: mean
+    square of what is missed where the mask has defects, over the square of what they take.
+    """
+
+    fit: Fit
+    mask: ShadowMask
+    defects: Defects | None = None
+    misfit: Mapping[tuple[int, int], Misfit] | None = None
+    of_defects: float = 0.0
+
+    @property
+    def shadow(self) -> Shadow:
+        """The shadow as fitted."""
+        return Shadow(self.mask if self.defects is None else self.defects.mask, self.fit.placement)
+
+    def psi(self, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
+        """Return Psi with the mask stage at `stages`, (x, y) in um per shot."""
+        return psi_at(self.shadow, layout, stages)
 
 
 def shot_stages(camera: Camera) -> Stages:

@@ -13,7 +13,7 @@ The coefficient of view j at pixel p is w_j(p) (leak + (clear - leak) T_j(p)), T
 transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j) (1 + falloff |u_j|^2) / sum over
 the views, x and u as shares of the picture's corner and of the aperture's: what falls off evenly
 over the views cancels against the white board seen without masks. The falloff could be part of the
-a_j; told apart, what is left of those is small.
+a_j; known apart, what is left of those is small.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def labels(views: tuple[int, int]) -> tuple[str, ...]:
 class Tolerances:
     """How far a bench may be from its design: standard deviations of the parameters' prior.
 
-    They hold what the whiteboards do not tell at the design; a frame tells far more of the rest.
+    They hold what the whiteboards do not determine at the design; a frame shows the rest far
+    better.
     """
 
     offset_um: float = 200.0

@@ -3,8 +3,8 @@
 Parametric: a frame of N pixels adds the Fisher information sum over pixels of (slope slope^T) /
 variance; with n frames of each kind the covariance of the placement is C = (prior + sum n_k I_k)^-1
 and the expected squared error of Psi trace(G C), G from `psi_information`. Every kind is taken
-once: a view that is never opened is told by its neighbours alone, whose shadows are nearly its own,
-and takes up whatever the model misses. Frames are then added one by one, always the kind that
+once: a view that is never opened is known from its neighbours alone, whose shadows are nearly its
+own, and takes up whatever the model misses. Frames are then added one by one, always the kind that
 lowers that error most (greedy A-optimal design: Pukelsheim 2006, ch. 5).
 
 Free: a coefficient's relative variance is that of its signal and of the reference it is divided

@@ -5,14 +5,14 @@ Saturated, dark, lit darks, without the mask, of another camera, of a bench or a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board_angle import BoardAngle
 from calibration.boards import Board, BoardSet
-from calibration.choice import HeldOut, predicted_by_shadow
+from calibration.choice import HeldOut
 from calibration.errors import CalibrationError
 from calibration.fit import Fit
 from calibration.frames import MeanFrame
@@ -49,11 +49,15 @@ UNLIKELY = 4.0
 """Times the tolerances of the fit."""
 LARGEST_GRADIENT = {True: 0.03, False: 0.1}
 """Over the picture, of the open aperture and of one view, whose falloff is but modelled."""
+FREE_GRADIENT = {True: 0.015, False: 0.1}
+"""The same of the free route, whose whiteboards are many: benches that are as they may be have
+at most 0.003 of the open aperture. Small pictures of few whiteboards show 0.02."""
 LARGEST_UNEVENNESS = 0.25
 SURE = 5.0
 MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
-SAMPLED = 3_000
+SAMPLED, SAMPLED_GRADIENT = 3_000, 200_000
+"""Pixels that distinguish whiteboards' views, and brightness over the picture."""
 ORDERS = {
     "mirrored left to right": lambda opened: opened[:, ::-1],
     "mirrored top to bottom": lambda opened: opened[::-1],
@@ -100,21 +104,19 @@ def _refuse_lit_darks(boards: BoardSet) -> None:
 
 
 def _refuse_saturated(boards: BoardSet) -> None:
-    named = {
-        f"the reference whiteboard, {lamp} lamp": frame
-        for (_, lamp), frame in boards.references.items()
-    }
-    named |= {board.name: board.frame for board in boards.frames}
-    lit = {
-        name: frame
-        for name, frame in named.items()
-        if np.mean(_above_dn(frame, boards)) > DARKEST_REFERENCE_DN
-    }
-    gains = {name: _gain(frame, boards) for name, frame in lit.items() if frame.count > 1}
+    def lit() -> Iterator[tuple[str, MeanFrame]]:
+        for (_, lamp), frame in boards.references.items():
+            yield f"the reference whiteboard, {lamp} lamp", frame
+        for board in boards.frames:
+            frame = board.frame
+            if np.mean(_above_dn(frame, boards)) > DARKEST_REFERENCE_DN:
+                yield board.name, frame
+
+    gains = {name: _gain(frame, boards) for name, frame in lit() if frame.count > 1}
     if not gains:
         return
     typical = float(np.median(list(gains.values())))
-    for name, frame in lit.items():
+    for name, frame in lit():
         less = gains.get(name, typical) < LEAST_GAIN_SHARE * typical
         if less or _plateau(_above_dn(frame, boards), typical, frame.count) > PLATEAU_SHARE:
             raise CalibrationError(
@@ -159,20 +161,21 @@ def refuse_without_mask(board: Board) -> None:
         )
 
 
-def refuse_another_mask(boards: Sequence[Board], camera: Camera, mask: ShadowMask) -> Placement:
+def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMask) -> Placement:
     """Return where the mask is registered; raises CalibrationError where it is not the design's.
 
     boards: the first is registered; of those of single views the order is checked.
     """
-    placement = register(boards[0], mask, designed_placement(camera)).placement
-    shadow = Shadow(mask, placement)
-    single = [board for board in boards if board.views_open.sum() == 1]
-    clearest = [np.percentile(b.reading[b.usable], 98) * b.views_open.size for b in single]
-    if single and np.mean(clearest) > BRIGHTEST_VIEWS:
-        _raise_dim_references(float(np.mean(clearest)))
     rng = np.random.default_rng(0)
-    own, others = [], []
-    for board in single:
+    own, others, clearest = [], [], []
+    shadow = None
+    for board in boards:
+        refuse_without_mask(board)
+        if shadow is None:
+            shadow = Shadow(mask, register(board, mask, designed_placement(camera)).placement)
+        if board.views_open.sum() > 1:
+            continue
+        clearest.append(np.percentile(board.reading[board.usable], 98) * board.views_open.size)
         usable = np.argwhere(board.usable)
         pixels = usable[rng.integers(len(usable), size=min(SAMPLED, len(usable)))]
         own.append(_correlation(board, shadow, pixels, board.views_open))
@@ -185,14 +188,17 @@ def refuse_another_mask(boards: Sequence[Board], camera: Camera, mask: ShadowMas
                 for one in orders
             ]
         )
-    if single:
+    assert shadow is not None
+    if own:
+        if np.mean(clearest) > BRIGHTEST_VIEWS:
+            _raise_dim_references(float(np.mean(clearest)))
         means = np.mean(others, axis=0)
         if means.max() > np.mean(own) + MIRRORED:
             raise CalibrationError(
                 "the views are not those that the whiteboards are named for: they are "
                 f"{list(ORDERS)[int(np.argmax(means))]}; check the axes of the aperture's stage"
             )
-    return placement
+    return shadow.placement
 
 
 def _correlation(
@@ -235,7 +241,7 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], tolerances: Tolerances) ->
         moved_um = float(np.hypot(*one.moved_um))
         if abs(one.brightness - 1) > max(ALIKE_BRIGHTNESS, SURE * one.brightness_deviation):
             raise CalibrationError(
-                f"{one.name}: {one.brightness:.2f} times as bright as the others tell: was the "
+                f"{one.name}: {one.brightness:.2f} times as bright as the others suggest: was the "
                 "aperture where it should be, the mask in the beam, and the lamp the same? "
                 "Capture it again"
             )
@@ -246,14 +252,20 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], tolerances: Tolerances) ->
             )
 
 
-def refuse_tilted_board(shadow: Shadow, boards: Sequence[Board], model: float = 1.0) -> None:
+def refuse_tilted_board(
+    shadow: Shadow,
+    boards: Sequence[Board],
+    model: float = 1.0,
+    limits: Mapping[bool, float] = LARGEST_GRADIENT,
+) -> None:
     """Raise CalibrationError where brightness changes over the picture against the references.
 
-    model: how much rougher the shadow is than a fitted one.
+    model: how much rougher the shadow is than a fitted one. limits: of the change, of an aperture
+    that is open and of one that is not.
     """
     for board in boards:
         across, deviation = _gradient(shadow, board)
-        limit = model * LARGEST_GRADIENT[bool(board.views_open.all())]
+        limit = model * limits[bool(board.views_open.all())]
         worst = int(np.argmax(np.abs(across)))
         if abs(across[worst]) > max(limit, SURE * deviation):
             raise CalibrationError(
@@ -266,11 +278,14 @@ def refuse_tilted_board(shadow: Shadow, boards: Sequence[Board], model: float = 
 
 def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
     """Return by how much a whiteboard's brightness changes down and across, and how sure."""
-    predicted = predicted_by_shadow(shadow, board)
-    y, x = np.argwhere(board.usable).T
+    chosen = np.flatnonzero(board.usable)
+    if len(chosen) > SAMPLED_GRADIENT:
+        chosen = np.random.default_rng(0).choice(chosen, SAMPLED_GRADIENT, replace=False)
     rows, columns = board.reading.shape
-    at = predicted[y, x]
-    levels = [np.where(board.channels[y, x] == c, at, 0) for c in np.unique(board.channels)]
+    y, x = np.unravel_index(chosen, (rows, columns))
+    channels, pixels = board.channels[y, x], np.stack([y, x], axis=1)
+    at = shadow.readings(pixels, channels, board.views_open, board.stage_um, board.shot)
+    levels = [np.where(channels == c, at, 0) for c in np.unique(channels)]
     terms = np.stack([at * (y / rows - 0.5), at * (x / columns - 0.5), *levels], axis=1)
     value = board.reading[y, x].astype(np.float64)
     keep = np.ones(len(value), dtype=bool)
@@ -302,8 +317,8 @@ def refuse_another_bench(chosen: HeldOut) -> None:
     why = "the mask, the lens or the camera moved between them, or it is of another day or camera"
     if abs(chosen.brightness - 1) > BRIGHTNESS_DIFFERS:
         why = (
-            f"it is {chosen.brightness:.2f} times as bright as the others tell: was the aperture "
-            "wholly open, and the lamp the same?"
+            f"it is {chosen.brightness:.2f} times as bright as the others suggest: was the "
+            "aperture wholly open, and the lamp the same?"
         )
     name = max(chosen.groups, key=lambda group: chosen.groups[group])
     raise CalibrationError(

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import board_over_angle, without
-from calibration.boards import Board, BoardSet, as_readings, channels_of, gain_of, sensor_blemishes
+from calibration.board_angle import board_over_angle, take_out
+from calibration.boards import (
+    Board,
+    BoardSet,
+    as_readings,
+    channels_of,
+    gain_of,
+    sensor_blemishes,
+)
 from calibration.choice import (
     AT_THE_NOISE,
     HeldOut,
@@ -24,21 +30,23 @@ from calibration.choice import (
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.combine import combined
-from calibration.defects import Defects, View, find_defects, loss_variance
+from calibration.defects import View, find_defects, loss_variance
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
-from calibration.fit import MOST_MORE, Fit, FitSettings, fit_placement
+from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, FitSettings, fit_placement
+from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, measured_misfit
 from calibration.parametric import (
+    Parametric,
     Stages,
     coefficient_planes,
-    psi_at,
     psi_deviation,
     shot_stages,
 )
 from calibration.placement import Tolerances
 from calibration.refusals import (
+    FREE_GRADIENT,
     refuse_another_bench,
     refuse_another_mask,
     refuse_odd_fit,
@@ -47,10 +55,17 @@ from calibration.refusals import (
     refuse_unfit,
     refuse_without_mask,
 )
-from calibration.shadow import Shadow, ShadowMask, shadow_mask
-from calibration.whiteboard import LAMP_COLOURS, Calibration, lamps_needed, measure_psi
+from calibration.shadow import Shadow, shadow_mask
+from calibration.whiteboard import (
+    LAMP_COLOURS,
+    Calibration,
+    NewArray,
+    in_memory,
+    lamps_needed,
+    measure_psi,
+)
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
@@ -58,30 +73,6 @@ LEAST_LOSS = 1e-5
 LARGEST_MOVE_UM = 1.0
 ROUGHER = 3.0
 """Times what a fitted mask misses: what one that is but registered does."""
-
-
-@dataclass(frozen=True, eq=False)
-class Parametric:
-    """What the parametric routes know of the bench: fit and mask, with its defects if sought.
-
-    misfit: of the model at whiteboards of few views, by view; None without any. of_defects: mean
-    square of what is missed where the mask has defects, over the square of what they take.
-    """
-
-    fit: Fit
-    mask: ShadowMask
-    defects: Defects | None = None
-    misfit: Mapping[tuple[int, int], Misfit] | None = None
-    of_defects: float = 0.0
-
-    @property
-    def shadow(self) -> Shadow:
-        """The shadow as fitted."""
-        return Shadow(self.mask if self.defects is None else self.defects.mask, self.fit.placement)
-
-    def psi(self, design: ImagingMatrix, stages: Stages) -> ImagingMatrix:
-        """Return Psi with the mask stage at `stages`, (x, y) in um per shot."""
-        return psi_at(self.shadow, design.layout, stages)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +105,7 @@ class Outcome:
 
 def calibrate(
     camera: Camera,
-    design: ImagingMatrix,
+    design: ImagingMatrix | PsiLayout,
     routes: Sequence[str],
     held_out: BoardSet,
     few: BoardSet | None = None,
@@ -123,73 +114,82 @@ def calibrate(
     tolerances: Tolerances | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
     turned: Mapping[float, BoardSet] | None = None,
+    empty: NewArray = in_memory,
+    on_plane: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Return Psi by the routes named (parametric, mixed, free, combined), and the one to use.
 
-    few: whiteboards for the parametric routes. pinholes: for the free one, every view of every
-    shot. held_out: whiteboards through the open aperture under a white lamp that no route sees;
-    one at the position of shot 0, which the free route can predict. turned: an open
-    whiteboard at that position and its references, by the degrees that the board was turned.
+    design, empty, on_plane: of the free route, see `measure_psi`. few: whiteboards for the
+    parametric routes. pinholes: for the free one, every view of every shot. held_out: whiteboards
+    through the open aperture under a white lamp that no route sees; one at the position of shot 0,
+    which the free route can predict. turned: an open whiteboard at that position and its
+    references, by the degrees that the board was turned.
     Raises CalibrationError for whatever makes the whiteboards unfit.
     """
+    layout = design.layout if isinstance(design, ImagingMatrix) else design
     advice: list[str] = []
     turned = turned or {}
     sets = [held_out, *(one for one in (few, pinholes) if one is not None), *turned.values()]
     refuse_unfit(sets)
     good = np.logical_and.reduce([sensor_blemishes(one) for one in sets])
-    channels = channels_of(design.layout)
+    channels = channels_of(layout)
     levels = fit_levels(list(dict.fromkeys(check for one in sets for check in one.checks)))
     findings = level_findings(levels)
     if levels is not None:
-        held_out = held_out.levelled(levels, channels)
-        few = None if few is None else few.levelled(levels, channels)
-        pinholes = None if pinholes is None else pinholes.levelled(levels, channels)
-        turned = {turn: one.levelled(levels, channels) for turn, one in turned.items()}
+        how = levels, channels, dict[int, MeanFrame]()
+        held_out = held_out.levelled(*how)
+        few = None if few is None else few.levelled(*how)
+        pinholes = None if pinholes is None else pinholes.levelled(*how)
+        turned = {turn: one.levelled(*how) for turn, one in turned.items()}
     seen_colours = crosstalk(held_out, channels, good)
-    judges = as_readings(held_out, design.layout, good)
+    judges = as_readings(held_out, layout, good)
     if not judges:
         raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
     for board in judges:
         refuse_without_mask(board)
     stage_um = shot_stages(camera)[0]
-    if few is None or pinholes is not None:
-        _refuse_unlike_the_design(camera, design, pinholes or held_out, judges, good)
+    modelled = bool({"parametric", "mixed", "combined"} & set(routes))
+    if not modelled or pinholes is not None:
+        boards = pinholes or held_out
+        findings += _unlike_the_design(
+            camera, layout, boards, judges, good, seen_colours, not modelled
+        )
     calibrations: dict[str, Calibration] = {}
     bare: dict[str, Calibration] = {}
     judged: dict[str, HeldOut] = {}
     frames: dict[str, int] = {}
     parametric = mixed = plain = None
-    if {"parametric", "mixed", "combined"} & set(routes):
+    if modelled:
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
         on_stage("parametric fit")
-        seen = as_readings(few, design.layout, good)
+        seen = as_readings(few, layout, good)
         for board in seen:
             refuse_without_mask(board)
-        plain = shadow_mask(camera, design.size)
+        plain = shadow_mask(camera, layout.size)
         mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
         advice += fit_advice(fit)
         refuse_odd_fit(fit, seen, tolerances or Tolerances())
         parametric = with_misfit(Parametric(fit, mask), seen)
-        if {"mixed", "combined"} & set(routes) and design.binning == 1:
+        if {"mixed", "combined"} & set(routes) and layout.binning == 1:
             on_stage("defects of the mask")
             mixed = with_misfit(_mixed(seen, camera, parametric, fit_settings, tolerances), seen)
         for name, one in (("parametric", parametric), ("mixed", mixed)):
             if one is not None:
                 one = replace(one, of_defects=_missed_at_defects(one, [*seen, *judges]))
                 on_stage(f"Psi, {name}")
-                bare[name] = _calibration(one, camera, design, few, good)
+                bare[name] = _calibration(one, camera, layout, few, good)
                 calibrations[name] = _counting_misfit(bare[name], one)
                 judged[name] = _judged(name, one.shadow, judges, seen)
                 frames[name] = few.exposures
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
-        findings += mask_findings(mixed or parametric)
+        findings += mask_findings((mixed or parametric).fit)
     if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")
         on_stage("Psi, free")
-        free = replace(measure_psi(pinholes.pinholes(), design), good=good)
+        free = replace(measure_psi(pinholes.pinholes(), design, empty, on_plane), good=good)
         calibrations["free"] = free
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
@@ -197,7 +197,7 @@ def calibrate(
                 "the free route is judged by an open whiteboard where the mask stands in the "
                 "first shot: hold one out there"
             )
-        judged["free"] = _judged_measured("free", free, still[0], design.binning)
+        judged["free"] = _judged_measured("free", free, still[0], layout.binning)
         frames["free"] = pinholes.exposures
         best = mixed or parametric
         if "combined" in routes and best is not None and few is not None:
@@ -205,13 +205,13 @@ def calibrate(
             model = bare["mixed" if mixed is not None else "parametric"]
             both = combined(free, model, good)
             calibrations["combined"] = both
-            judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
+            judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
             frames["combined"] = few.exposures
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > AT_THE_NOISE:
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
-        calibrations[chosen.route] = _less_sure(calibrations[chosen.route], missed)
+        _make_less_sure(calibrations[chosen.route], missed)
         advice.append(
             f"a whiteboard differs from the chosen Psi by {chosen.relative_error:.2%} of its "
             f"level, {chosen.chi2:.1f} times the noise's variance; what is worst: "
@@ -225,19 +225,20 @@ def calibrate(
         if plain is None:
             raise CalibrationError(
                 "the colour filters let other colours through, and the free route under a white "
-                "lamp does not tell which: add open whiteboards, for the parametric route"
+                "lamp does not show which: add open whiteboards, for the parametric route"
             )
         by = mixed or parametric
         assert by is not None
-        others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
+        others = other_colours(by, plain, seen_colours, layout, shot_stages(camera))
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
     if turned:
-        boards = {turn: as_readings(one, design.layout, good)[0] for turn, one in turned.items()}
+        boards = {turn: as_readings(one, layout, good)[0] for turn, one in turned.items()}
         board = board_over_angle(calibrations[chosen.route].psi, boards)
         refuse_uneven_board(board)
         findings += angle_findings(board)
         if board.uneven:
-            calibrations = {name: without(board, one) for name, one in calibrations.items()}
+            for one in calibrations.values():
+                take_out(board, one)
     return Outcome(
         chosen.route,
         why,
@@ -249,17 +250,17 @@ def calibrate(
         good,
         tuple(advice),
         tuple(findings),
-        tuple(unwatched(_missing(sets, levels, design, bool(turned)))),
+        tuple(unwatched(_missing(sets, levels, layout, bool(turned)))),
         seen_colours,
     )
 
 
 def _missing(
-    sets: Sequence[BoardSet], levels: Levels | None, design: ImagingMatrix, turned: bool
+    sets: Sequence[BoardSet], levels: Levels | None, layout: PsiLayout, turned: bool
 ) -> list[str]:
     """Return what was not watched, by the names of `findings.UNWATCHED`."""
     lamps = {lamp for one in sets for _, lamp in one.references}
-    coloured = design.colour is None or design.binning > 1 or lamps >= set(LAMP_COLOURS)
+    coloured = layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS)
     seen_again = any(check.masks_in for one in sets for check in one.checks)
     watched = {
         "lamp": seen_again,
@@ -270,31 +271,43 @@ def _missing(
     return [name for name, known in watched.items() if not known]
 
 
-def _refuse_unlike_the_design(
+def _unlike_the_design(
     camera: Camera,
-    design: ImagingMatrix,
+    layout: PsiLayout,
     boards: BoardSet,
     judges: Sequence[Board],
     good: NDArray[np.bool_],
-) -> None:
-    """Raise CalibrationError for whiteboards of another mask, and of a board that was tilted.
+    crosstalk: Crosstalk | None,
+    fitted: bool,
+) -> list[str]:
+    """Return what of the mask is off; raises CalibrationError for another mask, or a tilted board.
 
     Nothing for cameras whose mask is not modelled. Of those through the pinhole the middle view
-    and the corners' are enough.
+    and two corners' are enough. fitted: the mask is fitted to these as well, which distinguishes
+    another distance and references with less light from whiteboards that every coefficient follows.
     """
     try:
-        mask = shadow_mask(camera, design.size)
+        mask = shadow_mask(camera, layout.size)
     except CalibrationError:
-        return
+        return []
+    if crosstalk is not None:
+        mask = mixing(mask, crosstalk.seen)
     v, u = camera.views
-    wanted = [(v // 2, u // 2), *product((0, v - 1), (0, u - 1))]
+    wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
     some = [one for one in boards.frames if one.shot == 0 and one.pinhole in wanted]
     some.sort(key=lambda one: wanted.index(one.pinhole or wanted[0]))
-    seen = as_readings(boards.with_frames(some), design.layout, good) or list(judges)
-    for board in seen:
-        refuse_without_mask(board)
-    placement = refuse_another_mask(seen, camera, mask)
+    seen = as_readings(boards.with_frames(some), layout, good)
+    placement = refuse_another_mask(seen or judges, camera, mask)
     refuse_tilted_board(Shadow(mask, placement), judges, ROUGHER)
+    if not fitted:
+        return []
+    seen = [*seen, *judges]
+    start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
+    fit = fit_placement(seen, camera, mask, start=start)
+    refuse_odd_fit(fit, seen, Tolerances())
+    refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
+    # Finer than that, Psi as measured is what counts, and few whiteboards do not determine it well.
+    return mask_findings(fit, ("distance_share", "clear"))
 
 
 def _mixed(
@@ -317,8 +330,8 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """Return the model with its misfit, from what it leaves of whiteboards of few views.
 
     A view has that of the whiteboards which open it alone; where none does, that of those which
-    open the fewest with it, whose views are taken to be missed independently. Many pixels tell few
-    parameters, so that a board the fit has seen is as good as held out.
+    open the fewest with it, whose views are taken to be missed independently. Many pixels determine
+    few parameters, so that a board the fit has seen is as good as held out.
     """
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
@@ -400,35 +413,36 @@ def _worst_groups(one: HeldOut) -> str:
     return ", ".join(f"{name} ({one.groups[name]:.1f})" for name in order[:4])
 
 
-def _less_sure(known: Calibration, missed: float) -> Calibration:
-    """Return a calibration whose deviations count a relative error beside."""
-    more = np.square(missed * known.psi.weights)
-    return replace(known, deviation=np.sqrt(np.square(known.deviation) + more).astype(np.float32))
+def _make_less_sure(known: Calibration, missed: float) -> None:
+    """Count a relative error beside in the deviations of a calibration."""
+    for place in np.ndindex(*known.deviation.shape[:3]):
+        more = np.square(missed * known.psi.weights[place])
+        known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
 
 
 def _calibration(
     one: Parametric,
     camera: Camera,
-    design: ImagingMatrix,
+    layout: PsiLayout,
     boards: BoardSet,
     good: NDArray[np.bool_],
 ) -> Calibration:
     stages = shot_stages(camera)
-    psi = one.psi(design, stages)
-    deviation = psi_deviation(one.shadow, design.layout, stages, one.fit.covariance)
+    psi = one.psi(layout, stages)
+    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance)
     if one.defects is not None and one.defects.count:
-        deviation = _counting_defects(deviation, one, design, stages)
-    white = np.stack([_white(boards, design, shot) for shot in range(design.shots)])
+        deviation = _counting_defects(deviation, one, layout, stages)
+    white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
 
 
 def _counting_defects(
-    deviation: NDArray[np.float32], one: Parametric, design: ImagingMatrix, stages: Stages
+    deviation: NDArray[np.float32], one: Parametric, layout: PsiLayout, stages: Stages
 ) -> NDArray[np.float32]:
     """Return the deviation of Psi with what is not known of the defects of its mask."""
     assert one.defects is not None
     clean, soiled = (
-        coefficient_planes(Shadow(mask, one.fit.placement), design.layout, stages)
+        coefficient_planes(Shadow(mask, one.fit.placement), layout, stages)
         for mask in (one.mask, one.defects.mask)
     )
     for ((shot, v, u, stored), bare), (_, plane) in zip(clean, soiled, strict=True):
@@ -437,8 +451,8 @@ def _counting_defects(
         opened = np.zeros(one.mask.views, dtype=bool)
         opened[v, u] = True
         channels = np.full(len(touched), stored, dtype=np.uint8)
-        if design.colour is not None:
-            channels = design.colour[shot, y, x]
+        if layout.colour is not None:
+            channels = layout.colour[shot, y, x]
         seen = View(opened, stages[shot], shot)
         of_losses = loss_variance(one.defects, one.mask, one.fit.placement, touched, channels, seen)
         of_outline = one.of_defects * np.square(bare - plane)[y, x]
@@ -460,11 +474,11 @@ def _counting_misfit(known: Calibration, one: Parametric) -> Calibration:
     return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
-def _white(boards: BoardSet, design: ImagingMatrix, shot: int) -> NDArray[np.float32]:
+def _white(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32]:
     """Return what a reading of 1 gives in DN per second: all lamp colours together."""
     white = {(shot, "white"), (0, "white")} & set(boards.references)
-    lamps = ("white",) if white else lamps_needed(design)
-    total = np.zeros(design.frames_shape[1:], dtype=np.float64)
+    lamps = ("white",) if white else lamps_needed(layout)
+    total = np.zeros(layout.frames_shape[1:], dtype=np.float64)
     for lamp in lamps:
         reference = boards.references.get((shot, lamp)) or boards.references.get((0, lamp))
         if reference is None:

@@ -6,8 +6,8 @@ its slope is the gain K in DN per electron. Every figure's deviation is a jackkn
 groups of rows. Under a colour filter each of its 2 x 2 phases has its own level; all lie on one
 curve.
 
-What differs from pixel to pixel is told from noise by the covariance of the two frames, and split
-into rows, columns and pixels.
+What differs from pixel to pixel is separated from noise by the covariance of the two frames, and
+split into rows, columns and pixels.
 
 Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8) and general (row, column and pixel
 nonuniformity, spectrograms).

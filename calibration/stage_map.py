@@ -1,6 +1,6 @@
 """The mask stage as the sensor sees it: scale, rotation, orthogonality, backlash, repeatability.
 
-Every whiteboard tells where its mask stood, by the fitted shadow, to thousandths of a pixel. Those
+Every whiteboard shows where its mask stood, by the fitted shadow, to thousandths of a pixel. Those
 places are a linear map of the positions commanded, plus half the backlash with the sign of the
 direction from which each axis came.
 """
@@ -72,7 +72,8 @@ class StageMap:
     """What the stage really does.
 
     matrix: (2, 2), from commanded to real moves, x and y. repeatability_um: of one approach, x
-    and y. covariance: of (matrix by rows, offset x y, backlash x y), each axis apart.
+    and y. backlash_um: NaN along an axis whose places were all approached from one side.
+    residual_um: (place, 2), what the map leaves of each place.
     """
 
     matrix: NDArray[np.float64]
@@ -80,7 +81,7 @@ class StageMap:
     backlash_um: tuple[float, float]
     repeatability_um: tuple[float, float]
     deviations: dict[str, float]
-    count: int
+    residual_um: NDArray[np.float64]
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -101,7 +102,7 @@ class StageMap:
     def real_um(self, commanded_um: tuple[float, float]) -> tuple[float, float]:
         """Return where the mask stands for a commanded position approached from below."""
         at = self.matrix @ np.array(commanded_um) + np.array(self.offset_um)
-        at = at + np.array(self.backlash_um) / 2
+        at = at + np.nan_to_num(self.backlash_um) / 2
         return float(at[0]), float(at[1])
 
     def rows(self) -> list[tuple[str, float, float, str]]:
@@ -117,7 +118,9 @@ class StageMap:
             "Repeatability, y": (self.repeatability_um[1], "repeatability_y_um", "um"),
         }
         return [
-            (name, value, self.deviations[key], unit) for name, (value, key, unit) in values.items()
+            (name, value, self.deviations[key], unit)
+            for name, (value, key, unit) in values.items()
+            if not np.isnan(value)
         ]
 
 
@@ -128,8 +131,9 @@ def stage_map(
 ) -> StageMap:
     """Return the map from where the stage was sent, and from which side, to where the mask stood.
 
-    came_from: +1 where an axis moved up to its place, -1 down. Raises CalibrationError for too
-    few moves, moves along one line, and approaches from one side only.
+    came_from: +1 where an axis moved up to its place, -1 down; from one side alone, backlash is
+    not determined and does not matter. Raises CalibrationError for too few moves, and moves along
+    one line.
     """
     commanded = np.array(commanded_um, dtype=np.float64)
     sides = np.array(came_from, dtype=np.float64)
@@ -138,26 +142,21 @@ def stage_map(
         raise CalibrationError(
             f"{len(commanded)} stage positions: the stage map needs {FEWEST - len(commanded)} more"
         )
-    for axis, name in enumerate("xy"):
-        if np.ptp(sides[:, axis]) == 0:
-            raise CalibrationError(
-                f"every position was approached from one side along {name}: backlash cannot be "
-                "told; visit some from the other side"
-            )
     rows = np.column_stack([commanded, np.ones(len(commanded))])
     scale = np.array([max(np.ptp(commanded[:, 0]), 1e-9), max(np.ptp(commanded[:, 1]), 1e-9), 1])
     if np.linalg.matrix_rank(rows / scale, tol=1e-6) < 3:
         raise CalibrationError("the stage positions lie on one line: move along x and along y")
     matrix, offset, backlash, spread = np.empty((2, 2)), [], [], []
-    covariances = []
+    covariances, left = [], np.empty(real.shape)
     for axis in (0, 1):
-        basis = np.column_stack([rows, sides[:, axis] / 2])
+        both_sides = np.ptp(sides[:, axis]) > 0
+        basis = np.column_stack([rows, *([sides[:, axis] / 2] if both_sides else [])])
         found, *_ = np.linalg.lstsq(basis, real[:, axis], rcond=None)
-        residual = real[:, axis] - basis @ found
+        left[:, axis] = residual = real[:, axis] - basis @ found
         variance = float(residual @ residual) / max(len(residual) - basis.shape[1], 1)
         matrix[axis] = found[:2]
         offset.append(float(found[2]))
-        backlash.append(float(found[3]))
+        backlash.append(float(found[3]) if both_sides else np.nan)
         spread.append(float(np.sqrt(variance)))
         covariances.append(np.linalg.inv(basis.T @ basis) * variance)
     deviations = _deviations(covariances, spread, len(commanded))
@@ -167,7 +166,7 @@ def stage_map(
         (backlash[0], backlash[1]),
         (spread[0], spread[1]),
         deviations,
-        len(commanded),
+        left,
     )
 
 
@@ -183,8 +182,8 @@ def _deviations(
         "scale_y": float(np.sqrt(along_y[1, 1])),
         "rotation_deg": float(turn[0]),
         "orthogonality_deg": float(np.hypot(*turn)),
-        "backlash_x_um": float(np.sqrt(along_x[3, 3])),
-        "backlash_y_um": float(np.sqrt(along_y[3, 3])),
+        "backlash_x_um": float(np.sqrt(along_x[-1, -1])),
+        "backlash_y_um": float(np.sqrt(along_y[-1, -1])),
         "repeatability_x_um": spread[0] / freedom,
         "repeatability_y_um": spread[1] / freedom,
     }

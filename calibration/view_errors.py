@@ -4,7 +4,7 @@ Through a real lens every view sees the mask a little displaced and a little sof
 placement has it (aberrations). Neighbouring views are coded nearly alike, so that a displacement of
 one reads like weight moved between its neighbours: where whiteboards open several views at once it
 biases the aperture's weights, alike over the whole picture, which no residual shows. Displacements
-and softenings are taken as normal, of variances tau^2 that the whiteboards' residuals tell (random
+and softenings are taken as normal, of variances tau^2 that the whiteboards' residuals show (random
 effects: Searle, Casella, McCulloch 1992, chapter 6); the placement's covariance C then grows by
 C N diag(tau^2) N^T C, N the information between its parameters and the views' own.
 """
@@ -22,8 +22,8 @@ Array = NDArray[np.floating]
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
 TAUS_UM = np.geomspace(0.002, 0.2, 6)
-"""Of each kind: from far less than any whiteboard tells to a hundredth of a pixel. Beforehand tau
-is uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to tell it well."""
+"""Of each kind: from far less than any whiteboard shows to a hundredth of a pixel. Beforehand tau
+is uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to determine it well."""
 
 
 def bias_covariance(

@@ -13,14 +13,15 @@ Source: whiteboard calibration as in Marwah et al. (ACM TOG 2013), supplement, t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, photon_transfer
+from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
@@ -29,6 +30,7 @@ LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 LARGEST_DARK_SHARE = 0.01
 IDEAL_DN = 1e6
+NewArray = Callable[[str, tuple[int, ...]], Any]
 Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -92,26 +94,39 @@ class Calibration:
         return self.gain.variance_dn2(frames_dn - self.dark_dn) / scale**2
 
 
-def measure_psi(boards: Whiteboards, design: ImagingMatrix) -> Calibration:
+def in_memory(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an array for Psi's `weights` or their `deviation`, of any content."""
+    return np.empty(shape, dtype=np.float32)
+
+
+def measure_psi(
+    boards: Whiteboards,
+    design: ImagingMatrix | PsiLayout,
+    empty: NewArray = in_memory,
+    on_plane: Callable[[str], None] = lambda what: None,
+) -> Calibration:
     """Return the measured Psi with the standard deviation of every coefficient.
 
-    design: Psi as designed; gives the sizes, the colour of every pixel, and how a pixel's
-    coefficient is shared among its samples. Raises CalibrationError for missing frames, frames
-    of another size, and a whiteboard too dark to divide by.
+    design: Psi as designed, or what it is for; gives the sizes, the colour of every pixel, and how
+    a pixel's coefficient is shared among its samples (of a layout: evenly). empty: makes the arrays
+    of coefficients, written view by view: in memory, or on disk for sensors whose Psi does not fit
+    there. on_plane: called after each. Raises CalibrationError for missing frames, frames of
+    another size, and a whiteboard too dark to divide by.
     """
-    gain = _gain(boards, design.layout)
-    weights = np.empty_like(design.weights)
-    deviation = np.empty_like(design.weights)
-    planes = measured_planes(boards, design.layout, design.weights)
-    for (shot, v, u, stored), values, spread in planes:
+    whole = isinstance(design, ImagingMatrix)
+    layout, designed = (design.layout, design.weights) if whole else (design, None)
+    gain = _gain(boards, layout)
+    weights, deviation = (empty(name, layout.shape) for name in ("weights", "deviation"))
+    for (shot, v, u, stored), values, spread in measured_planes(boards, layout, designed):
         weights[shot, v, u, :, stored] = values
         deviation[shot, v, u, :, stored] = spread
-    white = np.empty(design.frames_shape, dtype=np.float32)
-    for shot in range(design.shots):
-        white[shot] = sum(
-            reference for reference, _ in _references(boards, gain, design.layout, shot)
-        )
-    psi = ImagingMatrix(weights, design.colour, design.binning, design.camera_json)
+        on_plane(f"view ({v}, {u})")
+    white = np.zeros(layout.frames_shape, dtype=np.float32)
+    for shot, reading in enumerate(white):
+        for reference in _references(boards, gain, layout, shot):
+            for rows in bands(reading):
+                reading[rows] += _bright(boards, gain, reference, rows)[0]
+    psi = ImagingMatrix(weights, layout.colour, layout.binning, layout.camera_json)
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
 
 
@@ -121,8 +136,9 @@ def measured_planes(
     """Yield ((shot, v, u, stored colour), coefficients, their deviation), both (y, x).
 
     One plane is held at a time, and one whiteboard is asked for: `boards.pinholes` may read its
-    frames as it is asked. designed: Psi's weights as designed, which say how a pixel's coefficient
-    is shared among its samples (default: evenly). Raises as `measure_psi`.
+    frames as it is asked. What is computed is computed by bands of rows. designed: Psi's weights as
+    designed, which say how a pixel's coefficient is shared among its samples (default: evenly).
+    Raises as `measure_psi`.
     """
     lamps = lamps_needed(layout)
     gain = _gain(boards, layout)
@@ -132,21 +148,22 @@ def measured_planes(
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):
-                reference, reference_variance = references[stored]
                 name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
-                pinhole = boards.pinholes.get((shot, v, u, lamp))
-                signal, variance = _signal(boards, gain, pinhole, name)
-                ratio = signal / reference
-                relative = reference_variance / reference**2
-                spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
-                share = 1 / (k**2 * len(lamps))
-                if designed is not None:
-                    share = _shares(designed[shot, v, u, :, stored], k) / len(lamps)
-                yield (
-                    (shot, v, u, stored),
-                    (share * _samples(np.maximum(ratio, 0), k)).astype(np.float32),
-                    (share * _samples(spread, k)).astype(np.float32),
-                )
+                pinhole = _checked(boards, boards.pinholes.get((shot, v, u, lamp)), name)
+                values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
+                for rows in bands(pinhole.mean_dn):
+                    signal, variance = _signal(boards, gain, pinhole, rows)
+                    reference, reference_variance = _bright(boards, gain, references[stored], rows)
+                    ratio = signal / reference
+                    relative = reference_variance / reference**2
+                    spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
+                    samples = slice(k * rows.start, k * rows.stop)
+                    share = 1 / (k**2 * len(lamps))
+                    if designed is not None and k > 1:
+                        share = _shares(designed[shot, v, u, samples, stored], k) / len(lamps)
+                    values[samples] = share * _samples(np.maximum(ratio, 0), k)
+                    deviation[samples] = share * _samples(spread, k)
+                yield (shot, v, u, stored), values, deviation
 
 
 def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
@@ -158,12 +175,24 @@ def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
 
 def _references(
     boards: Whiteboards, gain: SensorGain, layout: PsiLayout, shot: int
-) -> list[tuple[Array, Array]]:
-    """Return DN per second of the references of a shot, lamp by lamp, and their variances."""
-    return [
-        _bright(boards, gain, boards.references.get((shot, lamp)), f"shot {shot}, {lamp} lamp")
-        for lamp in lamps_needed(layout)
-    ]
+) -> list[MeanFrame]:
+    """Return the references of a shot, lamp by lamp; refuses those too dark to divide by."""
+    found = []
+    for lamp in lamps_needed(layout):
+        what = f"shot {shot}, {lamp} lamp"
+        frame = boards.references.get((shot, lamp))
+        frame = _checked(boards, frame, f"{what}, open aperture without masks")
+        dark = [
+            (frame.mean_dn[rows] - boards.dark.mean_dn[rows] < DARKEST_REFERENCE_DN).sum()
+            for rows in bands(frame.mean_dn)
+        ]
+        if sum(dark) > LARGEST_DARK_SHARE * frame.mean_dn.size:
+            raise CalibrationError(
+                f"the reference whiteboard ({what}) has pixels less than {DARKEST_REFERENCE_DN:g} "
+                "DN above the dark: raise the lamp or the exposure"
+            )
+        found.append(frame)
+    return found
 
 
 def ideal_boards(
@@ -187,37 +216,35 @@ def ideal_boards(
     return Whiteboards(frame(np.zeros(size)), references, pinholes)
 
 
-def _signal(
-    boards: Whiteboards, gain: SensorGain, frame: MeanFrame | None, what: str
-) -> tuple[Array, Array]:
-    """Return DN per second above the dark and its variance, (y, x)."""
+def _checked(boards: Whiteboards, frame: MeanFrame | None, what: str) -> MeanFrame:
+    """Return a frame that is there, and of the size of the others."""
     if frame is None:
         raise CalibrationError(f"whiteboard missing: {what}; capture it before measuring Psi")
-    dark = boards.dark
-    if frame.mean_dn.shape != dark.mean_dn.shape:
+    if frame.mean_dn.shape != boards.dark.mean_dn.shape:
         raise CalibrationError(f"whiteboard {what}: another size than the dark frame")
-    signal = (frame.mean_dn - dark.mean_dn).astype(np.float64)
+    return frame
+
+
+def _signal(
+    boards: Whiteboards, gain: SensorGain, frame: MeanFrame, rows: slice
+) -> tuple[Array, Array]:
+    """Return DN per second above the dark of some rows and its variance, (y, x)."""
+    dark = boards.dark
+    signal = (frame.mean_dn[rows] - dark.mean_dn[rows]).astype(np.float64)
     variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
     variance = variance + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2
 
 
 def _bright(
-    boards: Whiteboards, gain: SensorGain, frame: MeanFrame | None, what: str
+    boards: Whiteboards, gain: SensorGain, frame: MeanFrame, rows: slice
 ) -> tuple[Array, Array]:
-    """Return `_signal` of a reference whiteboard; refuses one too dark to divide by.
+    """Return `_signal` of a reference whiteboard.
 
     A few hot or dead pixels, which no route uses, are taken as just bright enough.
     """
-    signal, variance = _signal(boards, gain, frame, f"{what}, open aperture without masks")
-    assert frame is not None
-    darkest = DARKEST_REFERENCE_DN / frame.exposure_s
-    if np.mean(signal < darkest) > LARGEST_DARK_SHARE:
-        raise CalibrationError(
-            f"the reference whiteboard ({what}) has pixels less than {DARKEST_REFERENCE_DN:g} DN "
-            "above the dark: raise the lamp or the exposure"
-        )
-    return np.maximum(signal, darkest), variance
+    signal, variance = _signal(boards, gain, frame, rows)
+    return np.maximum(signal, DARKEST_REFERENCE_DN / frame.exposure_s), variance
 
 
 def _samples(pixels: Array, binning: int) -> Array:

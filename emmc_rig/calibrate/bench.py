@@ -31,9 +31,9 @@ DARK_REPEATS = 2
 """Before all whiteboards, and after them."""
 REFERENCE_REPEATS = 4
 CHECK_EVERY = 5
-"""Whiteboards between two looks at the same one, which tell what the lamp does."""
+"""Whiteboards between two looks at the same one, which show how the lamp drifts."""
 SERIES_SHARES = (0.25, 0.5, 0.75)
-"""Of a reference's exposure: what tells whether the response is straight."""
+"""Of a reference's exposure: they show whether the response is linear."""
 FRAME_S = 0.5
 """Between two frames, for stage and readout."""
 COLOUR_REPEATS = 2
@@ -241,7 +241,9 @@ class WhiteboardBench:
             on_frame(label)
             sent = self.sent_um(setting)
             frames.append(
-                BoardFrame(frame, sent, setting.shot, setting.pinhole, setting.lamp, setting.window)
+                BoardFrame.held(
+                    frame, sent, setting.shot, setting.pinhole, setting.lamp, setting.window
+                )
             )
         if watched:
             seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))

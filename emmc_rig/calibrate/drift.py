@@ -178,7 +178,7 @@ def run_drift(
         raise AppError(
             f"{frames_folder / FRAMES}: {capture.readings.shape[0]} frames of "
             f"{capture.readings.shape[1]} x {capture.readings.shape[2]} pixels; this calibration "
-            f"is for {known.psi.frames_shape}"
+            "is for {} of {} x {}".format(*known.psi.frames_shape)
         )
     variance = np.full(capture.readings.shape, capture.noise_sigma**2)
     taken = Captures(capture.readings, variance, capture.usable, known.colour)

@@ -22,7 +22,7 @@ WATCHES = {
     "colours": "references under red, green and blue lamps",
     "turned": "the white board turned by 90 degrees",
 }
-"""Whiteboards that tell what else is wrong than the mask: each may be left out of a plan."""
+"""Whiteboards that show errors of other parts than the mask: each may be left out of a plan."""
 
 
 @dataclass(frozen=True)

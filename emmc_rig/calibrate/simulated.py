@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from calibration.boards import BoardSet, as_readings
+from calibration.parametric import Parametric
 from calibration.planning import (
     PlannedFrames,
 )
-from calibration.routes import Outcome, Parametric, calibrate
+from calibration.routes import Outcome, calibrate
 from calibration.sensor import SensorSheet, characterise
 from calibration.shadow import shadow_mask
 from calibration.stage_map import StageMap, locate, stage_map
@@ -155,7 +156,7 @@ def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None)
 def measured_stage(
     bench: WhiteboardBench, design: ImagingMatrix, known: Parametric, watcher: Watcher
 ) -> StageMap:
-    """Send the mask stage about, from both sides, and return what one whiteboard each tells."""
+    """Move the mask stage about, from both sides, with a whiteboard each; return its map."""
     if not bench.camera.moving_masks:
         raise AppError("--stage: no mask of this camera moves")
     rng = np.random.default_rng(bench.seed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.placement import SCALARS, labels
-from calibration.routes import Outcome, Parametric
-from calibration.whiteboard import Calibration
+from calibration.routes import Outcome
+from calibration.whiteboard import Calibration, NewArray
 from emmc_rig.files.frames import PSI
 
 Array = NDArray[np.floating]
@@ -79,37 +81,52 @@ def _fit_figures(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def save_calibration(
-    path: Path, calibration: Calibration, known: Parametric | None, seen: Array | None = None
-) -> None:
-    """Write what turns frames into readings, how sure Psi is, and the placement, as HDF5.
+@contextmanager
+def arrays_in(folder: Path) -> Iterator[NewArray]:
+    """Yield what makes the arrays of Psi in the files of a folder that `save_outcome` completes."""
+    with ExitStack() as files:
 
-    seen: what every filter sees of the colours, (filter, colour).
-    """
-    with h5py.File(path, "w") as file:
-        file.attrs["gain_dn_per_electron"] = calibration.gain.gain_dn_per_electron
-        file.attrs["dark_variance_dn2"] = calibration.gain.dark_variance_dn2
-        file["deviation"] = calibration.deviation
-        file["dark_dn"] = calibration.dark_dn
-        file["white_dn_per_s"] = calibration.white_dn_per_s
-        if calibration.good is not None:
-            file["good"] = calibration.good
-        if seen is not None:
-            file["crosstalk"] = seen
-        if known is not None:
-            for name in SCALARS:
-                file.attrs[name] = getattr(known.fit.placement, name)
-            file["aperture"] = np.array(known.fit.placement.aperture)
-            if known.defects is not None:
-                file["lost"] = known.defects.lost
+        def empty(name: str, shape: tuple[int, ...]) -> h5py.Dataset:
+            path = folder / {"weights": PSI, "deviation": CALIBRATION}[name]
+            file = files.enter_context(h5py.File(path, "w"))
+            return file.create_dataset(name, shape, np.float32)
+
+        yield empty
 
 
 def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
-    """Write psi.h5 and calibration.h5 of the calibration chosen into an existing folder."""
-    best = outcome.mixed or outcome.parametric
-    known = {"parametric": outcome.parametric, "mixed": outcome.mixed, "combined": best}.get(
-        outcome.chosen
-    )
+    """Write psi.h5 and calibration.h5 of the calibration chosen into an existing folder.
+
+    Arrays that are on disk stay where they are, and their files get the rest.
+    """
+    weights, deviation = chosen.psi.weights, chosen.deviation
+    if isinstance(weights, h5py.Dataset) and isinstance(deviation, h5py.Dataset):
+        chosen.psi.describe(weights.file)
+        _describe(deviation.file, outcome, chosen)
+        return
     chosen.psi.save(folder / PSI)
-    seen = None if outcome.crosstalk is None else outcome.crosstalk.seen
-    save_calibration(folder / CALIBRATION, chosen, known, seen)
+    with h5py.File(folder / CALIBRATION, "w") as file:
+        file["deviation"] = chosen.deviation
+        _describe(file, outcome, chosen)
+
+
+def _describe(file: h5py.File, outcome: Outcome, chosen: Calibration) -> None:
+    """Write what turns frames into readings, and where the mask sat."""
+    file.attrs["gain_dn_per_electron"] = chosen.gain.gain_dn_per_electron
+    file.attrs["dark_variance_dn2"] = chosen.gain.dark_variance_dn2
+    file["dark_dn"] = chosen.dark_dn
+    file["white_dn_per_s"] = chosen.white_dn_per_s
+    if chosen.good is not None:
+        file["good"] = chosen.good
+    if outcome.crosstalk is not None:
+        # What every filter sees of the colours, (filter, colour).
+        file["crosstalk"] = outcome.crosstalk.seen
+    best = outcome.mixed or outcome.parametric
+    by_route = {"parametric": outcome.parametric, "mixed": outcome.mixed, "combined": best}
+    known = by_route.get(outcome.chosen)
+    if known is not None:
+        for name in SCALARS:
+            file.attrs[name] = getattr(known.fit.placement, name)
+        file["aperture"] = np.array(known.fit.placement.aperture)
+        if known.defects is not None:
+            file["lost"] = known.defects.lost

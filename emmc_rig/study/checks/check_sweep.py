@@ -27,6 +27,7 @@ from emmc_rig.study.checks.scenes import (
 )
 from emmc_rig.study.checks.session import check_session
 from emmc_rig.study.checks.statistics import check_bound, check_plan
+from emmc_rig.study.checks.streamed import check_streamed
 from emmc_rig.study.sweep import Results, Sweep, machine, sweep_folder
 
 CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
@@ -42,6 +43,7 @@ CHECKS: dict[str, Callable[[CalibrateSettings], tuple[list[Row], dict]]] = {
     "alarms": check_alarms,
     "large": check_large,
     "session": check_session,
+    "streamed": check_streamed,
 }
 EFFECTS = "effects"
 COMMAND = "calibrate --check"

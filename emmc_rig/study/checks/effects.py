@@ -47,10 +47,7 @@ def check_effect(settings: CalibrateSettings, name: str) -> tuple[list[Row], dic
     if settings.psnr:
         captured = captured_scene(BUILT_IN[1], settings.camera, truth, settings.seed, settings.size)
         known = run.outcome.calibration
-        readings = known.readings(captured.frames_dn, captured.exposures_s)
-        usable = known.usable(captured.frames_dn, settings.camera.sensor.noise.white_level_dn)
-        variance = known.reading_variance(captured.frames_dn, captured.exposures_s)
-        sigma = float(np.sqrt(variance[usable].mean()))
+        readings, _, usable, sigma = captured.read(known)
         true = run.bench.true_psi()
         detail["cost_db"] = cost_db = psnr_cost_db(
             known.psi, true, readings, sigma, usable, captured.truth

@@ -69,6 +69,14 @@ class _Captured:
     frames_dn: NDArray[np.uint16]
     exposures_s: Array
 
+    def read(self, calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_], float]:
+        """Return readings, their variance, what is usable, and the deviation of all together."""
+        given = self.frames_dn, self.exposures_s
+        white = self.bench.camera.sensor.noise.white_level_dn
+        usable = calibration.usable(self.frames_dn, white)
+        variance = calibration.reading_variance(*given)
+        return calibration.readings(*given), variance, usable, float(variance[usable].mean() ** 0.5)
+
 
 def captured_scene(
     spec: str, camera: Camera, truth: BenchTruth, seed: int, size: tuple[int, int] = SCENE_SIZE
@@ -88,11 +96,7 @@ def _reconstructed(
     psi: ImagingMatrix, calibration: Calibration, captured: _Captured
 ) -> tuple[float, ResidualCheck]:
     """Return the PSNR of a TV reconstruction, and what its residuals look like."""
-    readings = calibration.readings(captured.frames_dn, captured.exposures_s)
-    white = captured.bench.camera.sensor.noise.white_level_dn
-    usable = calibration.usable(captured.frames_dn, white)
-    variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
-    sigma = float(np.sqrt(variance[usable].mean()))
+    readings, variance, usable, sigma = captured.read(calibration)
     result = reconstruct_tv(psi, readings, sigma, TVSettings(), usable)
     residual = readings - psi.forward(result.light_field)
     return psnr_db(result.light_field, captured.truth), check_residuals(residual, variance, usable)
@@ -126,13 +130,13 @@ def check_cost(settings: CalibrateSettings) -> tuple[list[Row], dict]:
             for name, one in outcome.calibrations.items()
         }
         costs["design"] = with_exact - _psnr(design, calibration, captured)
-        detail[Path(spec).name] = {"exact_psnr_db": with_exact, **costs}
         name = Path(spec).name
-        rows.append(
-            target_row(f"{name}: cost of the parametric Psi, dB", costs["parametric"], 0.3, ".3f")
-        )
-        rows.append(target_row(f"{name}: cost of the mixed Psi, dB", costs["mixed"], 0.3, ".3f"))
-        rows.append(target_row(f"{name}: cost of the design, dB", costs["design"], None, ".2f"))
+        detail[name] = {"exact_psnr_db": with_exact, **costs}
+        for what, limit, form in (
+            ("parametric Psi", 0.3, ".3f"), ("mixed Psi", 0.3, ".3f"), ("design", None, ".2f")
+        ):  # fmt: skip
+            cost_db = costs[what.removesuffix(" Psi")]
+            rows.append(target_row(f"{name}: cost of the {what}, dB", cost_db, limit, form))
     return rows, detail
 
 
@@ -172,14 +176,12 @@ def check_frames(settings: CalibrateSettings) -> tuple[list[Row], dict]:
             )
         )
         if db > reached - SAME_DB:
-            whiteboards = len(free_boards.frames) / boards
-            rows.append(
-                target_row("whiteboards, free over parametric", whiteboards, 5.0, ".1f", above=True)
-            )
-            every = free_boards.exposures / few.exposures
-            rows.append(
-                target_row("all frames, free over parametric", every, 5.0, ".1f", above=True)
-            )
+            for what, times in (
+                ("whiteboards", len(free_boards.frames) / boards),
+                ("all frames", free_boards.exposures / few.exposures),
+            ):
+                named = f"{what}, free over parametric"
+                rows.append(target_row(named, times, 5.0, ".1f", above=True))
             break
     else:
         rows.append(Row("the parametric routes do not reach it", "-", "at least 5.0", "missed"))
@@ -187,16 +189,9 @@ def check_frames(settings: CalibrateSettings) -> tuple[list[Row], dict]:
 
 
 def _drift_of(
-    outcome_calibration: Calibration,
-    shadow: Shadow,
-    captured: _Captured,
-    design: ImagingMatrix,
+    calibration: Calibration, shadow: Shadow, captured: _Captured, design: ImagingMatrix
 ) -> Drift:
-    calibration = outcome_calibration
-    readings = calibration.readings(captured.frames_dn, captured.exposures_s)
-    white = captured.bench.camera.sensor.noise.white_level_dn
-    usable = calibration.usable(captured.frames_dn, white)
-    variance = calibration.reading_variance(captured.frames_dn, captured.exposures_s)
+    readings, variance, usable, _ = captured.read(calibration)
     colour, k = design.colour, design.binning
     taken = Captures(readings, variance, usable, None if colour is None else colour[:, ::k, ::k])
     stages = shot_stages(captured.bench.camera)

@@ -1,0 +1,61 @@
+"""The free route of `calibrate SESSION`: Psi written to disk view by view is Psi in memory."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from programs import exit_code
+
+import emmc_rig as emmc
+from calibration import frames
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.study.checks.streamed import check_streamed, drawn_session
+
+NAME, SIZE = "rgbw-bayer-1shot", (48, 64)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    settings = CalibrateSettings(NAME, find_camera(NAME), SIZE)
+    return drawn_session(tmp_path_factory.mktemp("drawn") / "session", settings)[0]
+
+
+def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
+    whole = emmc.calibrate(session, "free")
+    whole.save(tmp_path / "whole")
+    monkeypatch.setattr(frames, "BAND_PIXELS", 5 * SIZE[1])
+    out = tmp_path / "streamed"
+    assert exit_code("calibrate", session.folder, "--route", "free", "--out", out) == 0
+    psi = ImagingMatrix.load(out / "psi.h5")
+    np.testing.assert_allclose(psi.weights, whole.psi.weights, rtol=1e-6, atol=1e-9)
+    assert psi.camera_json == whole.psi.camera_json
+    np.testing.assert_array_equal(psi.colour, whole.psi.colour)
+    with (
+        h5py.File(out / "calibration.h5") as one,
+        h5py.File(tmp_path / "whole/calibration.h5") as two,
+    ):
+        assert set(one) == set(two)
+        assert set(one.attrs) == set(two.attrs)
+        for name in two:
+            written, kept = one[name], two[name]
+            assert isinstance(written, h5py.Dataset)
+            assert isinstance(kept, h5py.Dataset)
+            np.testing.assert_allclose(written[...], kept[...], rtol=1e-5, atol=1e-9)
+    judged = [
+        json.loads((tmp_path / name / "metrics.json").read_text())["held_out"]["free"]
+        for name in ("streamed", "whole")
+    ]
+    assert judged[0]["chi2"] == pytest.approx(judged[1]["chi2"], rel=1e-6)
+
+
+def test_the_check_measures_the_command_and_not_the_program_that_starts_it():
+    held = np.ones(2**28, np.float32)  # 1 GiB
+    settings = CalibrateSettings(NAME, find_camera(NAME), (24, 32))
+    rows, detail = check_streamed(settings)
+    assert held.all()
+    assert 0.1 < detail["peak_gib"] < 0.9
+    assert detail["cpu_seconds"] > 0.1
+    assert {row.verdict for row in rows} <= {"", "met"}
