@@ -150,7 +150,7 @@ def check_frame(
 
 
 class ShapeFromFrames(ABC):
-    """Base of cameras whose frames alone tell their shape and colours: `snap` keeps both."""
+    """Base of cameras whose shape and colours only frames show: `snap` keeps both."""
 
     _shape: tuple[int, int] | None = None
     _cfa: str | None = None

@@ -25,10 +25,14 @@ PTP_IP = "PTP/IP Camera"
 PAIR_LIMIT_S = 2.0
 """How long to wait for a RAW file once another file of the same exposure came."""
 SHUTTER, ISO = "shutterspeed", "iso"
+TARGET, CARD = "capturetarget", "Memory card"
+"""Where frames go. Otherwise it is what libgphoto2 last stored in this user's home, else the
+camera's memory, which not every EOS takes.
+"""
 IDENTITY = ("manufacturer", "cameramodel", "serialnumber", "deviceversion")
 SECONDS = re.compile(r'(?:(\d+)/)?(\d+(?:\.\d+)?) ?(?:s|sec|")?')
 ADVICE = {
-    -1: "look at the camera's display",
+    -1: "look at the camera's display; without a memory card, set capturetarget: Internal RAM",
     -7: "check cable and power; switch the camera off and on",
     -10: "check cable and power; switch the camera off and on",
     -52: "plug it in and switch it on",
@@ -53,9 +57,10 @@ class GphotoCamera(ShapeFromFrames):
 
     address: a port such as `usb:001,007` or `ptpip:192.168.1.5`; "" takes the first camera found.
     model: libgphoto2's name of it; "" where libgphoto2 finds that out. settings: by libgphoto2's
-    names, set at the start. delete: each RAW file from the card once it has arrived; a JPEG beside
-    it stays. The size of a frame is known from the first one, which asking for it takes. Raises
-    `GphotoError`, `CameraSettingError`.
+    names, set at the start; frames go to the memory card unless `capturetarget` says otherwise.
+    delete: each RAW file from the card once it has arrived; a JPEG beside it stays. The size of a
+    frame is known from the first one, which asking for it takes. Raises `GphotoError`,
+    `CameraSettingError`.
     """
 
     def __init__(
@@ -83,7 +88,8 @@ class GphotoCamera(ShapeFromFrames):
             self._choose(address, model)
             self._camera.init()
         try:
-            for name, value in (settings or {}).items():
+            on_card = {TARGET: CARD} if CARD in self._choices(TARGET) else {}
+            for name, value in (on_card | dict(settings or {})).items():
                 self._set(name, str(value))
             self._shutters = self._numbers(SHUTTER, seconds_of)
             self._isos = self._numbers(ISO, lambda word: float(word) if word.isdecimal() else None)
@@ -214,16 +220,16 @@ class GphotoCamera(ShapeFromFrames):
 
     def _numbers(self, name: str, number: Any) -> dict[float, str]:
         """Return the choices of a setting that are numbers above 0, {} where it has none."""
-        with self._lock:
-            try:
-                widget = self._camera.get_single_config(name)
-                if widget is None or widget.get_readonly():
-                    return {}
-                words = list(widget.get_choices())
-            except self._gp.GPhoto2Error:
-                return {}
-        found = {number(word): word for word in words}
+        found = {number(word): word for word in self._choices(name)}
         return {value: word for value, word in found.items() if value}
+
+    def _choices(self, name: str) -> list[str]:
+        """Return the words that a setting may be set to, [] where it has none."""
+        with self._lock, suppress(self._gp.GPhoto2Error):
+            widget = self._camera.get_single_config(name)
+            if widget is not None and not widget.get_readonly():
+                return list(widget.get_choices())
+        return []
 
     def _text(self, name: str) -> str:
         """Return a setting's value, "" where the camera has none such."""

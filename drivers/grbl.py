@@ -63,7 +63,7 @@ class GrblStage(HostStage):
     """Axes of one controller, `axes` mapping names to letters; positions are machine positions.
 
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
-    not tell whether it was homed, so every axis must be homed after connecting. Homing some of
+    not report whether it was homed, so every axis must be homed after connecting. Homing some of
     the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
     controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
     be, without which the firmware's default counts as never set. `any_scale` skips that: only to

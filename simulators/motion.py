@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from enum import Enum, auto
+from functools import cached_property
 from typing import Protocol
 
 from drivers.clock import Clock
@@ -56,7 +57,7 @@ class Motion:
     speed_um_s: float
     acceleration_um_s2: float
 
-    @property
+    @cached_property
     def peak_um_s(self) -> float:
         """Fastest speed reached; a short move never reaches its top speed."""
         distance_um = abs(self.end_um - self.start_um)

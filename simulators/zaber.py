@@ -293,8 +293,9 @@ class ZaberChain(SimulatedController):
     ) -> None:
         """Let the triggers on an axis fire that its position calls for."""
         for trigger in device.triggers.values():
-            beyond = axis.counter - trigger.value
-            if trigger.left and trigger.axis == number and (beyond >= 0) == trigger.rises:
+            if not trigger.left or trigger.axis != number:
+                continue
+            if (axis.counter >= trigger.value) == trigger.rises:
                 trigger.left -= 1
                 at_s = self._clock.now_s() if ended_s is None else ended_s
                 self._set_output(address, device, trigger.output, trigger.level, at_s)

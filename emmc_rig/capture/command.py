@@ -30,10 +30,10 @@ from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.sequencer import RunEnd, Sequencer
+from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.suspend import Suspend, suspended_by
 from emmc_rig.capture.until import Until, refuse_without_choice
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.capture.watcher import CaptureWatcher, RunEnd
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.replaced import replace_text

@@ -78,7 +78,7 @@ class Exposures:
     def seconds(
         self, frame: PlannedFrame, meterings: Mapping[str, Entry], decided: Entry | None
     ) -> float | None:
-        """Return a frame's exposure; None where nothing tells.
+        """Return a frame's exposure; None where nothing determines it.
 
         meterings: journal lines of metering frames. decided: what metering of the scene asks for.
         """
@@ -111,7 +111,7 @@ def last_session(out: Path, rig: Mapping[str, Any]) -> Session | None:
                 written_s = (folder / JOURNAL).stat().st_mtime
                 found.append((written_s, session))
         except (AppError, OSError):
-            continue  # a damaged neighbour tells nothing
+            continue  # a damaged neighbour is no evidence
     return max(found, key=lambda one: one[0])[1] if found else None
 
 
@@ -185,7 +185,7 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
 def known_exposures(
     exposures: Exposures, meterings: Mapping[str, Entry], entries: list[Entry]
 ) -> Callable[[PlannedFrame], float | None]:
-    """Return what tells a frame's exposure by a session's journal as it is now."""
+    """Return what determines a frame's exposure, by a session's journal as it is now."""
     decided = metered(entries)
     return lambda frame: exposures.seconds(frame, meterings, decided)
 

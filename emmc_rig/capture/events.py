@@ -25,13 +25,12 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.raw import RawFrame
 from emmc_rig.capture.checks import Figures
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.capture.watcher import CaptureWatcher, RunEnd
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.sequencer import RunEnd
     from reconstruction.result import Reconstruction
 
 

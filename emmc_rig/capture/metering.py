@@ -36,7 +36,7 @@ through masks, so that most scenes stay below 4."""
 def better_metering_s(
     frame: RawFrame, found: Figures, exposure_s: float, limits_s: Limits
 ) -> float | None:
-    """Return a better exposure for a metering frame; None: this one tells, or none is possible."""
+    """Return a better exposure for a metering frame; None: this one will do, or none exists."""
     level = found.bright_dn / (frame.white_level_dn - float(frame.black_level_dn.mean()))
     low, high = USABLE_LEVELS
     if low <= level <= high:

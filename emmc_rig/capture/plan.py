@@ -187,7 +187,7 @@ class Suspender(Settings):
     """A figure that makes a capture wait while it is outside its range.
 
     name: for people. file: a text file that begins with the figure, as a lab's own program or the
-    system keeps it. camera: or what the camera tells under this name. low, high: the range.
+    system keeps it. camera: or what the camera reports under this name. low, high: the range.
     """
 
     name: str

@@ -42,7 +42,7 @@ from emmc_rig.capture.plan import Boards, Plan
 from emmc_rig.capture.preflight import refuse_impossible
 from emmc_rig.capture.retries import Budget, mending
 from emmc_rig.capture.suspend import Suspend
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.capture.watcher import CaptureWatcher, RunEnd
 from emmc_rig.capture.writer import Writer
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
@@ -63,17 +63,6 @@ TELL_LEFT_S = 1.0
 ALL_TAKEN = "all frames are taken: finish, or take some once more"
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
-
-
-@dataclass(frozen=True)
-class RunEnd:
-    """How a run ended: complete, or stopped by whoever controls it."""
-
-    complete: bool
-    taken: int
-    missing: int
-    retries: int
-    seconds: float
 
 
 @dataclass
@@ -215,7 +204,7 @@ class Sequencer:
         rig, camera = self._rig, self._camera
         settings = {}
         with suppress(DriverError):
-            # What else a camera tells, such as its battery, it may also not tell.
+            # Other values, such as the battery's, a camera may not report.
             settings = dict(getattr(camera, "details", dict)())
         return {
             "wall": self._wall(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 ENDING = ("SIGTERM", "SIGHUP")
@@ -21,3 +22,14 @@ def handled(handler: Any, names: Iterable[str]) -> Iterator[None]:
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
+
+
+@contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """Let a request to end, or a closed terminal, act as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    with handled(interrupt, ENDING):
+        yield

@@ -30,7 +30,7 @@ SMALLEST = (16, 16)
 def refuse_without_choice(plan: Plan, camera: Camera) -> None:
     """Raise AppError or CalibrationError unless a plan lets shots be chosen; camera: as planned.
 
-    Its whiteboards must tell Psi of every shot before the first one is taken.
+    Its whiteboards must determine Psi of every shot before the first one is taken.
     """
     if len(plan.shots) < 2:
         raise AppError(

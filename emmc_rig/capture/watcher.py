@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.raw import RawFrame
@@ -10,11 +11,21 @@ from emmc_rig.capture.checks import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.sequencer import RunEnd
     from emmc_rig.session.session import Session
     from reconstruction.result import Reconstruction
 
 STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+
+
+@dataclass(frozen=True)
+class RunEnd:
+    """How a run ended: complete, or stopped by whoever controls it."""
+
+    complete: bool
+    taken: int
+    missing: int
+    retries: int
+    seconds: float
 
 
 class CaptureWatcher:

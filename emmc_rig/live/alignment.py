@@ -61,8 +61,8 @@ class MaskPlace:
     """Where the mask's shadow lies against the design's; every figure with its deviation.
 
     rotation_deg: of the mask, counterclockwise in the picture. scale: 1 as designed; the shadow
-    cannot tell a stretched mask from one at another distance. offset_um: of the mask, x and y,
-    from where the stage should have it; None for a periodic mask, whose periods look alike.
+    cannot distinguish a stretched mask from one at another distance. offset_um: of the mask, x and
+    y, from where the stage should have it; None for a periodic mask, whose periods look alike.
     correlation: of frame and shadow, up to 1.
     """
 
@@ -128,7 +128,7 @@ class MaskGauge:
 
         stage_um: where the mask stage stands, x and y, from where it centres the mask. shot: of
         the camera, whose filter is in. Raises CalibrationError with the reason where the frame
-        does not tell.
+        does not show.
         """
         board = self._board(frame, stage_um, shot)
         if self._last is not None:

@@ -11,6 +11,7 @@ async function ask(path, options) {
 
 // Returns what the action answers, null where it was refused.
 async function act(name, values = {}) {
+  hiddenLines = [];
   try {
     const answer = await ask("do/" + name, {
       method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(values),
@@ -18,7 +19,10 @@ async function act(name, values = {}) {
     });
     complain("");
     return await answer.json();
-  } catch (fault) { complain(fault.message); return null; }
+  } catch (fault) {
+    complain(fault instanceof TypeError ? `${name}: the program does not answer` : fault.message);
+    return null;
+  }
 }
 
 let complaint = "";
@@ -27,11 +31,31 @@ function complain(text) { complaint = text; drawTrouble(); }
 // What is announced is written only when it changes: a screen reader reads it again otherwise.
 function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
 
-function drawTrouble() {
-  const lines = [complaint, ...Object.values(state.trouble || {})].filter(Boolean);
-  $("trouble").hidden = lines.length === 0;
-  write("trouble", lines.join("; "));
+// What was read may be hidden; with the next action it is shown again where it still holds.
+let hiddenLines = [], lostSince = "";
+function troubleLines() {
+  const lost = lostSince && `No connection since ${lostSince}: what is shown is from then. Where the program has`
+    + " ended, start it again and open the address that it prints";
+  return [lost, complaint, ...Object.values(state.trouble || {})].filter(Boolean);
 }
+
+// The same, where `so` is what somebody types.
+function writeWithCode(id, text) {
+  if ($(id).dataset.text === text) return;
+  $(id).dataset.text = text;
+  fill($(id), text.split("`").map((part, i) => i % 2 ? cell("code", part) : part));
+}
+
+function drawTrouble() {
+  const lines = troubleLines();
+  hiddenLines = hiddenLines.filter((line) => lines.includes(line));
+  const shown = lines.filter((line) => !hiddenLines.includes(line));
+  $("trouble").hidden = shown.length === 0;
+  write("trouble-text", shown.join("; "));
+  $("lost").hidden = !lostSince;
+  document.body.classList.toggle("stale", Boolean(lostSince || state.trouble?.camera));
+}
+$("trouble-close").addEventListener("click", () => { hiddenLines = troubleLines(); drawTrouble(); });
 
 // Draw every newer state; what is seen of the light field follows it.
 function follow(draw) {
@@ -39,7 +63,7 @@ function follow(draw) {
   source.onmessage = (event) => {
     const before = state;
     state = JSON.parse(event.data);
-    $("lost").hidden = true;
+    lostSince = "";
     $("read-only").hidden = !state.read_only;
     drawTrouble();
     drawField();
@@ -47,7 +71,7 @@ function follow(draw) {
     showField();
     if (state.ended) source.close();
   };
-  source.onerror = () => { $("lost").hidden = false; };
+  source.onerror = () => { lostSince ||= new Date().toLocaleTimeString(); drawTrouble(); };
 }
 
 function cell(kind, text, style = "") {

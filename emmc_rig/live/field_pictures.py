@@ -1,8 +1,9 @@
-"""Pictures that a page draws a light field from: all views in one, and the disparity."""
+"""What a page turns a light field by: views, disparities and maps, as `viewer.js` reads them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.live.picture import disparity_png, encoded
+from emmc_rig.files.formats import Export
 from emmc_rig.live.server import Picture, Pictured, Query
-from emmc_rig.pages.frame_view import srgb_codes
+from emmc_rig.pages.display import PART_PIXELS
+from emmc_rig.pages.viewer import viewer_data
 
 Array = NDArray[np.floating]
-LONGEST_SHEET_PX = 4096
 SURE_PX = 0.15
 """Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
 WINDOW_PX = 7
@@ -23,44 +24,32 @@ WINDOW_PX = 7
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """All views side by side, and the centre view's disparity.
+    """A light field and its maps; each has another number.
 
-    sheet: (V y, U x, BGR). disparity: (y, x) in pixels of the sheet per view step, NaN where the
-    views do not tell.
+    block: how many of the camera's samples, along each axis, one of the light field is.
     """
 
     number: int
-    views: tuple[int, int]
-    sheet: NDArray[np.uint8]
-    disparity: NDArray[np.float32]
+    export: Export
+    block: int = 1
 
     def facts(self) -> dict[str, Any]:
-        """Return what the page's script needs to draw them, plain data."""
-        known = self.disparity[np.isfinite(self.disparity)]
-        rows, columns = self.sheet.shape[:2]
-        return {
-            "number": self.number,
-            "views": list(self.views),
-            "size": [rows // self.views[0], columns // self.views[1]],
-            "disparities": [float(d) for d in np.percentile(known, (5, 95))]
-            if known.size
-            else None,
-        }
+        """Return what the page needs before it asks for them, as plain data."""
+        return {"number": self.number, "views": list(self.export.light_field.shape[:2])}
+
+    def encoded(self) -> bytes:
+        """Return what the viewer reads, JSON."""
+        data = viewer_data(self.export, most_pixels=PART_PIXELS)
+        data["scale"] = float(str(data["scale"])) / self.block
+        return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
 
 
-def drawn(light_field: Array, disparity: Array | None, number: int) -> Pictures:
-    """Return pictures of a light field (v, u, y, x, c); disparity: (y, x), None: estimated."""
-    views_v, views_u, high, wide, _ = light_field.shape
-    shrink = max(1, int(np.ceil(max(views_v * high, views_u * wide) / LONGEST_SHEET_PX)))
-    size = wide // shrink, high // shrink
-    tiles = [[_fitted(light_field[v, u], size) for u in range(views_u)] for v in range(views_v)]
-    linear = np.concatenate([np.concatenate(row, axis=1) for row in tiles], axis=0)
-    if disparity is None:
-        found = disparity_of(np.stack([np.stack(row) for row in tiles]))
-    else:
-        found = _fitted(np.asarray(disparity), size) / np.float32(shrink)
-    sheet = np.ascontiguousarray(srgb_codes(linear)[..., ::-1])
-    return Pictures(number, (views_v, views_u), sheet, found)
+def export_of(
+    light_field: Array, maps: Mapping[str, NDArray], misfit: Array | None = None
+) -> Export:
+    """Return a light field with those of a method's maps that the viewer shows."""
+    disparity, sigma, model = (maps.get(name) for name in ("disparity", "sigma", "model"))
+    return Export("", "", light_field, None, disparity, sigma, model, misfit)
 
 
 def field_pictures(
@@ -68,25 +57,11 @@ def field_pictures(
 ) -> dict[str, Pictured]:
     """Return what a `emmc_rig.live.server.Page` serves of a light field."""
 
-    def views(query: Query) -> Picture | None:
+    def light_field(query: Query) -> Picture | None:
         shown = newest()
-        return shown and Picture("views", shown.number, lambda: encoded(shown.sheet))
+        return shown and Picture("light field", shown.number, shown.encoded, "application/json")
 
-    def disparity(query: Query) -> Picture | None:
-        shown = newest()
-        return shown and Picture(
-            "disparity", shown.number, lambda: disparity_png(shown.disparity), "image/png"
-        )
-
-    return {"views.jpg": views, "disparity.png": disparity}
-
-
-def _fitted(view: Array, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return a picture (y, x[, c]) at size (x, y)."""
-    if view.shape[1::-1] == size:
-        return np.asarray(view, np.float32)
-    whole = np.ascontiguousarray(view, np.float32)
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
+    return {"light-field.json": light_field}
 
 
 def disparity_of(light_field: Array) -> NDArray[np.float32]:

@@ -33,7 +33,7 @@ class Sharpness:
 
 
 def sharpness(now: RawFrame, before: RawFrame) -> Sharpness | None:
-    """Return how sharp two frames of the same scene are; None where they do not tell."""
+    """Return how sharp two frames of the same scene are; None where they do not show it."""
     alike = (now.mosaic.shape, now.cfa, now.exposure_s)
     if alike != (before.mosaic.shape, before.cfa, before.exposure_s):
         return None
@@ -76,20 +76,24 @@ class FocusMeter:
         self._seen: deque[tuple[float, Sharpness]] = deque()
 
     def forget(self) -> None:
-        """Compare with nothing seen so far: something else is before the camera."""
+        """Compare with nothing seen so far: something else is before the camera.
+
+        May be called by another thread while `add` works: what that looks at is left as it is.
+        """
         self._before = None
-        self._seen.clear()
+        self._seen = deque()
 
     def add(self, frame: RawFrame, now_s: float) -> dict[str, float] | None:
         """Return the share of the best sharpness and its deviation; None where unknown."""
         before, self._before = self._before, frame
         found = None if before is None else sharpness(frame, before)
-        while self._seen and now_s - self._seen[0][0] > REMEMBERED_S:
-            self._seen.popleft()
+        seen = self._seen
+        while seen and now_s - seen[0][0] > REMEMBERED_S:
+            seen.popleft()
         if found is None:
             return None
-        self._seen.append((now_s, found))
-        best = max((one for _, one in self._seen), key=lambda one: one.value)
+        seen.append((now_s, found))
+        best = max((one for _, one in seen), key=lambda one: one.value)
         share = found.value / best.value
         relative = np.hypot(found.deviation / found.value, best.deviation / best.value)
         return {

@@ -20,7 +20,8 @@ from calibration.bracket import fuse
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import Pictures, drawn
+from emmc_rig.files.formats import Export
+from emmc_rig.live.field_pictures import Pictures, disparity_of, export_of
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -29,6 +30,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.preview import Preview
 from reconstruction.result import Progress, Reconstruction
+from reconstruction.verdict.missed import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
@@ -44,6 +46,8 @@ CHANGED = 4.0
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
 BLOCK_PX = 16
 ANOTHER_BRIGHTNESS = 1.2
+COMPILING_S = 5.0
+"""Without a step, from when on the page says why."""
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
 
@@ -128,7 +132,11 @@ class LiveLightField:
         if run is not None and run.result is not None and self._drawn is not run:
             self._drawn = run
             found = run.result[0]
-            self._draw(found.light_field, found.maps.get("disparity"))
+            taken = run.frames
+            missed = missed_readings(
+                run.psi, found.light_field, taken.readings, taken.noise_sigma, taken.usable
+            )
+            self._draw(export_of(found.light_field, found.maps, missed))
         return self._report("")
 
     def _give_up(self) -> None:
@@ -179,7 +187,9 @@ class LiveLightField:
             noise = self._noise(shots, readings)
             self.preview = Preview(psi, int(step), readings, noise, seen)
         self.preview.follow(readings, STEPS)
-        self._draw(self.preview.light_field, None)
+        coarse = self.preview.light_field
+        block = max(1, self.psi.size[1] // coarse.shape[3])
+        self._draw(export_of(coarse, {"disparity": disparity_of(coarse)}), block)
 
     _shots = 0
 
@@ -210,9 +220,9 @@ class LiveLightField:
             usable[place] = linear.usable & seen & scale.good
         return psi, Frames(readings, deviation, usable)
 
-    def _draw(self, light_field: Array, disparity: Array | None) -> None:
+    def _draw(self, export: Export, block: int = 1) -> None:
         self._numbers += 1
-        self._pictures = drawn(light_field, disparity, self._numbers)
+        self._pictures = Pictures(self._numbers, export, block)
 
     def _report(self, why: str) -> dict[str, Any]:
         """Return what the page says: what is shown, how far a reconstruction is, the verdict."""
@@ -220,12 +230,17 @@ class LiveLightField:
         stage, verdict = "preview", None
         if run is not None and run.result is not None:
             found, judged = run.result
-            stage = f"{found.method}: {found.status} in {found.seconds:.1f} s, as `reconstruct`"
+            stage = (
+                f"{found.method}: {found.status} in {found.seconds:.1f} s, as emmc-rig reconstruct"
+            )
             verdict = {"level": judged.level, "words": judged.words}
         elif run is not None and run.fault:
             why = run.fault
         elif run is not None:
-            stage = f"preview; {self._method} at work, step {run.step}"
+            seconds = time.monotonic() - run.begun_s
+            stage = f"preview; {self._method} at work for {seconds:.0f} s, step {run.step}"
+            if run.step == 0 and seconds > COMPILING_S:
+                stage += ": the first time on a computer it is compiled, for up to a minute or two"
         return {
             "stage": stage,
             "why": why,
@@ -241,9 +256,9 @@ class _Refinement:
     def __init__(self, psi: ImagingMatrix, frames: Frames, method: str, solve: Solve) -> None:
         self.result: tuple[Reconstruction, Verdict] | None = None
         self.fault = ""
-        self.step = 0
+        self.step, self.begun_s = 0, time.monotonic()
         self._given_up = threading.Event()
-        self._work = psi, frames, method, solve
+        self.psi, self.frames, self._method, self._solve = psi, frames, method, solve
         threading.Thread(target=self._run, name="live reconstruction", daemon=True).start()
 
     def give_up(self) -> None:
@@ -251,11 +266,11 @@ class _Refinement:
         self._given_up.set()
 
     def _run(self) -> None:
-        psi, frames, method, solve = self._work
+        frames = self.frames
         try:
-            self.result = solve(
-                method,
-                psi,
+            self.result = self._solve(
+                self._method,
+                self.psi,
                 frames.readings,
                 frames.noise_sigma,
                 None,

@@ -48,7 +48,7 @@ function draw() {
   times = times.filter((one) => now - one.now < 3000);
   const rate = times.length > 1
     ? (times.at(-1).frame - times[0].frame) * 1000 / (times.at(-1).now - times[0].now) : 0;
-  write("rate", rate ? `${rate.toFixed(1)} frames/s` : "");
+  write("rate", rate && !state.trouble.camera ? `${rate.toFixed(1)} frames/s` : "");
   drawHistogram(figures);
   drawLevels(figures);
   const focus = figures.focus;
@@ -81,7 +81,7 @@ function drawHint() {
 }
 
 // Steps are made once and then written to: a button that has the focus keeps it.
-const LABELS = { autoexpose: "expose", centre: "centre", autofocus: "focus", preview: "save ..." };
+const LABELS = { autoexpose: "expose", centre: "centre", autofocus: "focus", preview: "show the changes" };
 function drawSteps() {
   const parent = $("steps");
   if (parent.children.length !== state.steps.length)
@@ -208,7 +208,7 @@ function drawAxes() {
   for (const [axis, told] of axes) {
     const row = $("axes").querySelector(`[data-axis="${CSS.escape(axis)}"]`);
     const known = told.position_um !== null;
-    const text = known ? told.position_um.toFixed(2) + " um" : "not homed";
+    const text = known ? told.position_um.toFixed(2) + " \u00b5m" : "not homed";
     if (row.children[1].textContent !== text) row.children[1].textContent = text;
     for (const one of row.querySelectorAll("button")) one.disabled = off || !known;
   }
@@ -221,6 +221,8 @@ function jog(axis, sign) {
 
 function zoom(by, x = view.x, y = view.y) {
   view.level = Math.max(0, Math.min(PARTS.length - 1, view.level + by));
+  // A finger scrolls the page over the whole frame, and moves what is zoomed.
+  $("stage").style.touchAction = view.level ? "none" : "pan-y";
   const half = PARTS[view.level] / 2;
   view.x = Math.max(half, Math.min(1 - half, x));
   view.y = Math.max(half, Math.min(1 - half, y));
@@ -289,7 +291,9 @@ $("save-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   $("save").disabled = true;
   const answer = await act("save");
-  if (answer) { write("saved", "wrote " + answer.written.join(", ")); write("diff", ""); }
+  if (!answer) return;
+  write("diff", "");
+  write("saved", "wrote " + answer.written.join(", ") + (answer.next && `; next: ${answer.next}`));
 });
 
 // Escape stops from anywhere; moves are by key only while the stage's panel has the focus.

@@ -189,25 +189,6 @@ def encoded(shown: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def disparity_png(disparity: NDArray[np.float32]) -> bytes:
-    """Return a disparity map (y, x) in false colours as PNG; clear where it is not known.
-
-    The colours span the 5th to the 95th percentile, as `Pictures` states them.
-    """
-    known = np.isfinite(disparity)
-    picture = np.zeros((*disparity.shape, 4), np.uint8)
-    if known.any():
-        low, high = np.percentile(disparity[known], (5, 95))
-        share = np.clip((disparity - low) / max(high - low, 1e-6), 0, 1)
-        codes = np.where(known, 255 * share, 0).astype(np.uint8)
-        picture[..., :3] = cv2.applyColorMap(codes, cv2.COLORMAP_VIRIDIS)
-        picture[..., 3] = np.where(known, 255, 0)
-    ok, data = cv2.imencode(".png", picture)
-    if not ok:
-        raise AppError("the disparity map cannot be encoded")
-    return data.tobytes()
-
-
 def _resized(linear: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     if scale < 1:
         smaller = cv2.resize(linear, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

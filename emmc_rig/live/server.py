@@ -17,11 +17,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterat
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from importlib.resources import files
 from threading import Thread
 from typing import Any, Protocol
 
 import uvicorn
+from jinja2 import ChoiceLoader, PackageLoader
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
@@ -31,6 +31,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 PATIENCE_S = 10.0
@@ -44,6 +45,10 @@ AT_ONCE = 4
 MOST_VIEWS = 16
 """Whose last picture is kept; those asked for least recently go first."""
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+COMMON_FILES = ("page.css", "viewer.css", "common.js", "viewer.js", "field.js")
+"""Of every page; the viewer is that of the reports."""
+PARTS_FOUND = ChoiceLoader([PackageLoader("emmc_rig.live", ""), TEMPLATES])
+PARTS = ENVIRONMENT.overlay(loader=PARTS_FOUND)
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
@@ -77,7 +82,7 @@ class Page(Protocol):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Files of the package `emmc_rig.live`; the first is the page itself."""
+        """Files of the package `emmc_rig.live` or templates; the first is the page itself."""
         ...
 
     @property
@@ -146,7 +151,7 @@ class _News:
     async def newer(self, after: int) -> None:
         """Return when the state is newer than `after`, or patience ends."""
         self._loop = asyncio.get_running_loop()
-        if after <= 0 or self.closed:
+        if self.closed:
             return
         future = self._loop.create_future()
         self._waiting.append(future)
@@ -255,20 +260,27 @@ def application(
             return Response(await encoder.of(wanted), media_type=wanted.media_type)
         if name not in page.files:
             raise _RefusedError(404, f"no page {name!r}")
-        text = files("emmc_rig.live").joinpath(name).read_text(encoding="utf-8")
+        if name.endswith(".html"):
+            text = PARTS.get_template(name).render(poster=None)
+        else:
+            text = PARTS_FOUND.get_source(PARTS, name)[0]
         return Response(text, media_type=TYPES[name[name.rindex(".") :]])
 
     async def state(request: Request) -> Response:
-        await news.newer(number_of(request.query_params, "after", 0, int))
+        after = number_of(request.query_params, "after", 0, int)
+        if after > 0:
+            await news.newer(after)
         return Response(news.state(read_only=read_only)[1], media_type="application/json")
 
     async def events(request: Request) -> Response:
         async def states() -> AsyncIterator[bytes]:
             version, data = news.state(read_only=read_only)
+            yield b"data: " + data + b"\n\n"
             while not news.closed:
-                yield b"data: " + data + b"\n\n"
                 await news.newer(version)
+                # Also when nobody waits any longer: the last state says how it ended.
                 version, data = news.state(read_only=read_only)
+                yield b"data: " + data + b"\n\n"
 
         return StreamingResponse(states(), media_type="text/event-stream")
 

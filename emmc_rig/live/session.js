@@ -9,12 +9,14 @@ function draw(before) {
   $("bar").max = Math.max(1, state.planned);
   $("bar").value = state.done;
   write("count", state.planned ? `${state.done} of ${state.planned} frames` : "no frame yet");
-  write("left", state.left && !state.ended ? `about ${duration(state.left.seconds)} left`
+  write("left", state.left && !state.ended && state.done < state.planned ? `about ${duration(state.left.seconds)} left`
     + (state.left.guessed ? `, and the exposures of ${state.left.guessed} not metered yet` : "") : "");
   write("step", state.step);
-  write("wish", state.wish);
-  $("waiting").hidden = !state.paused;
-  write("waiting", state.paused ? `Waiting: ${state.paused.reason}` : "");
+  // Whoever may press "go on" reads of a pause beside it: nothing moves under the hand.
+  const here = state.paused && state.held && !state.read_only;
+  write("wish", here ? "Paused by hand: \u201cgo on\u201d takes the next frame." : state.wish);
+  $("waiting").hidden = !state.paused || here;
+  write("waiting", !state.paused ? "" : state.held ? "Paused by hand." : `Waiting: ${state.paused.reason}`);
   for (const one of document.querySelectorAll(".steers")) one.hidden = state.read_only || state.ended;
   write("pause", state.held ? "go on" : "pause");
   $("pause").hidden = state.paused !== null && !state.held;
@@ -31,21 +33,26 @@ function duration(seconds) {
   return `${(whole / 3600).toFixed(1)} h`;
 }
 
-let drawnMessages = "";
+let drawnMessages = null;
 function drawMessages() {
   const key = JSON.stringify(state.messages);
   if (key === drawnMessages) return;
   drawnMessages = key;
-  fill($("messages"), state.messages.map((text) => cell("li", text)).reverse());
+  fill($("messages"), state.messages.length ? state.messages.map((text) => cell("li", text)).reverse()
+    : [cell("li", "none yet", "quiet")]);
 }
 
 function drawEnd() {
   const { end, verdict } = state;
   $("end").hidden = !state.ended;
+  $("capture-section").hidden = state.ended;
   const reasons = (verdict?.reasons || []).map((one) => `${one.level}: ${one.what}; ${one.remedy}`);
-  write("end", !end ? "The capture has ended; see the terminal."
+  const folder = end && (/[^\w./:\\-]/.test(end.session) ? JSON.stringify(end.session) : end.session);
+  writeWithCode("end", !end ? `The capture has ended: ${state.why || "see the terminal"}`
     : [end.complete ? "Complete: every frame verified." : `Stopped: ${end.missing} frames are still to be taken.`,
-      ...reasons, `In ${end.session}`].join(" "));
+      ...reasons, `Next: \`emmc-rig ${end.complete ? "reconstruct" : "capture"} ${folder}\``].join("\n"));
+  $("end").classList.toggle("good", Boolean(end?.complete) && reasons.length === 0);
+  $("end").classList.toggle("bad", !end);
 }
 
 // A tile is made once for each frame, and its picture is asked for when that is taken (again).
@@ -68,15 +75,16 @@ function drawFrames() {
     const key = `frame.jpg?id=${encodeURIComponent(one.id)}&n=${one.number}`;
     if (tile.firstChild.getAttribute("src") !== key) tile.firstChild.src = key;
     const saturated = one.saturated > 0 ? `, ${(100 * one.saturated).toFixed(2)} % saturated` : "";
-    const words = `${Math.round(100 * one.level)} % of white${saturated}, ${Number(one.exposure_s.toPrecision(3))} s`;
+    const words = `${Math.round(100 * one.level)}\u00a0%\u00a0of\u00a0white${saturated}, ${Number(one.exposure_s.toPrecision(3))}\u00a0s`;
     if (tile.lastChild.textContent !== words) tile.lastChild.textContent = words;
     tile.lastChild.classList.toggle("bad", one.saturated > 0.001);
     tile.classList.toggle("due", !one.stored);
     tile.disabled = state.read_only || state.ended;
   }
   const hidden = state.taken - state.frames.length;
-  write("chosen", chosen.size ? `${chosen.size} chosen` : hidden > 0 ? `the last ${state.frames.length} of ${state.taken}` : "");
+  write("chosen", chosen.size ? `${chosen.size} chosen` : state.frames.length === 0 ? "none yet" : hidden > 0 ? `the last ${state.frames.length} of ${state.taken}` : "");
   $("retake").disabled = chosen.size === 0;
+  write("retake", chosen.size ? `take ${chosen.size} again` : "take again");
 }
 
 function choose_frame(id) {
@@ -95,6 +103,7 @@ async function show() {
     const before = $("picture").src;
     $("picture").src = URL.createObjectURL(blob);
     $("picture").hidden = false;
+    $("none-yet").hidden = true;
     if (before) URL.revokeObjectURL(before);
   } catch (fault) { /* the next frame is shown */ }
   loading = false;
@@ -115,8 +124,9 @@ $("plan-details").addEventListener("toggle", async () => {
 $("plan").addEventListener("input", () => { $("amend").disabled = true; write("changes", ""); });
 $("preview").addEventListener("click", async () => {
   const answer = await act("preview", { text: $("plan").value });
-  write("changes", answer?.changes || "");
-  $("amend").disabled = !answer;
+  write("changes", answer ? answer.changes : complaint); // also here: the head may be out of sight
+  $("changes").classList.toggle("bad", !answer);
+  $("amend").disabled = !answer || answer.changes === "nothing changes";
 });
 $("amend").addEventListener("click", async () => {
   $("amend").disabled = true;

@@ -18,9 +18,9 @@ from emmc_rig.capture.events import Event, EventWatcher
 from emmc_rig.capture.until import light_field_so_far
 from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import Pictures, drawn, field_pictures
+from emmc_rig.live.field_pictures import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
-from emmc_rig.live.server import Action, Picture, Pictured, Query
+from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.pages.session_sheet import small_jpeg, stored_jpeg
 from emmc_rig.session.planned import PlannedFrame
@@ -44,7 +44,7 @@ class SessionPage(EventWatcher):
     the disk; where the capture itself does (`--until`) its light field is shown.
     """
 
-    files = ("session.html", "page.css", "common.js", "field.js", "session.js")
+    files = ("session.html", "session.js", *COMMON_FILES)
     urgent = frozenset({"pause", "stop"})
 
     def __init__(
@@ -86,6 +86,7 @@ class SessionPage(EventWatcher):
             "verdict": None,
             "end": None,
             "ended": False,
+            "why": "",
             "light_field": None,
             "trouble": {"light field": ""},
         }
@@ -108,10 +109,10 @@ class SessionPage(EventWatcher):
         """Begin to reconstruct."""
         self._thread.start()
 
-    def close(self) -> None:
-        """Let those who look know that the capture is over."""
+    def close(self, why: str = "") -> None:
+        """Let those who look know that the capture is over; why: what ended it early."""
         self._ending.set()
-        self._publish(ended=True, step="", wish="")
+        self._publish(ended=True, why=why, step="", wish="")
         with self._changed:
             self._changed.notify_all()
         self._thread.join(PATIENCE_S)
@@ -150,7 +151,7 @@ class SessionPage(EventWatcher):
         """Show what these shots give."""
         super().light_field(shots, result)
         number = 1 if self._pictures is None else self._pictures.number + 1
-        self._pictures = drawn(result.light_field, result.maps.get("disparity"), number)
+        self._pictures = Pictures(number, export_of(result.light_field, result.maps))
         try:
             stated = f", states {stated_psnr_db(result):.1f} dB"
         except AppError:

@@ -9,17 +9,20 @@ from typing import Any
 from emmc_rig.errors import AppError
 from emmc_rig.live.field_pictures import field_pictures
 from emmc_rig.live.picture import KINDS, View, encoded, picture
-from emmc_rig.live.server import Action, Picture, Pictured, Query, finite, number_of
+from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite, number_of
 from emmc_rig.live.watch import Watch
 
 
 class SetupPage:
-    """A `emmc_rig.live.server.Page` over a Watch."""
+    """A `emmc_rig.live.server.Page` over a Watch.
 
-    files = ("page.html", "page.css", "common.js", "field.js", "page.js")
+    following: the command to go on with once a plan was saved; "": none is known.
+    """
+
+    files = ("page.html", "page.js", *COMMON_FILES)
     urgent = frozenset({"stop"})
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: Watch, following: str = "") -> None:
         self._watch = watch
         self.pictures: dict[str, Pictured] = {
             "picture.jpg": self._picture,
@@ -39,7 +42,7 @@ class SetupPage:
             "refocus": watch.forget_focus,
             "autofocus": lambda span_um: watch.autofocus(finite(span_um)),
             "preview": watch.preview,
-            "save": watch.save,
+            "save": lambda: {**watch.save(), "next": following},
         }
 
     @property

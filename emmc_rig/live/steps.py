@@ -15,8 +15,8 @@ AWAY_UM = 5.0
 """From where an axis centres the mask or opens the aperture, it is not there."""
 ALIGNED_DEG = 0.1
 NO_FOCUS = (
-    "this stage has no axis `focus`, and the camera's driver moves no lens: turn the lens by hand "
-    "until the sharpness no longer grows"
+    "this stage has no axis named focus, and the camera's driver moves no lens: turn the lens by "
+    "hand until the sharpness no longer grows"
 )
 
 
@@ -65,7 +65,14 @@ def _centre(off_um: Mapping[str, float | None]) -> dict[str, Any]:
         text = "it is not known where the mask is centred: name zero_um in the rig's file"
         return {"name": "centre the mask", "done": False, "text": text, "action": ""}
     away = [axis for axis, um in off_um.items() if um is None or abs(um) > AWAY_UM]
-    text = f"{', '.join(away)} not there" if away else "mask centred, aperture open"
+    text = "mask centred, aperture open"
+    if away:
+        unknown = [axis for axis in away if off_um[axis] is None]
+        text = (
+            f"not homed yet: {', '.join(unknown)}"
+            if unknown
+            else f"away from it: {', '.join(away)}"
+        )
     action = "centre" if away else ""
     return {"name": "centre the mask", "done": not away, "text": text, "action": action}
 

@@ -14,7 +14,7 @@ from calibration.sensor import SensorSheet
 from calibration.stage_map import StageMap
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.display import png_of
-from emmc_rig.pages.drawing import ACCENT, FAINT, INK, sheet, svg_of, titled
+from emmc_rig.pages.drawing import ACCENT, INK, LEGEND, sheet, svg_of, titled
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -23,6 +23,7 @@ from emmc_rig.pages.page import (
     fragment,
     framed,
     provenance_section,
+    typed,
 )
 from emmc_rig.pages.psi_panels import psi_panels
 
@@ -48,6 +49,7 @@ WORDS = {
 }
 
 
+PLACES = ("Frame", "Sent to, um", "Mask stood at, um", "Deviation, um", "Left by the map, um")
 GOOD_CHI2 = 1.5
 """Held-out residual, in variances of the noise, above which something is not modelled."""
 
@@ -59,16 +61,18 @@ def write_calibration_report(
     truth: Mapping[str, float] | None = None,
     sensor: SensorSheet | None = None,
     stage: StageMap | None = None,
+    places: Sequence[tuple[str, ...]] = (),
 ) -> None:
     """Write the page whole or not at all.
 
     metrics: as `emmc_rig.calibrate` makes them. truth: parameters of a simulated bench, shown
-    beside the fit.
+    beside the fit. places: of the stage, see PLACES.
     """
+    unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
     sections = [
         Section("choice", "Chosen", _choice(outcome, metrics)),
         *_listed("found", "Found and taken into account", outcome.findings),
-        *_listed("unwatched", "Not measured", outcome.unwatched),
+        *_listed("unwatched", "Not measured", unwatched),
     ]
     best = outcome.mixed or outcome.parametric
     first = outcome.parametric
@@ -82,21 +86,31 @@ def write_calibration_report(
     if stage is not None:
         heads = ("Quantity", "Value", "Standard deviation", "Unit")
         body = fragment("figures.html", heads=heads, rows=_figures(stage.rows()), pictures={})
+        if places:
+            body += fragment("figures.html", heads=PLACES, rows=places, pictures={})
         sections.append(Section("stage", "Stage map", body))
     sections.append(provenance_section(_provenance(metrics)))
     title = f"Calibration of {metrics['camera']}"
-    write_text(path, framed(title, (), (), sections, ["calibration.css"], head=_head(outcome)))
+    write_text(
+        path, framed(title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics))
+    )
 
 
-def _head(outcome: Outcome) -> Head:
+def _head(outcome: Outcome, metrics: Mapping) -> Head:
     """Return whether the whiteboards agree with the Psi chosen, and what to measure again."""
     good = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2 and not outcome.advice
     return Head(
         "trust" if good else "doubt",
         outcome.why,
-        outcome.advice or ["nothing to measure again: reconstruct with this Psi"],
+        outcome.advice or [_use(metrics)],
         "good" if good else "watch",
     )
+
+
+def _use(metrics: Mapping) -> str:
+    if (session := metrics.get("session")) is None:
+        return "plan the whiteboards of a bench of your own: `emmc-rig calibrate --plan`"
+    return f"get the light field with this Psi: `emmc-rig reconstruct {typed(session)}`"
 
 
 def _choice(outcome: Outcome, metrics: Mapping) -> str:
@@ -178,14 +192,20 @@ def _residuals(judged: Sequence[HeldOut]) -> str:
 
 def _psi(outcome: Outcome) -> str:
     calibration = outcome.calibration
-    weights = calibration.psi.weights[0].sum(axis=3)
-    deviation = np.asarray(calibration.deviation)[0].sum(axis=3)
-    known = deviation if np.isfinite(deviation).all() else None
-    return fragment("calibration_psi.html", panels=psi_panels(weights, known))
+    weights, deviation = calibration.psi.weights, calibration.deviation
+    panels = psi_panels(
+        calibration.psi.light_field_shape[:2],
+        lambda v, u: weights[0, v, u].sum(axis=1),
+        lambda v, u: deviation[0, v, u].sum(axis=1),
+    )
+    return fragment("calibration_psi.html", panels=panels)
 
 
 def _sensor(sheet_: SensorSheet) -> str:
-    figure, (transfer, linearity, rows) = sheet(3, 4.2, label="temporal variance, DN²")
+    (first, (transfer,)), (second, (linearity,)), (third, (rows,)) = (
+        sheet(1, 4.8, label=label)
+        for label in ("temporal variance, DN²", "deviation from the line, %", "amplitude")
+    )
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
     grid = np.linspace(0, max(curve.mean_dn), 50)
@@ -194,20 +214,17 @@ def _sensor(sheet_: SensorSheet) -> str:
     titled(transfer, "Photon transfer", "signal above the dark, DN")
     linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
     linearity.axhline(0, color=INK, linewidth=0.8)
-    linearity.set_ylabel("deviation from the line, %", color=FAINT, fontsize=9)
     titled(linearity, "Linearity", "exposure, s")
     for name, one, scale in (("DSNU, DN", sheet_.dsnu, 1.0), ("PRNU, %", sheet_.prnu, 100.0)):
         for direction, line_style in (("horizontal", "-"), ("vertical", ":")):
             amplitude = scale * one.spectra[direction][1:]
             label = f"{name}, {direction}"
             rows.plot(one.frequency[direction][1:], amplitude, line_style, label=label)
-    rows.set_ylabel("amplitude", color=FAINT, fontsize=9)
-    rows.legend(fontsize=7, frameon=False)
+    rows.legend(**LEGEND)
     titled(rows, "Spectrograms", "cycles a pixel")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    pictures = {
-        "Photon transfer curve, linearity, spectrograms": data_address(svg_of(figure), ".svg")
-    }
+    drawn = {"Photon transfer curve": first, "Linearity": second, "Spectrograms": third}
+    pictures = {name: data_address(svg_of(one), ".svg") for name, one in drawn.items()}
     return fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()), pictures=pictures)
 
 

@@ -79,6 +79,7 @@ def light_field_layers(export: Export) -> list[Layer]:
             data,
             {
                 "name": f"{export.title}: {name}", "rgb": True, "visible": name == "views",
+                "contrast_limits": (0, 1),  # napari stretches colours from least to most, else
                 "axis_labels": AXES, "metadata": {"disparities_px": disparities.tolist()},
             },
             "image",

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import base64
 import math
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from emmc_rig.version import __version__
 
@@ -46,33 +48,74 @@ class Card:
 
 @dataclass(frozen=True)
 class Head:
-    """The first thing on a page: what came out, why, and what to do next. tone: see `Card`."""
+    """The first thing on a page: what came out, why, and what to do next. tone: see `Card`.
+
+    next: sentences, at least one; commands in backticks.
+    """
 
     level: str
     why: str
-    next: Sequence[str] = ()
+    next: Sequence[str]
     tone: str = ""
 
+    def __post_init__(self):
+        if not self.next:
+            raise ValueError(f"{self.level}: say what to do next")
 
-def verdict_head(metrics: Mapping[str, object]) -> Head | None:
-    """Return whether to trust a light field and what to do next; None without a verdict."""
+
+def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bool = False) -> Head:
+    """Return whether to trust a light field, and what to do next.
+
+    metrics: as in metrics.json. source: the result's folder, or the scene, as a command takes it;
+    empty where it is in memory alone. viewer: the page is nothing but the viewer.
+    """
     verdict = metrics.get("verdict")
     if not isinstance(verdict, dict):
-        return None
+        why = "this light field was not reconstructed from frames, or they were not checked"
+        return Head("no verdict", why, _uses(source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
     why = [reason["what"] for reason in reasons]
-    advice = str(metrics.get("advice") or "")
+    remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
     return Head(
         level,
         "; ".join(why) or "frames, Psi and light field agree",
-        [reason["remedy"] for reason in reasons] + ([advice] if advice else []),
+        [one for one in remedies if one] or _uses(source, viewer),
         {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad"),
     )
+
+
+def _uses(source: str, viewer: bool) -> list[str]:
+    """Return what a light field can be used for."""
+    look = "drag the picture to turn it, click to focus, turn the wheel to open the aperture"
+    if not source:
+        return [look]
+    named = shlex.quote(source)
+    return [
+        look,
+        "hand it on: this page is one file"
+        if viewer
+        else f"hand it on as one page to turn: `emmc-rig export {named}`",
+        f"open it in other programs: `emmc-rig export {named} --format tiff`; "
+        "`emmc-rig export --list` names all formats",
+        f"draw it for a paper: `emmc-rig figure {named}`",
+    ]
+
+
+def typed(path: str | Path) -> str:
+    """Return a path as it is typed in a command here: short where it lies below this folder."""
+    whole = Path(path).absolute()
+    here = Path.cwd()
+    return shlex.quote(str(whole.relative_to(here) if whole.is_relative_to(here) else whole))
 
 
 def number(value: float | None, form: str) -> str:
     """Return a number by its format, a dash for None and for values that are not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)
+
+
+def worded(text: str) -> Markup:
+    """Return a sentence with what stands in backticks as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def source(name: str) -> Markup:
@@ -87,7 +130,7 @@ ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-ENVIRONMENT.filters["number"] = number
+ENVIRONMENT.filters.update(number=number, worded=worded)
 ENVIRONMENT.globals.update(source=source, generator=f"emmc-rig {__version__}")
 
 
@@ -105,7 +148,8 @@ def framed(
     scripts: Sequence[str] = (),
     data: Mapping[str, object] | None = None,
     lead: str = "",
-    head: Head | None = None,
+    *,
+    head: Head,
 ) -> str:
     """Return a page of sections.
 

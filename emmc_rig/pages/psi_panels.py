@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from markupsafe import Markup
@@ -11,29 +13,41 @@ from emmc_rig.pages.display import DisplayCurve, finite, heat, montage, png_of, 
 from emmc_rig.pages.page import fragment
 
 Array = NDArray[np.floating]
+OfView = Callable[[int, int], Array]
 DETAIL_PX = 40
 """Side of the piece of a slice that is shown pixel for pixel."""
 THUMBNAIL_PX = 120
 """Side of a whole slice."""
 
 
-def psi_panels(psi: Array, psi_std: Array | None) -> Markup:
-    """Return the figures; both arrays are (v, u, y, x), the weights of one shot."""
-    rows, columns = psi.shape[:2]
-    piece = finite(_centre(psi))
+def psi_panels(views: tuple[int, int], psi: OfView, deviation: OfView | None) -> Markup:
+    """Return the figures of one shot; psi, deviation: return a view's (y, x), of (v, u).
+
+    One view is in memory at a time.
+    """
+    rows, columns = views
+    thumbnails, piece = (_of_every_view(views, psi, change) for change in (_thumbnail, _centre))
     layout = f"rows are v 0 to {rows - 1} downwards, columns u 0 to {columns - 1}"
     side = f"{piece.shape[3]} × {piece.shape[2]}"
     panels = [
-        _panel("Whole field", f"one tile per view, averaged down; {layout}", _thumbnails(psi), 3),
+        _panel("Whole field", f"one tile per view, averaged down; {layout}", thumbnails, 3),
         _panel(
             "Centre, pixel for pixel", f"the middle {side} pixels of each view's weights", piece, 2
         ),
     ]
-    if psi_std is not None:
-        typical = float(np.median(finite(psi_std)))
-        note = f"same pixels; median over all coefficients {typical:.2g}"
-        panels.append(_panel("Its standard deviation", note, finite(_centre(psi_std)), 2, "heat"))
+    if deviation is not None:
+        middle, centre = (_of_every_view(views, deviation, change) for change in (_median, _centre))
+        note = f"same pixels; of the views' medians the median is {np.median(middle):.2g}"
+        panels.append(_panel("Its standard deviation", note, centre, 2, "heat"))
     return fragment("psi.html", panels=panels)
+
+
+def _of_every_view(
+    views: tuple[int, int], of_view: OfView, change: Callable[[Array], Array]
+) -> Array:
+    """Return what becomes of each view, (v, u, ...)."""
+    found = np.array([change(finite(of_view(v, u))) for v, u in np.ndindex(views)], np.float32)
+    return found.reshape(*views, *found.shape[1:])
 
 
 def _panel(
@@ -46,18 +60,18 @@ def _panel(
     return {"name": name, "note": note, "picture": picture, "scale": scale, "ramp": ramp}
 
 
-def _centre(slices: Array) -> Array:
-    height, width = slices.shape[2:]
+def _centre(view: Array) -> Array:
+    height, width = view.shape
     top, left = max((height - DETAIL_PX) // 2, 0), max((width - DETAIL_PX) // 2, 0)
-    return slices[:, :, top : top + DETAIL_PX, left : left + DETAIL_PX]
+    return view[top : top + DETAIL_PX, left : left + DETAIL_PX]
 
 
-def _thumbnails(slices: Array) -> Array:
-    rows, columns, height, width = slices.shape
+def _median(view: Array) -> Array:
+    return np.asarray(np.median(view))
+
+
+def _thumbnail(view: Array) -> Array:
+    height, width = view.shape
     shrink = min(1.0, THUMBNAIL_PX / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-    small = [
-        cv2.resize(finite(one), size, interpolation=cv2.INTER_AREA)
-        for one in slices.reshape(-1, height, width)
-    ]
-    return np.asarray(small, np.float32).reshape(rows, columns, size[1], size[0])
+    return np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.float32)

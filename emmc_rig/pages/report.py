@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from emmc_rig.files.formats import Export
@@ -28,8 +27,7 @@ from emmc_rig.pages.display import (
     sprite,
     three_colours,
 )
-from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
-from emmc_rig.pages.page import Card, data_address, fragment, verdict_head
+from emmc_rig.pages.page import Card, data_address, fragment, light_field_head
 from emmc_rig.pages.psi_panels import psi_panels
 from emmc_rig.pages.viewer import poster, viewer_data
 
@@ -44,7 +42,7 @@ class ReportContent:
     psi and psi_std (v, u, y, x), the weights of shot 0; cfa_tile (y, x, rgb), the colour each
     pixel of the tile lets through. Under a sensor that bins, frames are smaller than views.
     disparity_range_px is in pixels per view step; None where it is not known. maps: what is laid
-    over the picture in the viewer, by name, see `Export`.
+    over the picture in the viewer, by name, see `Export`. source: the result's folder, as typed.
     """
 
     title: str
@@ -66,6 +64,7 @@ class ReportContent:
     disparity_range_px: tuple[float, float] | None = None
     warnings: Sequence[str] = ()
     command: str = ""
+    source: str = ""
     maps: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -107,6 +106,7 @@ def render(content: ReportContent) -> str:
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, model, misfit
     )
+    psi, psi_std = content.psi, content.psi_std
     return fragment(
         "report.html",
         title=content.title,
@@ -114,9 +114,8 @@ def render(content: ReportContent) -> str:
         caveats=(),
         lead="",
         styles=("viewer.css",),
-        heat=HEAT,
         warnings=_warnings(content),
-        summary=verdict_head(content.metrics),
+        summary=light_field_head(content.metrics, content.source),
         cards=_cards(content),
         capture={
             "shots": frames.shape[0],
@@ -131,14 +130,20 @@ def render(content: ReportContent) -> str:
         curve=curve,
         view_psnr=[] if errors is None else _view_psnr(errors),
         error_figures={} if errors is None else _error_figures(errors),
-        psi=None if content.psi is None else psi_panels(content.psi, content.psi_std),
+        psi=None
+        if psi is None
+        else psi_panels(
+            (rows, columns),
+            lambda v, u: psi[v, u],
+            None if psi_std is None else lambda v, u: psi_std[v, u],
+        ),
         convergence=_convergence(content.objective),
         timings=_timings(content.stage_s),
         figures=_figures(content.metrics),
         provenance=_provenance(content),
         data={
             "data": _page_data(content, shown, curve, errors),
-            "viewer-data": viewer_data(export, atlases=False),
+            "viewer-data": viewer_data(export, atlases=False, most_pixels=PART_PIXELS),
         },
         poster=poster(export, PART_PIXELS),
         scripts=("viewer.js", "report.js"),
@@ -273,7 +278,10 @@ FIGURES = {
         "Mean standard deviation of Psi", ".2e", "", "of one coefficient, as calibration states it"
     ),
     "noise_sigma": Figure(
-        "Noise of the readings", ".2e", "", "standard deviation that the reconstruction was told"
+        "Noise of the readings",
+        ".2e",
+        "",
+        "their standard deviation, as the reconstruction took it",
     ),
     "saturated_share": Figure("Saturated readings", ".2%", "", "share left out as clipped"),
     "whiteboard_frames": Figure("Whiteboard frames", "", "", "exposures taken to measure Psi"),
@@ -287,6 +295,7 @@ FIGURES = {
     "scene": Figure("Scene", "", "", ""),
     "scene_provenance": Figure("Origin of the scene", "", "", ""),
     "camera": Figure("Camera", "", "", ""),
+    "finer": Figure("Finer scene", "", "", "views and pixels of the simulated scene for each here"),
 }
 SHOWN_ELSEWHERE = {"verdict", "versions", "seconds", "warnings", "command"}
 
@@ -424,6 +433,11 @@ def _curve(name: str, first_step: int, values: Sequence[float], logarithmic: boo
     ]
     if len(points) < 2:
         return []
+    # matplotlib loads for half a second: here only.
+    from matplotlib.ticker import MaxNLocator
+
+    from emmc_rig.pages.drawing import ACCENT, sheet, svg_of, titled
+
     figure, (axes,) = sheet(1, 6.2, 2.7, "")
     axes.plot(*zip(*points, strict=True), color=ACCENT, linewidth=2)
     if logarithmic:
@@ -452,26 +466,23 @@ def _convergence(objective: Sequence[float]) -> list[Curve]:
 
 
 def _timings(stage_s: Mapping[str, float]) -> dict[str, object] | None:
-    """Return the seconds of each stage in words and drawn, and their sum; None without any."""
+    """Return the seconds of each stage as bars with words, and their sum; None without any."""
     if not stage_s:
         return None
-    stages = {name: float(s) if math.isfinite(s) else math.nan for name, s in stage_s.items()}
-    total_s = sum(s for s in stages.values() if not math.isnan(s))
-    figure, (axes,) = sheet(1, 10, 0.6 + 0.3 * len(stages), "")
-    bars = axes.barh(list(stages), np.nan_to_num(list(stages.values())), color=ACCENT)
-    labels = [
-        "not a number" if math.isnan(s) else f"{s:.2f} s ({s / max(total_s, 1e-12):.0%})"
-        for s in stages.values()
+    known = {name: float(s) if math.isfinite(s) else 0.0 for name, s in stage_s.items()}
+    total_s = sum(known.values())
+    longest_s = max(*known.values(), 1e-12)
+    stages = [
+        {
+            "name": name,
+            "width": f"{known[name] / longest_s:.1%}",
+            "words": f"{s:.2f} s ({s / max(total_s, 1e-12):.0%})"
+            if math.isfinite(s)
+            else _written(s),
+        }
+        for name, s in stage_s.items()
     ]
-    axes.bar_label(bars, labels, padding=6, color=INK, fontsize=9)
-    axes.margins(x=0.15)
-    axes.invert_yaxis()
-    axes.grid(visible=False)
-    axes.set_xticks([])
-    axes.spines["bottom"].set_visible(False)
-    axes.tick_params(axis="y", colors=INK, length=0)
-    words = ", ".join(f"{name} {_written(s, '.2f', 's')}" for name, s in stages.items())
-    return {"words": words, "picture": data_address(svg_of(figure), ".svg"), "total_s": total_s}
+    return {"stages": stages, "total_s": total_s}
 
 
 def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:
@@ -486,11 +497,17 @@ def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, ob
     return rows
 
 
+def _of_the_method(key: str) -> Figure:
+    """Return how a figure is written that only its method knows."""
+    name = key.removeprefix("parameters.")
+    return Figure(name.replace("_", " "), "", "", "" if name == key else "of the method")
+
+
 def _figures(metrics: Mapping[str, object]) -> list[dict[str, str]]:
     """Return the rows of the table of metrics."""
     rows = []
     for key, value in _flat(metrics):
-        figure = FIGURES.get(key, Figure(key))
+        figure = FIGURES.get(key) or _of_the_method(key)
         written = _written(value, figure.format, figure.unit)
         rows.append(
             {"key": key, "label": figure.label, "value": written, "meaning": figure.meaning}

@@ -28,6 +28,7 @@ from emmc_rig.pages.page import (
     fragment,
     framed,
     provenance_section,
+    typed,
 )
 from emmc_rig.pages.timeline import (
     COLOURS,
@@ -114,14 +115,16 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
 
 def _head(session: Session) -> Head:
     """Return whether all is captured and well exposed, and the next command."""
-    name = session.folder.name
+    name = typed(session.folder)
     if missing := len(session.missing()):
         why = f"{missing} of {len(session.needed)} frames are missing"
-        return Head("not complete", why, [f"go on with: emmc-rig capture {name}"], "watch")
+        return Head("not complete", why, [f"go on with: `emmc-rig capture {name}`"], "watch")
     reasons = exposure_reasons(shot_exposures(session))
-    commands = [f"emmc-rig reconstruct {name}"]
-    if any(frame.kind in BOARDS for frame in session.needed):
-        commands.insert(0, f"emmc-rig calibrate {name}")
+    commands = [f"get the light field: `emmc-rig reconstruct {name}`"]
+    if reconstructed(session.folder)[0]:
+        commands = [f"look into the light field: `emmc-rig export {name}`"]
+    elif any(frame.kind in BOARDS for frame in session.needed):
+        commands.insert(0, f"measure Psi from the whiteboards: `emmc-rig calibrate {name}`")
     return Head(
         "complete",
         "; ".join(reason.what for reason in reasons) or "every frame is stored and verified",

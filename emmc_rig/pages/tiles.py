@@ -26,6 +26,8 @@ from emmc_rig.version import __version__
 WIDTH_IN = 7.16
 """Of a figure across both columns of an IEEE page."""
 EDGE_IN, GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.01, 0.06, 0.2, 0.45, 0.3
+TICK_IN = 0.05
+"""Half a figure at the lower end of a scale, which stands at the edge."""
 TEXT_PT, LINE_IN = 7.5, 0.13
 LETTER_PT = 0.55 * TEXT_PT
 """Mean width of a letter of a title."""
@@ -116,10 +118,13 @@ def caption_of(
         side = pieces[0].side
         middles = ", ".join(f"({one.y + side // 2}, {one.x + side // 2})" for one in pieces)
         close_ups = [f"Close-ups of {side}x{side} pixels around (y, x) = {middles}."]
+    shown = f"{curve.gain:.3g} x"
+    if abs(curve.gamma - 1) >= 0.005:
+        shown = f"({shown})^(1/{curve.gamma:.3g})"
     return " ".join([
         *sentences,
         *close_ups,
-        f"Linear values x are shown as ({curve.gain:.3g} x)^(1/{curve.gamma:.3g}), cut at 1.",
+        f"Linear values x are shown as {shown}, cut at 1.",
         *(f"{one}." for one in sources),
         f"Drawn by emmc-rig {__version__}.",
     ])  # fmt: skip
@@ -139,6 +144,8 @@ class _Sheet:
         self.wide, self.width = room / columns, width_in
         heights = [self._heights(row) for row in rows]
         self.height = sum(map(sum, heights)) + (len(rows) - 1) * 2 * GAP_IN + EDGE_IN
+        if any(tile and tile.bar for tile in rows[-1].tiles):
+            self.height += TICK_IN
         self.figure = figure
         figure.set_size_inches(self.width, self.height)
         y = 0.0

@@ -24,7 +24,6 @@ from emmc_rig.model.files import write_text
 from emmc_rig.model.novel_view import centre_disparity, view_disparities
 from emmc_rig.pages.display import (
     HEAT,
-    PART_PIXELS,
     SPRITE_PIXELS,
     TILE_MULTIPLE_PX,
     DisplayCurve,
@@ -35,7 +34,7 @@ from emmc_rig.pages.display import (
     sprite,
     three_colours,
 )
-from emmc_rig.pages.page import fragment, verdict_head
+from emmc_rig.pages.page import fragment, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
@@ -78,7 +77,8 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
         "viewer_page.html",
         title=content.title,
         about=[content.caption] if content.caption else [],
-        caveats=(), sections=(), lead="", summary=verdict_head(content.metrics),
+        caveats=(), sections=(), lead="",
+        summary=light_field_head(content.metrics, content.source, viewer=True),
         styles=("viewer.css",), scripts=("viewer.js",),
         data={"viewer-data": viewer_data(content, lossless=lossless)}, poster=poster(content),
     )  # fmt: skip
@@ -98,12 +98,17 @@ def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, objec
     return {"picture": picture, "height": shown.shape[2], "width": shown.shape[3]}
 
 
-def viewer_data(content: Export, atlases: bool = True, lossless: bool = False) -> dict[str, object]:
+def viewer_data(
+    content: Export,
+    atlases: bool = True,
+    lossless: bool = False,
+    most_pixels: int = SPRITE_PIXELS,
+) -> dict[str, object]:
     """Return what viewer.js reads; without atlases it takes those of the report it is part of.
 
-    Disparity is estimated where the light field comes without.
+    Disparity is estimated where the light field comes without. most_pixels: of all views.
     """
-    shown = reduced(content.light_field, SPRITE_PIXELS if atlases else PART_PIXELS)
+    shown = reduced(content.light_field, most_pixels)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
     curve = DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
@@ -171,10 +176,14 @@ def _resized(values: NDArray, shown: Array) -> NDArray:
 
 def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
     levels = np.clip((_resized(one.values, shown) - one.low) / (one.high - one.low), 0, 1)
+    picture = np.rint(levels * 255).astype(np.uint8)
+    if np.isnan(one.values).any():  # clear where nothing is known
+        known = _resized(~np.isnan(one.values), shown)
+        picture = np.dstack([picture, picture, picture, np.rint(known * 255).astype(np.uint8)])
     return {
         "key": one.key, "label": one.label, "unit": one.unit, "low": one.low, "high": one.high,
         "colours": one.colours, "names": one.names,
-        "picture": png_of(np.rint(levels * 255).astype(np.uint8)),
+        "picture": png_of(picture),
     }  # fmt: skip
 
 

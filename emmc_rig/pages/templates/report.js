@@ -86,6 +86,11 @@ function drawCrop(canvas, source) {
 }
 
 // Lays a mark over a picture, so that the picture's own pixels stay what they are.
+function screenValue(frame) {
+  const part = `value / ${frame.white.toPrecision(2)}`;
+  return frame.gamma === 1 ? part : `(${part})^(1 / ${frame.gamma.toFixed(2)})`;
+}
+
 function cover(mark, left, top, w, h, pictureWidth, pictureHeight) {
   Object.assign(mark.style, {
     left: `${(100 * left) / pictureWidth}%`, width: `${(100 * w) / pictureWidth}%`,
@@ -347,7 +352,7 @@ function frameViewer(host, frames, name) {
     const value = frames[shown].white * Math.pow(level / 255, frames[shown].gamma);
     const written = level === 255 ? `${value.toPrecision(2)} or more` : `about ${value.toPrecision(2)}`;
     readout.textContent = `x ${cursor[0]}, y ${cursor[1]}: ${written}. ${side} × ${side} pixels; ` +
-      `screen value = (value / ${frames[shown].white.toPrecision(2)})^(1 / ${frames[shown].gamma.toFixed(2)}).`;
+      `screen value = ${screenValue(frames[shown])}.`;
     [...tabs.querySelectorAll("button")].forEach((b, i) => b.setAttribute("aria-pressed", String(i === shown)));
   }
 

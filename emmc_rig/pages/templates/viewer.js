@@ -12,30 +12,22 @@ const decoded = (() => {
     canvas.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
     return canvas;
   }
-  return (uri) => {
+  const once = (uri) => {
     if (!known.has(uri)) known.set(uri, decode(uri));
     return known.get(uri);
   };
+  return Object.assign(once, { forget: () => known.clear() });
 })();
 
 // A light field to turn, focus and look into. The shader is the twin of model/novel_view.py.
-// Fulfilled when it can be turned; truth and maps are decoded after that.
-const viewerShown = (() => {
-const data = JSON.parse(document.getElementById("viewer-data").textContent);
-if (!data.estimate) { // a part of a report, which holds the views already
-  const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
-  Object.assign(data, { estimate, truth });
-}
+const lightFieldViewer = (() => {
 const byId = (id) => document.getElementById(`viewer-${id}`);
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
-const { rows, columns, width, height } = data.views;
-const padded = (length) => Math.ceil(length / data.tile) * data.tile;
-const tileWidth = padded(width), tileHeight = padded(height), count = rows * columns;
-const farthest = Math.hypot(rows - 1, columns - 1) + 1;
-const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus.at, aperture: 0, wipe: 0 });
-const state = { ...home(), overlay: -1, x: width >> 1, y: height >> 1 };
 const picture = byId("picture");
+const state = { overlay: -1 };
+let data, rows, columns, width, height, tileWidth, tileHeight, count, farthest; // of what is shown
 let renderer, atlases = {}, depth, overlayLevels = [];
+const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus.at, aperture: 0, wipe: 0 });
 const breath = () => new Promise((done) => setTimeout(done)); // lets the page answer in between
 
 const VERTEX = `#version 300 es
@@ -129,8 +121,8 @@ void main() {
   }
   if (opacity > 0.0) {
     vec2 centre = vec2(grid / 2);
-    vec3 laid = texture(overlay, (p + surface * (centre - position) + 0.5) / size).rgb;
-    colour.rgb = mix(colour.rgb, laid, opacity);
+    vec4 laid = texture(overlay, (p + surface * (centre - position) + 0.5) / size);
+    colour.rgb = mix(colour.rgb, laid.rgb, opacity * laid.a);
   }
 }`;
 
@@ -183,9 +175,11 @@ function webgl(canvas) {
   gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
   gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
 
+  const made = [];
   function texture(unit, kind) {
     gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(kind, gl.createTexture());
+    gl.deleteTexture(made[unit] ?? null);
+    gl.bindTexture(kind, made[unit] = gl.createTexture());
     for (const [name, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
@@ -203,25 +197,28 @@ function webgl(canvas) {
     gl.texSubImage3D(
       gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGBA, gl.UNSIGNED_BYTE, codes);
   }
-  layers(0, data.truth ? 2 * count : count);
-  layers(1, count);
-  for (let view = 0; view < count; view++) {
-    upload(0, atlases.estimate, view, view);
-    upload(1, depth, view, view, addNearest);
-  }
-  texture(2, gl.TEXTURE_2D);
-  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
-  gl.uniform1i(at("views"), 0);
-  gl.uniform1i(at("depths"), 1);
-  gl.uniform1i(at("overlay"), 2);
-  gl.uniform2i(at("grid"), columns, rows);
-  gl.uniform2f(at("size"), width, height);
-  gl.uniform2f(at("range"), data.disparity.low, data.disparity.high);
-  gl.uniform1f(at("gamma"), data.gamma);
   const [shown, position, focus, aperture, wipe, opacity] =
     ["shown", "position", "focus", "aperture", "wipe", "opacity"].map(at);
   return {
     kind: "WebGL2",
+    load() {
+    layers(0, data.truth ? 2 * count : count);
+    layers(1, count);
+    for (let view = 0; view < count; view++) {
+      upload(0, atlases.estimate, view, view);
+      upload(1, depth, view, view, addNearest);
+    }
+    texture(2, gl.TEXTURE_2D);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    gl.uniform1i(at("compared"), 0);
+    gl.uniform1i(at("views"), 0);
+    gl.uniform1i(at("depths"), 1);
+    gl.uniform1i(at("overlay"), 2);
+    gl.uniform2i(at("grid"), columns, rows);
+    gl.uniform2f(at("size"), width, height);
+    gl.uniform2f(at("range"), data.disparity.low, data.disparity.high);
+    gl.uniform1f(at("gamma"), data.gamma);
+    },
     async compare(truth) {
       for (let view = 0; view < count; view++) {
         upload(0, truth, view, count + view);
@@ -269,6 +266,7 @@ function plain(canvas) {
   }
   return {
     kind: "plain canvas",
+    load() { Object.assign(canvas, { width, height }); laid = null; },
     async compare() {},
     draw() {
       scene(atlases.estimate);
@@ -349,7 +347,8 @@ function reading() {
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
   data.overlays.forEach((one, k) => {
     if (one.key === "disparity" || !overlayLevels[k]) return;
-    const level = overlayLevels[k].data[4 * (y * width + x)] / 255;
+    const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
+    if (!overlayLevels[k].data[at + 3]) { here.push(`${one.label} unknown`); return; }
     const value = one.low + level * (one.high - one.low);
     here.push(one.names.length ? `${one.label}: ${one.names[Math.round(value)]}`
       : `${one.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${one.unit}`.trimEnd());
@@ -395,7 +394,7 @@ function choose(overlay) {
     const table = Array.from({ length: 256 }, (_, i) => colourOf(one.colours, i / 255, one.names.length));
     for (let i = 0; i < coloured.data.length; i += 4) {
       const [r, g, b] = table[levels.data[i]];
-      coloured.data.set([r, g, b, 255], i);
+      coloured.data.set([r, g, b, levels.data[i + 3]], i);
     }
     renderer.lay(coloured);
     const add = (to, kind, text, name) => {
@@ -533,13 +532,13 @@ function listen() {
     event.preventDefault();
     set({ aperture: state.aperture - Math.sign(event.deltaY) * 0.25 });
   }, { passive: false });
-  const step = (data.focus.high - data.focus.low) / 60;
+  const step = () => (data.focus.high - data.focus.low) / 60;
   const keys = {
     ArrowLeft: () => set({ u: state.u - 0.1 }), ArrowRight: () => set({ u: state.u + 0.1 }),
     ArrowUp: () => set({ v: state.v - 0.1 }), ArrowDown: () => set({ v: state.v + 0.1 }),
     "+": () => set({ aperture: state.aperture + 0.25 }), "=": () => set({ aperture: state.aperture + 0.25 }),
     "-": () => set({ aperture: state.aperture - 0.25 }),
-    PageUp: () => set({ focus: state.focus + step }), PageDown: () => set({ focus: state.focus - step }),
+    PageUp: () => set({ focus: state.focus + step() }), PageDown: () => set({ focus: state.focus - step() }),
     w: () => atlases.truth && set({ wipe: state.wipe ? 0 : 0.5 }),
     " ": sway, r: reset, f: full,
   };
@@ -570,39 +569,74 @@ function prepareControls() {
   byId("focus").min = data.focus.low;
   byId("focus").max = data.focus.high;
   for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
-  const choices = [["nothing", -1], ...data.overlays.map((one, k) => [one.label, k])];
-  for (const [label, value] of choices) {
+  const choices = ["nothing", ...data.overlays.map((one) => one.label)];
+  const there = [...byId("overlays").querySelectorAll("label")];
+  if (choices.join() === there.map((row) => row.textContent).join()) return; // one of them may have the focus
+  for (const row of there) row.remove();
+  choices.forEach((label, k) => {
     const row = byId("overlays").appendChild(document.createElement("label"));
     const input = row.appendChild(document.createElement("input"));
-    Object.assign(input, { type: "radio", name: "viewer-overlay", value, checked: value < 0 });
-    input.addEventListener("change", () => choose(value));
+    Object.assign(input, { type: "radio", name: "viewer-overlay", value: k - 1, checked: !k });
+    input.addEventListener("change", () => choose(k - 1));
     row.append(label);
-  }
+  });
 }
 
-async function main() {
+// What the pictures are of; a place, a focus and an overlay stay chosen from one light field to the next.
+function adopt(next) {
+  const before = data, overlay = data?.overlays[state.overlay]?.key;
+  const grown = before ? next.views.width / width : 1;
+  data = next;
+  ({ rows, columns, width, height } = data.views);
+  const padded = (length) => Math.ceil(length / data.tile) * data.tile;
+  [tileWidth, tileHeight, count] = [padded(width), padded(height), rows * columns];
+  farthest = Math.hypot(rows - 1, columns - 1) + 1;
+  if (!before) Object.assign(state, home(), { x: width >> 1, y: height >> 1 });
+  state.x = clamp(Math.round(state.x * grown), 0, width - 1);
+  state.y = clamp(Math.round(state.y * grown), 0, height - 1);
+  state.focus = clamp(state.focus * grown, data.focus.low, data.focus.high);
+  state.overlay = data.overlays.findIndex((one) => one.key === overlay);
+  picture.style.aspectRatio = `${width} / ${height}`;
+  byId("stage").style.maxWidth = `calc(80vh * ${width} / ${height})`;
+}
+
+// Show a light field, in place of the one before if there is one. Fulfilled when it can be turned;
+// maps of the first, and a truth, are decoded after that.
+async function take(next) {
+  const replaced = Boolean(renderer);
+  if (replaced) decoded.forget();
+  const [estimate, disparities, maps] = await Promise.all(
+    [decoded(next.estimate), decoded(next.disparity.atlas), replaced ? levelsOf(next) : []]);
+  adopt(next);
   prepareControls();
-  [atlases.estimate, depth] = await Promise.all([data.estimate, data.disparity.atlas].map(decoded));
+  [atlases, depth, overlayLevels] = [{ estimate }, disparities, maps];
   const wanted = new URLSearchParams(location.search).get("renderer");
-  renderer = (wanted === "plain" ? null : webgl(picture)) ?? plain(picture);
-  listen();
+  renderer ??= (wanted === "plain" ? null : webgl(picture)) ?? plain(picture);
+  renderer.load();
+  if (replaced) choose(state.overlay);
+  else listen();
   draw();
-  byId("poster").remove();
+  byId("poster")?.remove();
   const viewer = document.getElementById("viewer");
   viewer.dataset.renderer = renderer.kind;
   viewer.dataset.ready = "yes";
   // For tests: set a state, draw it now, and how long a drawing takes.
   viewer.show = (more, pixels = 1) => { set(more); detail = pixels; draw(); renderer.finish(); };
-  compare().then(() => { viewer.dataset.complete = "yes"; }, failed);
+  compare(next).then(() => { viewer.dataset.complete = "yes"; }, failed);
+}
+
+async function levelsOf(next) {
+  const laid = await Promise.all(next.overlays.map((one) => decoded(one.picture)));
+  return laid.map((one) => one.getContext("2d").getImageData(0, 0, one.width, one.height));
 }
 
 // What is laid over the estimate and compared with it.
-async function compare() {
+async function compare(next) {
   await breath();
-  const laid = await Promise.all(data.overlays.map((one) => decoded(one.picture)));
-  overlayLevels = laid.map((canvas) => canvas.getContext("2d").getImageData(0, 0, width, height));
-  if (data.truth) {
-    const truth = await decoded(data.truth);
+  const maps = await levelsOf(next), truth = next.truth && await decoded(next.truth);
+  if (data !== next) return;
+  overlayLevels = maps;
+  if (truth) {
     await renderer.compare(truth);
     atlases.truth = truth;
   }
@@ -613,5 +647,15 @@ function failed(error) {
   byId("status").textContent = `The light field could not be drawn (${error}).`;
   console.error(error);
 }
-return main().catch(failed);
+return { take: (next) => take(next).catch(failed) };
+})();
+
+// What a page holds itself; a report holds the views for more than the viewer.
+const viewerShown = (() => {
+  const own = document.getElementById("viewer-data");
+  if (!own) return null;
+  const data = JSON.parse(own.textContent);
+  if (data.estimate) return lightFieldViewer.take(data);
+  const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
+  return lightFieldViewer.take({ ...data, estimate, truth });
 })();
