@@ -32,3 +32,8 @@ print(f"{result.compare(scene)['psnr_db']:.2f} dB")
 print(result.verdict.level)
 for reason in result.verdict.reasons:
     print(f"- {reason.what}\n  {reason.remedy}")
+
+# %%
+# What it would have shown, beside the truth and the readings that it leaves unexplained:
+
+figure = result.figure(truth=scene)

@@ -51,7 +51,7 @@ calibration
 psi, frames = emmc.open_frames(session.folder)
 result = emmc.reconstruct(psi, frames, "adaptive-fast")
 print(result.verdict.words)
-result.show()
+figure = result.show()
 
 # %%
 work.cleanup()

@@ -13,15 +13,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
 from emmc_rig.study.oracle import matched_disparity
 from emmc_rig.study.sweep import Results, Sweep, machine
-from emmc_rig.study.trial import Array, Setup, Trial, trial_of
+from emmc_rig.study.trial import Array, Capture, Trial, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.methods import MethodSettings
@@ -61,7 +59,7 @@ class Ablation(Figures):
 
 @dataclass
 class AblationSweep(Sweep[str]):
-    """The rows of an ablation by name; settings: Setup."""
+    """The rows of an ablation by name; settings: Capture."""
 
     journal = "ablation.jsonl"
     noun = "rows"
@@ -75,17 +73,9 @@ class AblationSweep(Sweep[str]):
 
     def inputs(self, point: str) -> dict[str, object]:
         """Return everything that a row depends on, as plain data."""
-        given = self.settings
-        return {
-            "row": point,
-            "settings": _settings(point).model_dump(mode="json"),
-            "machine": machine(),
-            "camera": given.camera.model_dump(mode="json"),
-            "scene": given.scene,
-            "sum": float(np.sum(self.trial.truth, dtype=np.float64)),
-            "size": given.size,
-            "seed": given.seed,
-        }
+        settings = _settings(point).model_dump(mode="json")
+        given = self.settings.identity()
+        return {"row": point, "settings": settings, "machine": machine(), "capture": given}
 
     def prepare(self, points: Sequence[str], watcher: Watcher) -> None:
         """Run the method once, so that no row's seconds count its compiling."""
@@ -120,7 +110,7 @@ def _reconstructed(given: Trial, row: str) -> tuple[Array, float]:
     return result.light_field, result.seconds
 
 
-def ablations(given: Setup, folder: Path, watcher: Watcher) -> list[Ablation]:
+def ablations(given: Capture, folder: Path, watcher: Watcher) -> list[Ablation]:
     """Return the whole method, then it without each part, its rivals, the oracle and the copy.
 
     Rows that the folder holds are not measured again; see `Sweep.run`.
@@ -137,7 +127,7 @@ def ablations(given: Setup, folder: Path, watcher: Watcher) -> list[Ablation]:
 def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     """Measure `adaptive` without each of its parts (`chart --ablation`)."""
     scene, size = (*asked.scenes, "deep-occlusions")[0], asked.size or (128, 160)
-    rows = ablations(Setup(scene, asked.described, size, asked.seed), folder, show)
+    rows = ablations(Capture(scene, asked.camera, size, asked.seed), folder, show)
     show.table(
         ("adaptive", "dB", "s", "buys dB", "costs s"),
         [

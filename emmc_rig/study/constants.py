@@ -1,20 +1,15 @@
 """What twice and half of each tuned constant of the adaptive method costs, in dB.
 
-The constants are found, not listed: numbers in capitals at the top of the modules of
-`reconstruction.adaptive`, and the numbers among its settings. Those that compiled kernels use are
-left out: they are frozen with the kernel.
+They are those of the modules of `reconstruction.adaptive` (see `study.scaling`), and the numbers
+among its settings.
 """
 
 from __future__ import annotations
 
-import ast
-import inspect
-import pkgutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from importlib import import_module
+from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,46 +23,31 @@ from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
+from emmc_rig.study.scaling import (
+    FACTORS,
+    Constant,
+    is_number,
+    modules_of,
+    numbers_of,
+    scaled,
+    scaled_value,
+    short_name,
+)
 from emmc_rig.study.sweep import NotApplicableError, Results, Sweep, csv_text
-from emmc_rig.study.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
 from simulators.scenes import SCENES
 
-FACTORS = (2.0, 0.5)
 ELSEWHERE = ("method", "models", "planning", "uncertainty")
 """Modules whose constants change advice, maps and deviation, but not the light field."""
-Value = float | tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Constant:
-    """A number, or several that are scaled together, of a module, or of its settings.
-
-    module: its name within `reconstruction.adaptive`; for settings "settings" and
-    "settings.texture".
-    """
-
-    module: str
-    name: str
-    value: Value
-
-    @property
-    def label(self) -> str:
-        """Return how a table calls it."""
-        return f"{self.module}.{self.name}"
-
-    @property
-    def is_setting(self) -> bool:
-        """Return whether it is a setting."""
-        return self.module.startswith("settings")
 
 
 @dataclass(frozen=True)
 class Scaled:
     """A capture reconstructed with a constant times a factor; None: with all as they are."""
 
-    capture: int
+    capture: Capture
     constant: Constant | None = None
     factor: float = 1.0
 
@@ -91,54 +71,17 @@ class Cost(Figures):
 
 
 def _modules() -> list[ModuleType]:
-    package = reconstruction.adaptive
-    return [
-        import_module(f"{package.__name__}.{one.name}")
-        for one in pkgutil.iter_modules(package.__path__)
-        if one.name not in ELSEWHERE
-    ]
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, tuple):
-        return bool(value) and all(map(_is_number, value))
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _compiled(module: ModuleType) -> set[str]:
-    """Return the names that the compiled functions of a module use."""
-    kernels = [getattr(value, "py_func", None) for value in vars(module).values()]
-    return {name for kernel in kernels if kernel for name in kernel.__code__.co_names}
+    return [one for one in modules_of(reconstruction.adaptive) if short_name(one) not in ELSEWHERE]
 
 
 @cache
 def constants() -> tuple[Constant, ...]:
     """Return the constants and numerical settings of the adaptive method."""
-    found, frozen = [], set().union(*map(_compiled, _modules()))
-    for module in _modules():
-        short = module.__name__.rpartition(".")[2]
-        for node in ast.parse(inspect.getsource(module)).body:
-            names = [
-                name.id
-                for target in getattr(node, "targets", ())
-                for name in ast.walk(target)
-                if isinstance(name, ast.Name) and name.id.isupper() and name.id not in frozen
-            ]
-            found += [
-                Constant(short, name, value)
-                for name in names
-                if not name.startswith("_") and _is_number(value := getattr(module, name))
-            ]
     settings = AdaptiveSettings()
+    found = numbers_of(_modules())
     for module, part in (("settings", settings), ("settings.texture", settings.texture)):
-        found += [Constant(module, name, value) for name, value in part if _is_number(value)]
+        found += [Constant(module, name, value) for name, value in part if is_number(value)]
     return tuple(found)
-
-
-def _times(value: Value, factor: float) -> Value:
-    if isinstance(value, tuple):
-        return tuple(_times(one, factor) for one in value)  # type: ignore[return-value]
-    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
 @contextmanager
@@ -150,34 +93,30 @@ def _with(constant: Constant | None, factor: float) -> Iterator[AdaptiveSettings
     if constant is None:
         yield AdaptiveSettings()
         return
-    value = _times(constant.value, factor)
-    if value == constant.value:
-        raise NotApplicableError(f"{constant.label} stays {value}")
-    if constant.is_setting:
-        own = {constant.name: value}
-        within = own if constant.module == "settings" else {"texture": own}
-        try:
-            changed = AdaptiveSettings.model_validate(within)
-        except ValidationError as why:
-            raise NotApplicableError(f"{constant.label} may not be {value}") from why
-        yield changed
+    if not _is_setting(constant):
+        with scaled(_modules(), constant, factor):
+            yield AdaptiveSettings()
         return
-    home = import_module(f"{reconstruction.adaptive.__name__}.{constant.module}")
-    was = getattr(home, constant.name)
-    # Modules import names from each other: each has its own.
-    users = [one for one in _modules() if getattr(one, constant.name, None) is was]
+    value = scaled_value(constant, factor)
+    own = {constant.name: value}
+    within = own if constant.module == "settings" else {"texture": own}
     try:
-        for one in users:
-            setattr(one, constant.name, value)
-        yield AdaptiveSettings()
-    finally:
-        for one in users:
-            setattr(one, constant.name, was)
+        changed = AdaptiveSettings.model_validate(within)
+    except ValidationError as why:
+        raise NotApplicableError(f"{constant.label} may not be {value}") from why
+    yield changed
+
+
+def _is_setting(constant: Constant) -> bool:
+    return constant.module.startswith("settings")
+
+
+_trial = lru_cache(maxsize=32)(trial_of)
 
 
 @dataclass
 class ConstantSweep(Sweep[Scaled]):
-    """The PSNR of captures with a constant scaled; settings: the captures, a tuple of Setup."""
+    """The PSNR of captures with a constant scaled; settings are not asked."""
 
     journal = "constants.jsonl"
     noun = "captures"
@@ -186,26 +125,14 @@ class ConstantSweep(Sweep[Scaled]):
 
     def inputs(self, point: Scaled) -> dict[str, object]:
         """Return everything that a trial depends on, as plain data."""
-        given: Setup = self.settings[point.capture]
-        return {
-            "camera": given.camera.model_dump(mode="json"),
-            "scene": given.scene,
-            "sum": float(np.sum(self.trials[point.capture].truth, dtype=np.float64)),
-            "size": given.size,
-            "seed": given.seed,
-            "constants": {one.label: one.value for one in constants()},
-            "constant": point.label,
-        }
-
-    @cached_property
-    def trials(self) -> list[Trial]:
-        """What is reconstructed."""
-        return [trial_of(one) for one in self.settings]
+        every = {one.label: one.value for one in constants()}
+        capture = point.capture.identity()
+        return {"capture": capture, "constants": every, "constant": point.label}
 
     def measured(self, points: Sequence[Scaled], watcher: Watcher) -> Results:
         """Yield the PSNR of each point."""
         for point in points:
-            given = self.trials[point.capture]
+            given = _trial(point.capture)
             with _with(point.constant, point.factor) as settings:
                 result = reconstruct_adaptive(
                     given.psi, given.readings, given.noise_sigma, settings, given.usable
@@ -214,15 +141,15 @@ class ConstantSweep(Sweep[Scaled]):
 
 
 def constant_costs(
-    captures: Sequence[Setup], folder: Path, watcher: Watcher
+    captures: Sequence[Capture], folder: Path, watcher: Watcher
 ) -> tuple[list[Cost], list[str]]:
     """Return what each factor of each constant costs, the dearest first, and what was left out.
 
     Trials that the folder holds are not measured again; see `Sweep.run`.
     """
-    whole = [Scaled(at) for at in range(len(captures))]
+    whole = [Scaled(one) for one in captures]
     scaled = [(one, factor) for one in constants() for factor in FACTORS]
-    sweep = ConstantSweep(tuple(captures), folder)
+    sweep = ConstantSweep(None, folder)
     trials = [replace(at, constant=one, factor=by) for one, by in scaled for at in whole]
     results = sweep.run([*whole, *trials], watcher)
     costs = []
@@ -243,7 +170,7 @@ def constant_costs(
 def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     """Measure twice and half of each constant (`chart --constants`)."""
     scenes, size = asked.scenes or tuple(SCENES), asked.size or (96, 96)
-    captures = [Setup(scene, asked.described, size, asked.seed) for scene in scenes]
+    captures = [Capture(scene, asked.camera, size, asked.seed) for scene in scenes]
     costs, left_out = constant_costs(captures, folder, show)
     show.table(
         ("constant", "value", "times", "costs dB", "error", "at most"),

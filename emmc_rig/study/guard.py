@@ -17,10 +17,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.files import write_text
 from emmc_rig.study.benchmarks.running import CFA, Asked, Show
-from emmc_rig.study.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.methods import DEFAULT_METHOD
 
 MOST_FALL_DB = 0.3
@@ -35,31 +34,20 @@ GROUPS = {
     "B": ("messerschmitt", "bikes", "isochart", "general11", "lytro1", "lytro2"),
 }
 REAL_SIZE = (96, 96)
-SEED = 0
 
 
-@dataclass(frozen=True)
-class Case:
-    """A scene, by what `open_scene` takes, its middle of `size` pixels, a shipped camera, and the
-    standard deviation of the readings' noise."""
-
-    scene: str
-    size: tuple[int, int]
-    camera: str = CAMERA
-    noise: float = NOISES[0]
-
-    @property
-    def key(self) -> str:
-        """The name of its stored figure."""
-        rows, columns = self.size
-        return f"{Path(self.scene).name} {rows}x{columns} {self.camera} {self.noise:g}"
+def key(case: Capture) -> str:
+    """Return the name of a capture's stored figure."""
+    assert case.size is not None
+    rows, columns = case.size
+    return f"{Path(case.scene).name} {rows}x{columns} {case.camera} {case.noise:g}"
 
 
 @dataclass(frozen=True)
 class Row:
     """A case measured: its PSNR and the one stored, None where there is none."""
 
-    case: Case
+    case: Capture
     psnr_db: float
     stored_db: float | None
 
@@ -71,7 +59,7 @@ class Row:
 
 def cases(
     scenes: Sequence[str] = (), size: tuple[int, int] | None = None, camera: str = CAMERA
-) -> list[Case]:
+) -> list[Capture]:
     """Return the cases of some scenes; by default the built-in ones, and the real ones there are.
 
     size: rows and columns of all; by default BUILT_IN_SIZE of built-in and REAL_SIZE of real ones.
@@ -81,21 +69,17 @@ def cases(
     real = [str(scene) for scene in there if os.environ.get("EMMC_LIGHTFIELDS") and scene.is_dir()]
     chosen = scenes or (*BUILT_IN, *real)
     return [
-        Case(scene, size or (BUILT_IN_SIZE if scene in BUILT_IN else REAL_SIZE), camera, noise)
+        Capture(
+            scene, camera, size or (BUILT_IN_SIZE if scene in BUILT_IN else REAL_SIZE), noise=noise
+        )
         for scene in chosen
         for noise in NOISES
     ]
 
 
-def captured(case: Case) -> Trial:
-    """Return the frames of a case; raises what scene and camera do."""
-    setup = Setup(case.scene, find_camera(case.camera), case.size, SEED)
-    return trial_of(setup, white_noise=case.noise)
-
-
-def measured_db(case: Case) -> float:
+def measured_db(case: Capture) -> float:
     """Return the PSNR of the default method; raises what scene, camera and method do."""
-    given = captured(case)
+    given = trial_of(case)
     return given.psnr_db(given.solved(DEFAULT_METHOD).light_field)
 
 
@@ -104,15 +88,15 @@ def stored_figures() -> dict[str, float]:
     return json.loads(resources.files("emmc_rig.study").joinpath(STORED).read_text())
 
 
-def guarded(chosen: Iterable[Case], stored: Mapping[str, float]) -> Iterator[Row]:
+def guarded(chosen: Iterable[Capture], stored: Mapping[str, float]) -> Iterator[Row]:
     """Yield every case measured, beside its stored figure."""
     for case in chosen:
-        yield Row(case, measured_db(case), stored.get(case.key))
+        yield Row(case, measured_db(case), stored.get(key(case)))
 
 
 def merged_text(rows: Iterable[Row], stored: Mapping[str, float]) -> str:
     """Return the text of a file of figures: those stored, with those measured in their place."""
-    new = {row.case.key: round(row.psnr_db, 2) for row in rows}
+    new = {key(row.case): round(row.psnr_db, 2) for row in rows}
     return json.dumps({**stored, **new}, indent=2, sort_keys=True) + "\n"
 
 
@@ -123,8 +107,8 @@ def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
         rows.append(row)
         was = "-" if row.stored_db is None else f"{row.stored_db:.2f}"
         word = "fell" if row.fell else "none stored" if row.stored_db is None else ""
-        shown.append((row.case.key, f"{row.psnr_db:.2f}", was, word))
+        shown.append((key(row.case), f"{row.psnr_db:.2f}", was, word))
     show.table(("case", "dB", "stored dB", ""), shown)
     write_text(folder / STORED, merged_text(rows, stored))
-    fell = [row.case.key for row in rows if row.fell]
-    return {"psnr_db": {row.case.key: row.psnr_db for row in rows}, "fell": fell}
+    fell = [key(row.case) for row in rows if row.fell]
+    return {"psnr_db": {key(row.case): row.psnr_db for row in rows}, "fell": fell}

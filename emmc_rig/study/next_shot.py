@@ -9,13 +9,14 @@ compared with the truth after each shot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from pydantic import TypeAdapter
 
 from calibration.shadow import shadow_mask
 from emmc_rig.calibrate.bench import WhiteboardBench
@@ -74,15 +75,6 @@ class SceneRows:
     in_order: tuple[ShotRow, ...]
     copied_db: float
     """Of the true centre view, copied."""
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> SceneRows:
-        """Return what `asdict` described."""
-        chosen, in_order = (
-            tuple(ShotRow(**{**row, "shots": tuple(row["shots"])}) for row in rows)
-            for rows in (data["chosen"], data["in_order"])
-        )
-        return cls(data["scene"], chosen, in_order, data["copied_db"])
 
 
 @dataclass(frozen=True)
@@ -256,7 +248,7 @@ def next_shots(
     """
     plan = candidate_plan(camera_name, camera, size)
     results = ShotSweep(plan, folder, camera, size, seed, rays, most).run(scenes, watcher)
-    return [SceneRows.from_dict(result) for result in results.values()]
+    return TypeAdapter(list[SceneRows]).validate_python(list(results.values()))
 
 
 def savings(rows: SceneRows, targets_db: Sequence[float]) -> list[Saving]:

@@ -74,17 +74,11 @@ def best_schedule_s(seconds: Sequence[float], workers: int) -> float:
     return float(free.max())
 
 
-@dataclass(frozen=True)
-class _Spent:
-    wall_s: float
-    cpu_s: float
-
-
-def _spent(what: Callable[[], Result]) -> tuple[_Spent, Result]:
-    """Return what a call takes, and what it returns."""
+def _spent(what: Callable[[], Result]) -> tuple[float, float, Result]:
+    """Return what a call takes, seconds by the clock and of the processor, and what it returns."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = what()
-    return _Spent(time.perf_counter() - wall, time.process_time() - cpu), result
+    return time.perf_counter() - wall, time.process_time() - cpu, result
 
 
 def _sleep(task: tuple[float, bytes]) -> None:
@@ -106,11 +100,11 @@ def replayed(seconds: Sequence[float], task_bytes: int, workers: int, speed_up: 
         pool = Cluster(client, "of sleeping workers")
         for _ in pool.run(_sleep, [(0.0, b"")] * workers):
             pass
-        idle, _ = _spent(lambda: time.sleep(IDLE_S))
-        spent, done = _spent(lambda: sum(1 for _ in pool.run(_sleep, tasks)))
-    scheduler_s = max(spent.cpu_s - idle.cpu_s / idle.wall_s * spent.wall_s, 0)
+        idle_s, idle_cpu_s, _ = _spent(lambda: time.sleep(IDLE_S))
+        wall_s, cpu_s, done = _spent(lambda: sum(1 for _ in pool.run(_sleep, tasks)))
+    scheduler_s = max(cpu_s - idle_cpu_s / idle_s * wall_s, 0)
     best = best_schedule_s(seconds, workers)
-    return Replayed(workers, done, sum(seconds), best, scheduler_s, spent.wall_s)
+    return Replayed(workers, done, sum(seconds), best, scheduler_s, wall_s)
 
 
 def main(

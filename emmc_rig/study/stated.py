@@ -18,7 +18,8 @@ from emmc_rig.advice.trial import SURE_DB, Prospect, prospects
 from emmc_rig.model.frames import Frames
 from emmc_rig.pages.page import number
 from emmc_rig.study.benchmarks.running import Asked, Show
-from emmc_rig.study.guard import Case, captured, cases
+from emmc_rig.study.guard import cases, key
+from emmc_rig.study.trial import Capture, trial_of
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Stated:
     """A method on a case: what was expected, the true PSNR, and the shares of the errors within one
     and two stated deviations, None of methods that state none."""
 
-    case: Case
+    case: Capture
     expected: Prospect
     true_db: float
     within_one: float | None
@@ -45,7 +46,7 @@ class Stated:
     def as_dict(self) -> dict:
         """Return the figures, for metrics."""
         return {
-            "case": self.case.key,
+            "case": key(self.case),
             **asdict(self.expected),
             "true_db": self.true_db,
             "inside": self.inside,
@@ -54,11 +55,13 @@ class Stated:
         }
 
 
-def stated(chosen: Iterable[Case]) -> Iterator[Stated]:
+def stated(chosen: Iterable[Capture]) -> Iterator[Stated]:
     """Yield every method of the trial on every case; raises what scene, camera and method do."""
     for case in chosen:
-        given = captured(case)
-        frames = Frames(given.readings, np.full(given.readings.shape, case.noise), given.usable)
+        given = trial_of(case)
+        frames = Frames(
+            given.readings, np.full(given.readings.shape, given.noise_sigma), given.usable
+        )
         for expected in prospects(given.psi, frames):
             result = given.solved(expected.method)
             sigma = result.maps.get("sigma")
@@ -100,7 +103,7 @@ def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
         shares = [number(one, ".0%") for one in (row.within_one, row.within_two)]
         true = f"{row.true_db:.1f}{'' if row.inside else ' (outside)'}"
         stated_db = f"{expected.psnr_db:.1f} ({interval})"
-        shown.append((row.case.key, expected.method, stated_db, true, *shares))
+        shown.append((key(row.case), expected.method, stated_db, true, *shares))
     show.table(("case", "method", "stated dB", "true dB", "within one", "within two"), shown)
     for line in lines:
         show.line(line)

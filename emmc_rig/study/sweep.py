@@ -15,9 +15,11 @@ import platform
 import re
 from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
+
+from pydantic_core import to_jsonable_python
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
@@ -27,6 +29,7 @@ from emmc_rig.pages.page import number
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.reconstruct.pool import Pool
 from emmc_rig.version import __version__
+from reconstruction.methods import METHODS
 
 P = TypeVar("P", bound=Hashable)
 Results = Generator[dict, None, None]
@@ -166,11 +169,11 @@ class Sweep(Generic[P]):
     """Of what a point's figures are: raised with them, so that older points are measured again."""
 
     def inputs(self, point: P) -> dict[str, object]:
-        """Return everything that a point's figures depend on, as plain data.
+        """Return everything that a point's figures depend on, as plain data: by default its own.
 
         Raises NotApplicableError for a point that cannot be measured.
         """
-        raise NotImplementedError
+        return described(point)
 
     def measured(self, points: Sequence[P], watcher: Watcher) -> Results:
         """Yield the result of each point of a group, in order.
@@ -329,6 +332,20 @@ def plain(result: Mapping[str, object]) -> dict:
     return json.loads(metrics_text(result))
 
 
+def described(point: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as plain data; of its capture what identifies it.
+
+    Raises NotApplicableError for a method that is not installed.
+    """
+    found = {one.name: getattr(point, one.name) for one in fields(point)}
+    method = METHODS.get(found.get("method", ""))
+    if method and not method.installed:
+        raise NotApplicableError(f"{method.name} needs {method.package}, which is not installed")
+    if "capture" in found:
+        found["capture"] = found["capture"].identity()
+    return to_jsonable_python(found)
+
+
 def csv_text(
     rows: Sequence[Mapping[str, object]],
     columns: Sequence[str] = (),
@@ -368,6 +385,12 @@ def check_scene_names(specs: Sequence[str], option: str = "--scene") -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise AppError(f"{option}: two are called '{twice}'; name each once, or rename one")
+
+
+def check_size(size: tuple[int, int] | None, least_px: int) -> None:
+    """Raise AppError for a picture of fewer than `least_px` rows or columns."""
+    if size is not None and min(size) < least_px:
+        raise AppError(f"--size {size[0]}x{size[1]}: needs {least_px}x{least_px} or more")
 
 
 def available_cores() -> int:

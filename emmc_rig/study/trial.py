@@ -10,14 +10,17 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.sweep import NotApplicableError
@@ -32,19 +35,45 @@ open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)
 
 
 @dataclass(frozen=True)
-class Setup:
-    """What is captured, and by what. scene: see `open_scene`.
+class Capture:
+    """A scene through a camera. scene: see `open_scene`. camera: described, or found by its name.
 
     size: rows and columns; None takes all of a measured scene. zoom: a built-in scene is rendered
-    so many times larger, and cut. seed: of the noise, of what is random in a fault, and of a
-    built-in scene.
+    so many times larger, and cut, which makes its disparities as many times larger. seed: of the
+    noise, of what is random in a fault, and of a built-in scene. shots, views: None takes the
+    camera's own. noise: deviation of the readings' white noise, instead of the sensor's.
     """
 
     scene: str
-    camera: Camera
+    camera: Camera | str
     size: tuple[int, int] | None = None
     seed: int = 0
     zoom: int = 1
+    shots: int | None = None
+    views: tuple[int, int] | None = None
+    noise: float | None = None
+
+    def __hash__(self) -> int:
+        # A camera holds dictionaries, which have no hash.
+        return hash((self.scene, self.size, self.seed, self.zoom, self.shots, self.noise))
+
+    @property
+    def scene_name(self) -> str:
+        """The scene as tables call it."""
+        return Path(self.scene).stem
+
+    @property
+    def camera_name(self) -> str:
+        """The camera as tables call it."""
+        return Path(self.camera).stem if isinstance(self.camera, str) else self.camera.title
+
+    @cached_property
+    def described(self) -> Camera:
+        """The camera; raises what `find_camera` and `with_shots` do."""
+        camera = find_camera(self.camera) if isinstance(self.camera, str) else self.camera
+        if self.views is not None:
+            camera = camera.model_copy(update={"views": self.views})
+        return camera if self.shots is None else with_shots(camera, self.shots)
 
     @property
     def is_built_in(self) -> bool:
@@ -63,22 +92,46 @@ class Setup:
 
         Raises what `zoomed_scene` does.
         """
-        views = views or self.camera.views
+        views = views or self.described.views
         if change is None:
             return _opened(self.scene, self.size, views, self.seed, self.zoom)
         return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
 
-    def content(self) -> list[float] | None:
-        """Return what identifies a measured scene beside its name; a built-in one has its seed."""
-        if self.is_built_in:
-            return None
-        seen = self.scene_seen().light_field
-        squares = np.square(seen, dtype=np.float64)
-        return [float(np.sum(one, dtype=np.float64)) for one in (seen, squares)]
+    def psi(self) -> ImagingMatrix:
+        """Return the Psi of the camera as designed, for the scene's size."""
+        truth = self.scene_seen().light_field
+        return build_imaging_matrix(self.described, (truth.shape[2], truth.shape[3]))
 
-    def with_camera(self, **changed: object) -> Setup:
-        """Return the setup with some fields of the camera replaced."""
-        return dataclasses.replace(self, camera=self.camera.model_copy(update=changed))
+    def identity(self) -> dict[str, object]:
+        """Return what its frames depend on, as plain data; of a measured scene its sums as well."""
+        content = None
+        if not self.is_built_in:
+            content = _sums(self.scene, self.size, self.described.views)
+        return {
+            "scene": self.scene_name,
+            "content": content,
+            "camera": self.described.model_dump(mode="json"),
+            **{name: getattr(self, name) for name in ("size", "zoom", "seed", "noise")},
+        }
+
+    def with_camera(self, **changed: object) -> Capture:
+        """Return the capture with some fields of the camera replaced."""
+        camera = self.described.model_copy(update=changed)
+        return dataclasses.replace(self, camera=camera, shots=None, views=None)
+
+
+def with_shots(camera: Camera, count: int) -> Camera:
+    """Return a camera of so many shots; raises NotApplicableError where it has no rule for them."""
+    try:
+        return camera.with_shots(count)
+    except CameraError as why:
+        raise NotApplicableError(str(why)) from why
+
+
+@lru_cache
+def _sums(spec: str, size: tuple[int, int] | None, views: tuple[int, int]) -> list[float]:
+    seen = zoomed_scene(spec, size, views).light_field
+    return [float(np.sum(one, dtype=np.float64)) for one in (seen, np.square(seen))]
 
 
 @lru_cache(maxsize=4)
@@ -132,26 +185,24 @@ class Trial:
 
 
 def trial_of(
-    setup: Setup,
+    capture: Capture,
     *,
     scene: Scene | None = None,
     true_psi: ImagingMatrix | None = None,
     shot_scenes: list[Array] | None = None,
     change_clean: Callable[[Array], Array] | None = None,
     unusable: NDArray[np.bool_] | None = None,
-    white_noise: float | None = None,
 ) -> Trial:
-    """Return the trial of a setup; the method assumes the Psi of its camera.
+    """Return the trial of a capture; the method assumes the Psi of its camera.
 
-    scene: instead of the setup's. true_psi: makes the readings, instead of the assumed one.
+    scene: instead of the capture's. true_psi: makes the readings, instead of the assumed one.
     shot_scenes: the light field before each shot, where it changes. change_clean: what becomes of
-    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels marked as such. white_noise:
-    deviation of the readings' noise, instead of the sensor's.
+    the noise-free readings (shot, pixel_y, pixel_x). unusable: pixels marked as such.
     """
-    scene = scene or setup.scene_seen()
+    scene = scene or capture.scene_seen()
     truth = scene.light_field
     size = (truth.shape[2], truth.shape[3])
-    psi = build_imaging_matrix(setup.camera, size)
+    psi = build_imaging_matrix(capture.described, size)
     real = true_psi or psi
     if shot_scenes is None:
         clean = real.forward(truth)
@@ -159,13 +210,13 @@ def trial_of(
         clean = np.stack([real.forward(seen)[shot] for shot, seen in enumerate(shot_scenes)])
     if change_clean is not None:
         clean = change_clean(clean)
-    if white_noise is not None:
-        noise = np.random.default_rng(setup.seed).normal(0, white_noise, clean.shape)
+    if capture.noise is not None:
+        noise = np.random.default_rng(capture.seed).normal(0, capture.noise, clean.shape)
         every, readings = np.ones(clean.shape, bool), (clean + noise).astype(np.float32)
-        return Trial(psi, readings, white_noise, every, truth, scene.disparity_px, real)
+        return Trial(psi, readings, capture.noise, every, truth, scene.disparity_px, real)
     # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
     clean = np.maximum(clean, 0)
-    shots = setup.camera.read_out(clean, setup.seed)
+    shots = capture.described.read_out(clean, capture.seed)
     usable = shots.usable if unusable is None else shots.usable & ~unusable
     return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
 
@@ -195,7 +246,7 @@ class Fault:
     strengths: tuple[float, ...]
     quick: tuple[float, ...]
     kind: str
-    make: Callable[[Setup, float], Trial]
+    make: Callable[[Capture, float], Trial]
     repairable: bool = False
     screened: bool = False
     shots: int = 1

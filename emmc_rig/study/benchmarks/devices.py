@@ -11,7 +11,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -249,7 +249,7 @@ STEPPED = Plan(
 
 
 @dataclass(frozen=True)
-class TriggerTiming:
+class TriggerTiming(Figures):
     """Mean time for each frame, in ms: the program polls, or the stage triggers the camera.
 
     vibration_ms: waited after every arrival, by the program or by the camera's trigger delay.
@@ -261,9 +261,10 @@ class TriggerTiming:
     asked_ms: float
     triggered_ms: float
 
-    def as_dict(self) -> dict[str, float]:
-        """Return the row, with the gain for each frame."""
-        return {**asdict(self), "gain_ms": self.asked_ms - self.triggered_ms}
+    @property
+    def gain_ms(self) -> float:
+        """Gained for each frame."""
+        return self.asked_ms - self.triggered_ms
 
 
 class TriggeredRig:
@@ -294,28 +295,28 @@ class TriggeredRig:
 
 def trigger_timing(frames: int = FRAMES, settle_s: float = 0.05) -> TriggerTiming:
     """Take frames at equal steps, once asked for and once triggered by the stage's arrival."""
-    rig = TriggeredRig(StageSettings(settle_s=settle_s))
-    rig.stage.home()
-    places_um = [1_000.0 + STEP_UM * number for number in range(frames + 1)]
-    with closing(rig.open_camera()) as camera:
-        rig.stage.move_to_um({"x": places_um[0]})
-        start_s = rig.clock.now_s()
-        for place_um in places_um[1:]:
-            rig.stage.move_to_um({"x": place_um})
-            camera.snap()
-        asked_s = rig.clock.now_s() - start_s
-    rig = TriggeredRig(StageSettings(settle_s=0.0))
-    rig.stage.home()
-    with closing(rig.open_camera()) as camera:
-        rig.stage.move_to_um({"x": places_um[0]})
-        start_s = rig.clock.now_s()
-        for place_um in places_um[1:]:
-            with camera.armed(delay_s=settle_s) as receive:
-                rig.stage.move_and_signal_um("x", place_um)
-                receive(MOVE_S)
-        triggered_s = rig.clock.now_s() - start_s
+    asked_s, triggered_s = (_stepped_s(frames, settle_s, by_stage) for by_stage in (False, True))
     ms = 1e3 / frames
     return TriggerTiming(frames, EXPOSURE_S * 1e3, settle_s * 1e3, asked_s * ms, triggered_s * ms)
+
+
+def _stepped_s(frames: int, settle_s: float, by_stage: bool) -> float:
+    """Return how long frames at equal steps take, each triggered by the stage or asked for."""
+    rig = TriggeredRig(StageSettings(settle_s=0.0 if by_stage else settle_s))
+    rig.stage.home()
+    first_um, *places_um = (1_000.0 + STEP_UM * number for number in range(frames + 1))
+    with closing(rig.open_camera()) as camera:
+        rig.stage.move_to_um({"x": first_um})
+        start_s = rig.clock.now_s()
+        for place_um in places_um:
+            if by_stage:
+                with camera.armed(delay_s=settle_s) as receive:
+                    rig.stage.move_and_signal_um("x", place_um)
+                    receive(MOVE_S)
+            else:
+                rig.stage.move_to_um({"x": place_um})
+                camera.snap()
+        return rig.clock.now_s() - start_s
 
 
 def capture_timing(settle_s: float = 0.05) -> TriggerTiming:

@@ -6,8 +6,6 @@ allocation. The bound of a kernel is its bytes over the triad's bandwidth.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,9 +16,7 @@ from typing import Any
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
@@ -113,37 +109,20 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
             yield Timing(name, counted / 1e9, median_s(call, repeats), counted / rate)
 
 
-def reconstruction_memory(camera_name: str, size: tuple[int, int]) -> tuple[float, float]:
-    """Return seconds and peak memory (GiB) of a TV reconstruction in a process of its own."""
-    code = (
-        "from emmc_rig.study.benchmarks.kernels import _reconstruct_once;"
-        f"_reconstruct_once({camera_name!r}, {size!r})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode:
-        lines = done.stderr.strip().splitlines() or ["no message"]
-        raise AppError(f"the reconstruction to be measured failed: {lines[-1]}")
-    seconds, peak_gib = done.stdout.split()
-    return float(seconds), float(peak_gib)
-
-
-def _reconstruct_once(camera_name: str, size: tuple[int, int]) -> None:
-    """Print the seconds of a converged reconstruction and this process's peak memory in GiB."""
-    camera = find_camera(camera_name)
+def reconstruction_memory(camera: Camera, size: tuple[int, int]) -> tuple[float, float]:
+    """Return seconds and peak memory (GiB) of this process, of a converged TV reconstruction."""
     psi = build_imaging_matrix(camera, size)
-    light_field = open_scene("deep-occlusions", size=size, views=camera.views).light_field
-    frames = psi.forward(light_field)
-    del light_field
+    frames = psi.forward(open_scene("deep-occlusions", size=size, views=camera.views).light_field)
+    forget_peak()
     started = time.perf_counter()
     reconstruct_tv(psi, frames, 0.005)
-    seconds = time.perf_counter() - started
-    print(seconds, peak_memory_mib() / 2**10)
+    return time.perf_counter() - started, peak_memory_mib() / 2**10
 
 
 def benchmark(asked: Asked, show: Show, folder: Path) -> dict[str, Any]:
     """Time kernels against their memory bound, a reconstruction, and starts (`chart --kernels`)."""
     size, repeats = asked.size or (593, 840), asked.repeats or 7
-    seconds, peak_gib = reconstruction_memory(asked.camera, size)
+    seconds, peak_gib = reconstruction_memory(asked.described, size)
     kernels = list(kernel_timings(asked.described, size, repeats))
     show.table(
         ("kernel", "GB counted", "ms", "GB/s", "times its bound"),

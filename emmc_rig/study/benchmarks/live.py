@@ -216,7 +216,7 @@ def shown_timing(shape: tuple[int, int] = LARGE_PX, seconds: float = WATCHED_S) 
 def field_timing(camera: Camera, size: tuple[int, int], scene: str) -> FieldTiming:
     """Return how soon a light field follows a frame of a scene, and how good it is then.
 
-    Measured from the frame in memory to the pictures that a page is sent, less their encoding.
+    Measured from the frame in memory to the light field, less what a page that asks draws of it.
     """
     light_field = open_scene(scene, size=size, views=camera.views).light_field
     psi = camera.psi(size)

@@ -7,7 +7,6 @@ data that lies in its first-level cache.
 
 from __future__ import annotations
 
-import importlib
 import statistics
 import time
 import warnings
@@ -27,6 +26,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
+from emmc_rig.study.benchmarks.variational import peer_module
 from reconstruction import bpdn
 from reconstruction.dictionary import Dictionary
 from reconstruction.patches import (
@@ -215,10 +215,7 @@ def peer_timings(
     off early in float32. `difference` is that of the fitted readings, relative. Raises AppError
     when the extra `peers` is not installed.
     """
-    try:
-        linear_model = importlib.import_module("sklearn.linear_model")
-    except ImportError as fault:
-        raise AppError('scikit-learn is not installed: pip install "emmc-rig[peers]"') from fault
+    linear_model = peer_module("sklearn.linear_model")
     problem = _problem(camera, size, dictionary, noise_sigma)
     patches, length = problem.sensed.shape[0], problem.data.shape[1]
     columns = [np.asfortranarray(sensed.T) for sensed in problem.sensed]

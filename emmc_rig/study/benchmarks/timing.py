@@ -41,15 +41,11 @@ STARTS = {
 
 
 @dataclass(frozen=True)
-class Start:
+class Start(Figures):
     """seconds: median of starting a new process, by the clock, Python's own start included."""
 
     name: str
     seconds: float
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the row."""
-        return asdict(self)
 
 
 def start_timings(repeats: int) -> list[Start]:

@@ -24,9 +24,10 @@ from typing import IO
 from emmc_rig.errors import AppError
 from emmc_rig.files.memory import forget_peak
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.captures import Capture, kept_capture
+from emmc_rig.study.chart.captures import kept_capture
 from emmc_rig.study.chart.points import Point
 from emmc_rig.study.sweep import Results, Sweep, available_cores, dictionary_identity, machine
+from emmc_rig.study.trial import Capture
 
 NAME = "emmc-rig-timing.lock"
 
@@ -196,7 +197,7 @@ class ChartSweep(Sweep[Point]):
         """Return the file of a capture and its digest; made where missing."""
         if capture not in self._captures:
             folder = self.folder / CAPTURES
-            self._captures[capture] = kept_capture(capture, self.settings.seed, folder)
+            self._captures[capture] = kept_capture(capture, folder)
         return self._captures[capture]
 
     def picture(self, point: Point) -> Path:

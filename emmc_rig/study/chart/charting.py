@@ -189,10 +189,11 @@ def chart_page(
     )  # fmt: skip
 
 
-def _head(chart: Chart | None) -> Head | None:
+def _head(chart: Chart | None) -> Head:
     """Return the most accurate configuration and the quicker ones that none beats."""
     if chart is None or not chart.marks:
-        return None
+        why = "no method of these could be measured"
+        return Head("nothing charted", why, ["see what there is: `emmc-rig reconstruct --list`"])
     *quicker, best = chart.front()
     return Head(
         best.configuration.label,
@@ -202,7 +203,8 @@ def _head(chart: Chart | None) -> Head | None:
             f"in {one.seconds:.3g} s take {one.configuration.label}: "
             f"{best.psnr_db - one.psnr_db:.2f} dB less"
             for one in reversed(quicker)
-        ],
+        ]
+        + [f"use it: `emmc-rig reconstruct FRAMES --method {best.configuration.method}`"],
     )
 
 
@@ -295,7 +297,7 @@ def run_chart(
     if not points:
         raise AppError(f"nothing to chart: {'; '.join(left_out)}")
     for capture in dict.fromkeys(point.capture for point in points):
-        capture.described()
+        _ = capture.described
     with sweep_folder(out, ChartSweep.journal, "chart") as folder:
         sweep = ChartSweep(settings, folder)
         sweep.make_frames(points, watcher)

@@ -15,8 +15,8 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
-from emmc_rig.study.chart.captures import Capture
 from emmc_rig.study.chart.peers import PEERS
+from emmc_rig.study.trial import Capture
 from reconstruction.methods import METHODS, MethodSettings, installed_methods
 from simulators.scenes import SCENES
 
@@ -166,7 +166,7 @@ def configurations(settings: ChartSettings) -> list[Configuration]:
 def charted_points(settings: ChartSettings) -> list[Point]:
     """Return the points of speed against accuracy."""
     return [
-        Point(Capture(scene, camera, settings.size, settings.zoom), configuration)
+        Point(Capture(scene, camera, settings.size, settings.seed, settings.zoom), configuration)
         for scene in settings.scenes
         for camera in settings.cameras
         for configuration in configurations(settings)
@@ -202,7 +202,7 @@ def scalings(settings: ChartSettings, cores: int) -> list[Scaling]:
         return []
     rows, columns = (32, 40) if settings.fast else (64, 80)
     factors = (1, 2, 4) if settings.fast else (1, 2, 4, 8)
-    middle = Capture("deep-occlusions", "rgbw-bayer-1shot", (2 * rows, 2 * columns), 1, 1)
+    middle = Capture("deep-occlusions", CAMERAS[0], (2 * rows, 2 * columns), settings.seed, shots=1)
     axes = {
         "pixels": [
             (f * f * rows * columns, replace(middle, size=(f * rows, f * columns)), None)

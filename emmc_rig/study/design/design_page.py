@@ -15,6 +15,7 @@ from emmc_rig.pages.page import (
     framed,
     number,
     provenance_section,
+    typed,
 )
 from emmc_rig.study.design.check import Simulated
 from emmc_rig.study.design.search import Search, pareto
@@ -59,9 +60,13 @@ def design_page(
     simulated: Sequence[Simulated],
     verdict: str,
     picture: Path,
+    camera: Path,
     provenance: Mapping[str, str],
 ) -> str:
-    """Return the page of a design. simulated: the chosen mask first, then the shipped cameras."""
+    """Return the page of a design.
+
+    simulated: the chosen mask first, then the shipped cameras. camera: its file, as it will lie.
+    """
     best = found.expected
     loss_db = found.ideal_db - best.psnr_db
     cards = (
@@ -94,7 +99,11 @@ def design_page(
     head = Head(
         found.winner.label,
         verdict,
-        ["try it on your own scenes: emmc-rig simulate --camera camera.yaml --scene SCENE"],
+        [
+            "try it on a scene of your own: "
+            f"`emmc-rig simulate --camera {typed(camera)} --scene FOLDER`",
+            "if it is worth it to you, have it made: the mask's GDSII file lies beside that camera",
+        ],
     )
     return framed("Which mask to order", about, CAVEATS, sections, head=head)
 
@@ -106,12 +115,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 def _tried(found: Search) -> Table:
     heads = ("Mask", "PSNR expected, dB", "Light", "Fresnel number")
     rows = [
-        [
-            one.label,
-            f"{what.psnr_db:.2f}",
-            f"{what.light:.0%}",
-            f"{what.fresnel:.2g}",
-        ]
+        [one.label, f"{what.psnr_db:.2f}", f"{what.light:.0%}", f"{what.fresnel:.2g}"]
         for one, what in found.tried[:SHOWN]
     ]
     return heads, rows
@@ -121,12 +125,7 @@ def simulated_table(found: Sequence[Simulated]) -> Table:
     """Return theory and simulation, a row a camera."""
     scenes = list(found[0].psnr_db)
     rows = [
-        [
-            one.name,
-            f"{one.expected_db:.2f}",
-            f"{one.mean_db:.2f}",
-            *(f"{one.psnr_db[scene]:.2f}" for scene in scenes),
-        ]
+        [one.name, *(f"{db:.2f}" for db in (one.expected_db, one.mean_db, *one.psnr_db.values()))]
         for one in found
     ]
     return ("Camera", "Theory", "Simulated, mean", *scenes), rows
@@ -144,4 +143,5 @@ def check_page(
     sections = [Section("check", "Theory beside simulation", body, "Check")]
     sections.append(provenance_section(provenance))
     title = "Does theory order masks as simulation does?"
-    return framed(title, about, CAVEATS, sections, head=Head("rank correlation (Spearman)", ranks))
+    head = Head("rank correlation (Spearman)", ranks, ["choose a mask: `emmc-rig design`"])
+    return framed(title, about, CAVEATS, sections, head=head)

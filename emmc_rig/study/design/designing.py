@@ -68,10 +68,7 @@ def run_design(
 
     Raises AppError for a folder that holds something else, and what scenes do for wrong input.
     """
-    started = time.monotonic()
-    scenes = tuple(scenes) or SCENES
-    check_scene_names(scenes)
-    folder = open_folder(out, JOURNAL, COMMAND)
+    started, scenes, folder = _begun(scenes, out, COMMAND)
     found = search(bench, watcher)
     winner = found.winner.camera(bench)
     rivals = {
@@ -96,10 +93,17 @@ def run_design(
         picture = draw_pareto(found, new / "light.svg")
         origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
         about = [f"{len(found.tried)} masks tried for {bench.shots} shot(s) by theory; {verdict}"]
-        page = design_page(about, found, compared, verdict, picture, origin)
+        page = design_page(about, found, compared, verdict, picture, folder / CAMERA, origin)
         (new / PAGE).write_text(page, encoding="utf-8")
         write_metrics(new, _metrics(bench, found, compared))
     return Designed(found, tuple(compared), verdict, folder / PAGE, tuple(left_out))
+
+
+def _begun(scenes: Sequence[str], out: Path, command: str) -> tuple[float, Sequence[str], Path]:
+    """Return when it began, the scenes, checked, and the folder."""
+    scenes = tuple(scenes) or SCENES
+    check_scene_names(scenes)
+    return time.monotonic(), scenes, open_folder(out, JOURNAL, command)
 
 
 def _at_equal_light(camera: Camera, bench: DesignBench) -> Camera:
@@ -154,10 +158,7 @@ def run_check(
     watcher: Watcher,
 ) -> Checked:
     """Compare theory with simulation on many cameras; raises what `run_design` does."""
-    started = time.monotonic()
-    scenes = tuple(scenes) or SCENES
-    check_scene_names(scenes)
-    folder = open_folder(out, JOURNAL, CHECK_COMMAND)
+    started, scenes, folder = _begun(scenes, out, CHECK_COMMAND)
     cameras = {
         name: _at_equal_light(camera, bench)
         for name, camera in checked_cameras(bench, seed).items()
@@ -171,13 +172,6 @@ def run_check(
         about = [f"{len(found)} cameras, {len(scenes)} scenes."]
         page = check_page(about, found, words, picture, origin)
         (new / PAGE).write_text(page, encoding="utf-8")
-        rows = [asdict(one) for one in found]
-        write_metrics(
-            new,
-            {
-                "rank_correlations": ranks,
-                "simulated": rows,
-                "settings": bench.model_dump(mode="json"),
-            },
-        )
+        rows, settings = [asdict(one) for one in found], bench.model_dump(mode="json")
+        write_metrics(new, {"rank_correlations": ranks, "simulated": rows, "settings": settings})
     return Checked(tuple(found), ranks, folder / PAGE)

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.study.stability.fault_sweep import Point
-from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.trial import Fault
 
 LOST_DB = 3.0
@@ -29,6 +27,12 @@ class Span:
 
     low: float | None
     high: float | None
+
+
+def known_levels(levels: Sequence[float | None]) -> tuple[list[int], list[float]]:
+    """Return places and levels where there are such."""
+    pairs = [(i, level) for i, level in enumerate(levels) if level is not None]
+    return [i for i, _ in pairs], [level for _, level in pairs]
 
 
 def below_best(levels: Sequence[float | None], whole: bool = False) -> Span | None:
@@ -156,13 +160,13 @@ class Curve:
 
 def curves(results: Mapping[Point, dict]) -> list[Curve]:
     """Return the curves of every scene, those of all scenes first where there are several."""
-    scenes = list(dict.fromkeys(point.scene for point in results))
-    kinds = list(dict.fromkeys((p.fault, p.method, p.screened) for p in results))
+    scenes = list(dict.fromkeys(point.scene_name for point in results))
+    kinds = list(dict.fromkeys((str(p.fault), p.method, p.screened) for p in results))
     found = []
     if len(scenes) > 1:
         found += [_curve(POOLED, scenes, kind, results) for kind in kinds]
     for scene in scenes:
-        found += [_curve(Path(scene).stem, [scene], kind, results) for kind in kinds]
+        found += [_curve(scene, [scene], kind, results) for kind in kinds]
     return [curve for curve in found if curve is not None]
 
 
@@ -174,7 +178,7 @@ def _curve(
         scene: {
             point.strength: point
             for point in results
-            if point.scene == scene and (point.fault, point.method, point.screened) == kind
+            if point.scene_name == scene and (point.fault, point.method, point.screened) == kind
         }
         for scene in scenes
     }

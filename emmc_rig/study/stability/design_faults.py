@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
 from emmc_rig.study.sweep import NotApplicableError
-from emmc_rig.study.trial import DESIGN, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import DESIGN, Capture, Fault, Trial, trial_of
 
 
 def _near_mask(camera: Camera) -> tuple[str, Mask]:
@@ -19,54 +21,50 @@ def _near_mask(camera: Camera) -> tuple[str, Mask]:
     return near[0]
 
 
-def _with_mask(setup: Setup, **changed: float) -> Trial:
-    name, mask = _near_mask(setup.camera)
-    masks = {**setup.camera.masks, name: mask.model_copy(update=changed)}
-    return trial_of(setup.with_camera(masks=masks))
+def _with_mask(capture: Capture, **changed: float) -> Trial:
+    name, mask = _near_mask(capture.described)
+    masks = {**capture.described.masks, name: mask.model_copy(update=changed)}
+    return trial_of(capture.with_camera(masks=masks))
 
 
-def mask_cell(setup: Setup, px: float) -> Trial:
+def mask_cell(capture: Capture, px: float) -> Trial:
     """The width of the mask's cells."""
-    return _with_mask(setup, cell_um=px * setup.camera.sensor.sample_pitch_um)
+    return _with_mask(capture, cell_um=px * capture.described.sensor.sample_pitch_um)
 
 
-def mask_distance(setup: Setup, px: float) -> Trial:
+def mask_distance(capture: Capture, px: float) -> Trial:
     """How far the mask's shadow moves from view to view, by its distance from the sensor."""
-    camera = setup.camera
+    camera = capture.described
     ratio = px * camera.sensor.sample_pitch_um / camera.lens.aperture_cell_um
-    return _with_mask(setup, distance_mm=ratio * camera.lens.distance_mm)
+    return _with_mask(capture, distance_mm=ratio * camera.lens.distance_mm)
 
 
-def shots(setup: Setup, count: float) -> Trial:
+def shots(capture: Capture, count: float) -> Trial:
     """The number of shots in the same total time."""
-    try:
-        camera = setup.camera.with_shots(round(count))
-    except CameraError as fault:
-        raise NotApplicableError(str(fault)) from fault
-    return trial_of(Setup(setup.scene, camera, setup.size, setup.seed, setup.zoom))
+    return trial_of(replace(capture, shots=round(count)))
 
 
-def views(setup: Setup, count: float) -> Trial:
+def views(capture: Capture, count: float) -> Trial:
     """The number of views, through the same aperture; of a measured scene, fewer."""
-    side, camera = round(count), setup.camera
-    if not setup.is_built_in and side > max(camera.views):
+    side, camera = round(count), capture.described
+    if not capture.is_built_in and side > max(camera.views):
         raise NotApplicableError(f"built-in scenes only: {side} x {side} views were not measured")
     lens = camera.lens
-    if setup.is_built_in:
+    if capture.is_built_in:
         cell_mm = lens.aperture_cell_mm * max(camera.views) / side
         lens = lens.model_copy(update={"aperture_cell_mm": cell_mm})
-    return trial_of(setup.with_camera(views=(side, side), lens=lens))
+    return trial_of(capture.with_camera(views=(side, side), lens=lens))
 
 
-def pixel_size(setup: Setup, r: float) -> Trial:
+def pixel_size(capture: Capture, r: float) -> Trial:
     """One pixel sums k x k samples, r = 1 / k^2."""
-    k, own = round(r**-0.5), setup.camera.sensor
+    k, own = round(r**-0.5), capture.described.sensor
     # A larger pixel holds more electrons: white stays within the range.
     gain = own.noise.gain_dn_per_electron * (own.binning / k) ** 2
     noise = own.noise.model_copy(update={"gain_dn_per_electron": gain})
     sensor = own.model_copy(update={"binning": k, "noise": noise})
     try:
-        return trial_of(setup.with_camera(sensor=sensor))
+        return trial_of(capture.with_camera(sensor=sensor))
     except CameraError as fault:
         raise NotApplicableError(str(fault)) from fault
 

@@ -2,8 +2,8 @@
 
 The detail lies on a plane at the disparity of its place and is as bright in every view. How much of
 it a picture shows is its projection: <difference, detail> / <detail, detail>, 1 where it is whole,
-0 where there is none. Two reconstructions with the same noise, with and without the detail, tell
-what is kept; the one without, against its truth, tells what is invented.
+0 where there is none. Two reconstructions with the same noise, with and without the detail, show
+what is kept; the one without, against its truth, shows what is invented.
 """
 
 from __future__ import annotations

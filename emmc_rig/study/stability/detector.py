@@ -10,6 +10,7 @@ verdicts are made anew: changed rules need no new measurement.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +19,6 @@ from typing import Literal
 from pydantic import Field
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.errors import ModelError
@@ -26,9 +26,9 @@ from emmc_rig.model.files import write_text
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
 from emmc_rig.study.stability.fault_sweep import named_methods
-from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
+from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.sweep import Results, Sweep, csv_text, sweep_folder
-from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Fault, Trial
+from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Capture, Fault, Trial
 from reconstruction.errors import ReconstructionError
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
@@ -82,53 +82,32 @@ def detector_settings(
     )
 
 
-@dataclass(frozen=True)
-class Case:
-    """One result to test. fault None: nothing is wrong."""
-
-    scene: str
-    camera: str
-    seed: int
-    method: str
-    fault: str | None
-    strength: float
-
-    @property
-    def harmless(self) -> Case:
-        """The same capture without its fault."""
-        if self.fault is None:
-            return self
-        return replace(self, **_named(FAULTS[self.fault], FAULTS[self.fault].strengths[0]))
-
-    @property
-    def label(self) -> str:
-        """In words."""
-        condition = "nothing wrong"
-        if self.fault is not None:
-            fault = FAULTS[self.fault]
-            condition = f"{fault.title} {self.strength:g} {fault.unit}"
-        return f"{Path(self.scene).stem}, {Path(self.camera).stem}, {condition}, {self.method}"
+def harmless(case: Point) -> Point:
+    """Return the same capture without its fault."""
+    if case.fault is None:
+        return case
+    return _case(case, FAULTS[case.fault], FAULTS[case.fault].strengths[0])
 
 
-def _named(fault: Fault, strength: float) -> dict:
-    return {"fault": None if fault.is_clean(strength) else fault.name, "strength": strength}
+def _case(case: Point, fault: Fault, strength: float) -> Point:
+    name = None if fault.is_clean(strength) else fault.name
+    return replace(case, fault=name, strength=strength)
 
 
-def cases(settings: DetectorSettings) -> list[Case]:
+def cases(settings: DetectorSettings) -> list[Point]:
     """Return the cases; those of one trial together."""
     names = settings.faults or tuple(f.name for f in FAULTS.values() if f.kind in KINDS)
     found = []
     for scene in settings.scenes:
         for camera in settings.cameras:
-            shots = len(find_camera(camera).shots)
             for seed in settings.seeds:
+                capture = Capture(scene, camera, settings.size, seed, settings.zoom)
+                shots = len(capture.described.shots)
                 for fault in (FAULTS[name] for name in names):
-                    if fault.shots > shots:
-                        continue
                     for strength in fault.quick if settings.fast else fault.strengths:
-                        for method in settings.methods:
-                            case = Case(scene, camera, seed, method, **_named(fault, strength))
-                            found += [case.harmless, case]
+                        for method in settings.methods if fault.shots <= shots else ():
+                            case = _case(Point(capture, None, 0.0, method), fault, strength)
+                            found += [harmless(case), case]
     return list(dict.fromkeys(found))
 
 
@@ -139,7 +118,7 @@ class CaseResult:
     little_to_lose: whether the harmless end is poor already.
     """
 
-    case: Case
+    case: Point
     psnr_db: float
     lost_db: float
     little_to_lose: bool
@@ -167,7 +146,7 @@ class CaseResult:
 
 
 @dataclass
-class DetectorSweep(Sweep[Case]):
+class DetectorSweep(Sweep[Point]):
     """The cases whose verdicts are tested; settings: DetectorSettings."""
 
     journal = "verdicts.jsonl"
@@ -175,34 +154,19 @@ class DetectorSweep(Sweep[Case]):
     stage = "judge"
     revision = 4
 
-    def inputs(self, point: Case) -> dict[str, object]:
-        """Return everything that a case's evidence depends on, as plain data."""
-        return {
-            **asdict(point),
-            "camera": find_camera(point.camera).model_dump(mode="json"),
-            "size": self.settings.size,
-            "zoom": self.settings.zoom,
-        }
-
-    def group(self, point: Case) -> Case:
+    def group(self, point: Point) -> Point:
         """Return what all methods of one trial have in common."""
         return replace(point, method="")
 
-    def measured(self, points: Sequence[Case], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the methods' evidence on one trial."""
-        made = _trial(points[0], self.settings)
+        made = points[0].trial()
         for case in points:
-            yield _row(case.method, made)
+            yield judged_row(case.method, made)
 
 
-def _trial(case: Case, settings: DetectorSettings) -> Trial:
-    camera = find_camera(case.camera)
-    # Without a fault, any that can be absent will do.
-    fault = FAULTS[case.fault or "mask-shift"]
-    return trial(fault, case.strength, case.scene, camera, settings.size, case.seed, settings.zoom)
-
-
-def _row(method: str, given: Trial) -> dict:
+def judged_row(method: str, given: Trial) -> dict:
+    """Return PSNR and evidence of a method on a trial, or why it refused."""
     dictionary = given.dictionary(method)
     try:
         found, verdict = reconstruct_judged(
@@ -217,21 +181,21 @@ def _row(method: str, given: Trial) -> dict:
     }
 
 
-def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
+def case_results(rows: Mapping[Point, dict]) -> list[CaseResult]:
     """Return the rows with verdicts by the present rules; those without a result are left out."""
-    best: dict[Case, float] = {}
+    best: dict[Point, float] = {}
     for case, row in rows.items():
         if "psnr_db" in row:
             any_method = replace(case, method="")
             best[any_method] = max(best.get(any_method, -math.inf), row["psnr_db"])
     found = []
     for case, row in rows.items():
-        harmless = rows.get(case.harmless, {})
-        if "evidence" not in row or "psnr_db" not in harmless:
+        clean = rows.get(harmless(case), {})
+        if "evidence" not in row or "psnr_db" not in clean:
             continue
-        level = harmless["psnr_db"]
-        rival = best[replace(case.harmless, method="")]
-        little = level < max(rival - POOR_DB, harmless["even_db"] + EVEN_DB)
+        level = clean["psnr_db"]
+        rival = best[replace(harmless(case), method="")]
+        little = level < max(rival - POOR_DB, clean["even_db"] + EVEN_DB)
         verdict = verdict_from(Evidence.from_dict(row["evidence"]))
         found.append(CaseResult(case, row["psnr_db"], level - row["psnr_db"], little, verdict))
     return found
@@ -241,7 +205,7 @@ def case_results(rows: Mapping[Case, dict]) -> list[CaseResult]:
 class Tally:
     """How many results were of each kind, and how many of those were flagged.
 
-    untold: of all kinds, how many could not be told.
+    untold: of all kinds, how many got the verdict *cannot tell*.
     """
 
     broken: int = 0
@@ -260,19 +224,15 @@ class Tally:
         return [(counts[f"{k}_flagged"], counts[k]) for k in ("broken", "good", "between", "poor")]
 
     @property
-    def detected(self) -> float | None:
-        """Share of the broken ones that were flagged; None without any."""
-        return self.broken_flagged / self.broken if self.broken else None
-
-    @property
-    def false_alarms(self) -> float | None:
-        """Share of the good ones that were flagged; None without any."""
-        return self.good_flagged / self.good if self.good else None
+    def shares(self) -> tuple[float | None, float | None]:
+        """Shares of the broken and of the good ones that were flagged; None without any."""
+        found, alarms = (flagged / all if all else None for flagged, all in self.pairs()[:2])
+        return found, alarms
 
 
 def tallied(results: Iterable[CaseResult]) -> Tally:
     """Return the counts."""
-    counts = dict.fromkeys(Tally.__dataclass_fields__, 0)
+    counts: Counter[str] = Counter()
     for one in results:
         counts[one.kind] += 1
         counts[f"{one.kind}_flagged"] += one.flagged
@@ -321,8 +281,7 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
         tallies = {
             f"{fault}, {method}": {
                 **asdict(tally),
-                "found": tally.detected,
-                "alarms": tally.false_alarms,
+                **dict(zip(("found", "alarms"), tally.shares, strict=True)),
             }
             for (fault, method), tally in tables(results).items()
         }
@@ -341,9 +300,9 @@ def run_detector(settings: DetectorSettings, out: Path, watcher: Watcher) -> lis
 def _csv_row(one: CaseResult) -> dict[str, object]:
     case = one.case
     return {
-        "scene": Path(case.scene).stem,
-        "camera": Path(case.camera).stem,
-        "seed": case.seed,
+        "scene": case.scene_name,
+        "camera": case.capture.camera_name,
+        "seed": case.capture.seed,
         "method": case.method,
         "fault": case.fault or NONE,
         "strength": float(case.strength),

@@ -6,33 +6,32 @@ All methods of a (scene, fault, strength) get the same trial.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
 from emmc_rig.study.scores import angular_snr_db
-from emmc_rig.study.stability.faults import FAULTS, camera_for, find_fault, trial
+from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.sweep import (
     Results,
     Sweep,
     check_scene_names,
+    check_size,
+    described,
     dictionary_identity,
     digest_of,
     machine,
 )
-from emmc_rig.study.trial import Fault, Setup, Trial
-from reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
+from emmc_rig.study.trial import Capture, Fault, Trial
+from reconstruction.methods import METHODS, MethodSettings, find_method
 from reconstruction.sparse import SparseSettings
 
 SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
@@ -40,7 +39,7 @@ FAST_METHODS = ("tv", "dict-omp", "adaptive-fast")
 SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
 FAST_SCENES = ("deep-occlusions",)
 ALL = "all"
-"""Instead of a method's name: every one that is installed."""
+"""Instead of a method's name: every one; those not installed are left out in one line."""
 CAMERA = "rgbw-bayer-3shots"
 SIZE, ZOOM = (96, 128), 2
 FAST_SIZE, FAST_ZOOM = (64, 80), 3
@@ -65,10 +64,10 @@ class StabilitySettings(Settings):
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
 
-    def trial(self, fault: str, strength: float, scene: str) -> Trial:
-        """Return what methods get of a scene with a fault; raises what `faults.trial` does."""
-        camera = find_camera(self.camera)
-        return trial(FAULTS[fault], strength, scene, camera, self.size, self.seed, self.zoom)
+    @property
+    def captures(self) -> list[Capture]:
+        """Every scene through the camera."""
+        return [Capture(one, self.camera, self.size, self.seed, self.zoom) for one in self.scenes]
 
 
 def stability_settings(
@@ -85,32 +84,6 @@ def stability_settings(
     return StabilitySettings.model_validate(chosen)
 
 
-@dataclass(frozen=True)
-class Point:
-    """One measurement; screened: whether the frames were screened first."""
-
-    scene: str
-    fault: str
-    strength: float
-    method: str
-    screened: bool = True
-
-    @property
-    def scene_name(self) -> str:
-        """The scene as charts call it."""
-        return Path(self.scene).stem
-
-    @property
-    def label(self) -> str:
-        """In words."""
-        fault = FAULTS[self.fault]
-        without = "" if self.screened else ", not screened"
-        return (
-            f"{self.scene_name}, {fault.title} {self.strength:g} {fault.unit}, "
-            f"{self.method}{without}"
-        )
-
-
 def chosen_faults(settings: StabilitySettings) -> list[Fault]:
     """Return the faults to sweep; raises AppError naming the nearest for one not known."""
     return [find_fault(name) for name in settings.faults] or list(FAULTS.values())
@@ -122,7 +95,7 @@ def named_methods(names: Sequence[str], fast: bool) -> tuple[str, ...]:
     Raises ReconstructionError naming the nearest for one not known.
     """
     if ALL in names:
-        return installed_methods()
+        return tuple(METHODS)
     for name in names:
         find_method(name)
     return tuple(names) or (FAST_METHODS if fast else SWEPT_METHODS)
@@ -140,17 +113,13 @@ def strengths(fault: Fault, settings: StabilitySettings) -> tuple[float, ...]:
 
 def planned(settings: StabilitySettings) -> list[Point]:
     """Return the points, those of one trial together; raises AppError for wrong names."""
-    if settings.size is not None and min(settings.size) < SMALLEST_PX:
-        raise AppError(
-            f"--size {settings.size[0]}x{settings.size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} "
-            "or more"
-        )
+    check_size(settings.size, SMALLEST_PX)
     check_scene_names(settings.scenes)
     methods = chosen_methods(settings)
     both = settings.screening == "both"
     return [
-        Point(scene, fault.name, strength, method, screened)
-        for scene in settings.scenes
+        Point(capture, fault.name, strength, method, screened)
+        for capture in settings.captures
         for fault in chosen_faults(settings)
         for strength in strengths(fault, settings)
         for method in methods
@@ -175,15 +144,19 @@ class StabilitySweep(Sweep[Point]):
 
     def truth_picture(self, point: Point) -> Path:
         """Return where the picture of what should have been reconstructed is kept."""
-        return self.folder / PICTURES / f"{digest_of(self._trial_inputs(point))}-truth.webp"
+        return self.folder / PICTURES / f"{digest_of(described(point.same_trial))}-truth.webp"
 
     def unmeasured(self) -> list[str]:
         """Return a line for what could not be measured, and why."""
         missing: dict[tuple[str, str, str], dict[float, None]] = {}
+        absent = {}
         for point, why in self.left_out.items():
-            strengths = missing.setdefault((point.scene_name, point.fault, why), {})
+            if not METHODS[point.method].installed:
+                absent[why] = None
+                continue
+            strengths = missing.setdefault((point.scene_name, str(point.fault), why), {})
             strengths[point.strength] = None
-        return [
+        return [*absent] + [
             f"{FAULTS[fault].title} at {', '.join(f'{one:g}' for one in strengths)}, {scene}: {why}"
             for (scene, fault, why), strengths in missing.items()
         ]
@@ -192,25 +165,10 @@ class StabilitySweep(Sweep[Point]):
         """Return everything that a point's figures depend on, as plain data."""
         needed = METHODS[point.method].needs_dictionary
         return {
-            **self._trial_inputs(point),
-            "method": point.method,
+            **described(replace(point.same_trial, method=point.method)),
+            "machine": machine(),
             "settings": _settings(point).model_dump(mode="json"),
             "dictionary": dictionary_identity(self.settings.dictionary) if needed else None,
-        }
-
-    def _trial_inputs(self, point: Point) -> dict[str, object]:
-        settings, fault = self.settings, FAULTS[point.fault]
-        clean = fault.is_clean(point.strength)
-        return {
-            "machine": machine(),
-            "scene": point.scene_name,
-            "content": _content(point.scene, settings.camera, settings.size, settings.seed),
-            "camera": camera_for(fault, find_camera(settings.camera)).model_dump(mode="json"),
-            "size": settings.size,
-            "zoom": settings.zoom,
-            "seed": settings.seed,
-            "fault": None if clean else point.fault,
-            "strength": None if clean else point.strength,
         }
 
     def is_whole(self, point: Point, result: dict) -> bool:
@@ -219,13 +177,12 @@ class StabilitySweep(Sweep[Point]):
 
     def group(self, point: Point) -> Hashable:
         """Return what all methods of one trial have in common."""
-        return point.scene, point.fault, point.strength
+        return replace(point, method="", screened=True)
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the methods' figures on one trial."""
-        one = points[0]
-        made = self.settings.trial(one.fault, one.strength, one.scene)
-        truth = self.truth_picture(one)
+        made = points[0].trial()
+        truth = self.truth_picture(points[0])
         truth.parent.mkdir(exist_ok=True)
         if not truth.is_file():
             save_thumbnail(truth, made.truth, epipolar_lines(made.truth))
@@ -266,10 +223,3 @@ def _settings(point: Point, binning: int = 1) -> MethodSettings:
     stride = SparseSettings().stride
     sparse = SparseSettings(stride=max(stride // binning * binning, binning))
     return MethodSettings(screening=point.screened, sparse=sparse)
-
-
-@lru_cache
-def _content(
-    scene: str, camera: str, size: tuple[int, int] | None, seed: int
-) -> list[float] | None:
-    return Setup(scene, find_camera(camera), size, seed).content()

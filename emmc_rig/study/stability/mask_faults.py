@@ -12,21 +12,21 @@ from calibration.errors import CalibrationError
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import Placement, designed_placement
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.sweep import NotApplicableError
-from emmc_rig.study.trial import MASK, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import MASK, Capture, Fault, Trial, trial_of
 from simulators.flaws import OpticsFlaws
 
 
-def misplaced_psi(camera: Camera, size: tuple[int, int], placement: Placement) -> ImagingMatrix:
-    """Return Psi of a camera whose mask sits otherwise than designed.
+def misplaced_psi(capture: Capture, placement: Placement) -> ImagingMatrix:
+    """Return Psi of a capture whose mask sits otherwise than designed.
 
     Raises NotApplicableError unless the camera has one mask, between lens and sensor.
     """
-    design = build_imaging_matrix(camera, size)
+    design, camera = capture.psi(), capture.described
     try:
-        mask = shadow_mask(_roomy(camera, size, placement), size)
+        mask = shadow_mask(_roomy(camera, design.size, placement), design.size)
     except CalibrationError as fault:
         raise NotApplicableError(
             "needs a camera with one mask between lens and sensor, in every shot"
@@ -50,58 +50,54 @@ def _roomy(camera: Camera, size: tuple[int, int], placement: Placement) -> Camer
     return camera.model_copy(update={"masks": masks})
 
 
-def _misplaced(setup: Setup, **changed: float) -> Trial:
+def _misplaced(capture: Capture, **changed: float) -> Trial:
     if "scale" in changed:
         changed["scale"] += 1
-    truth = setup.scene_seen().light_field
-    placement = replace(designed_placement(setup.camera), **changed)
-    size = (truth.shape[2], truth.shape[3])
-    return trial_of(setup, true_psi=misplaced_psi(setup.camera, size, placement))
+    placement = replace(designed_placement(capture.described), **changed)
+    return trial_of(capture, true_psi=misplaced_psi(capture, placement))
 
 
-def _diagonal(px: float, setup: Setup) -> dict[str, float]:
+def _diagonal(px: float, capture: Capture) -> dict[str, float]:
     """Return a shift in samples, at 30 degrees to the rows."""
-    um = px * setup.camera.sensor.sample_pitch_um
+    um = px * capture.described.sensor.sample_pitch_um
     return {"offset_x_um": um * math.cos(math.pi / 6), "offset_y_um": -um * math.sin(math.pi / 6)}
 
 
-def shift(setup: Setup, px: float) -> Trial:
+def shift(capture: Capture, px: float) -> Trial:
     """The mask is shifted, at 30 degrees to the rows."""
-    return _misplaced(setup, **_diagonal(px, setup))
+    return _misplaced(capture, **_diagonal(px, capture))
 
 
-def rotation(setup: Setup, degrees: float) -> Trial:
+def rotation(capture: Capture, degrees: float) -> Trial:
     """The mask is turned about the axis."""
-    return _misplaced(setup, rotation_rad=math.radians(degrees))
+    return _misplaced(capture, rotation_rad=math.radians(degrees))
 
 
-def scale(setup: Setup, percent: float) -> Trial:
+def scale(capture: Capture, percent: float) -> Trial:
     """The mask's cells are too large."""
-    return _misplaced(setup, scale=percent / 100)
+    return _misplaced(capture, scale=percent / 100)
 
 
-def distance(setup: Setup, percent: float) -> Trial:
+def distance(capture: Capture, percent: float) -> Trial:
     """The mask stands further from the sensor than designed."""
-    return _misplaced(setup, distance_share=percent / 100)
+    return _misplaced(capture, distance_share=percent / 100)
 
 
-def edge_blur(setup: Setup, px: float) -> Trial:
+def edge_blur(capture: Capture, px: float) -> Trial:
     """The mask's shadow is blurred, as by diffraction: deviation of a Gaussian in samples."""
-    return _misplaced(setup, blur_um=px * setup.camera.sensor.sample_pitch_um)
+    return _misplaced(capture, blur_um=px * capture.described.sensor.sample_pitch_um)
 
 
-def vignetting(setup: Setup, percent: float) -> Trial:
+def vignetting(capture: Capture, percent: float) -> Trial:
     """The outermost ray loses a share of light, the others less, by a power of the cos^4 law."""
-    truth = setup.scene_seen().light_field
-    psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
-    lens = setup.camera.lens
-    lengths = (lens.distance_mm * 1e3, setup.camera.sensor.sample_pitch_um, lens.aperture_cell_um)
-    natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, setup.camera.views, lengths)
+    psi, camera = capture.psi(), capture.described
+    lens = camera.lens
+    lengths = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
+    natural = OpticsFlaws(vignetting=1.0).falloff(psi.size, camera.views, lengths)
     power = math.log(1 - percent / 100) / math.log(float(natural.min()))
     passed = (natural**power).astype(psi.weights.dtype)
-    return trial_of(
-        setup, true_psi=replace(psi, weights=psi.weights * passed[None, :, :, :, None, :])
-    )
+    weights = psi.weights * passed[None, :, :, :, None, :]
+    return trial_of(capture, true_psi=replace(psi, weights=weights))
 
 
 FAULTS = (

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.drift import Captures, DriftSettings, find_drift
@@ -20,15 +20,14 @@ from calibration.errors import CalibrationError
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.drawing import COLOURS, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment
 from emmc_rig.progress import Watcher
 from emmc_rig.study.stability.fault_sweep import StabilitySettings, chosen_methods
-from emmc_rig.study.stability.faults import find_fault
-from emmc_rig.study.sweep import NotApplicableError, Results, Sweep
+from emmc_rig.study.stability.faults import Point
+from emmc_rig.study.sweep import NotApplicableError, Results, Sweep, described
 from emmc_rig.study.trial import Trial
 from reconstruction.errors import ReconstructionError
 
@@ -110,50 +109,26 @@ def _psnr(taken: Trial, psi: ImagingMatrix, method: str) -> float:
     return taken.psnr_db(found.light_field)
 
 
-@dataclass(frozen=True)
-class MismatchPoint:
-    """A method on a capture with an error: a fault's name, and its strength (0: nothing moved)."""
-
-    scene: str
-    error: str
-    strength: float
-    method: str
-
-    @property
-    def label(self) -> str:
-        """In words."""
-        return f"{self.method}, {Path(self.scene).stem}"
-
-
 @dataclass
-class MismatchSweep(Sweep[MismatchPoint]):
+class MismatchSweep(Sweep[Point]):
     """The points of the protocol; settings: StabilitySettings."""
 
     journal = "mismatch.jsonl"
     stage = "mismatch of Psi"
     revision = 2
 
-    def inputs(self, point: MismatchPoint) -> dict[str, object]:
+    def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
-        settings = self.settings
-        return {
-            **asdict(point),
-            "camera": find_camera(settings.camera).model_dump(mode="json"),
-            "size": settings.size,
-            "zoom": settings.zoom,
-            "drift": drift_settings(settings.fast).model_dump(),
-            "seed": settings.seed,
-        }
+        return {**described(point), "drift": drift_settings(self.settings.fast).model_dump()}
 
-    def group(self, point: MismatchPoint) -> MismatchPoint:
+    def group(self, point: Point) -> Point:
         """Return what all methods on one capture have in common."""
         return replace(point, method="")
 
-    def measured(self, points: Sequence[MismatchPoint], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the methods' PSNRs by scenario, and what became of Psi."""
-        settings, one = self.settings, points[0]
-        moved = settings.trial(one.error, one.strength, one.scene)
-        blind, detected = corrected(moved, drift_settings(settings.fast))
+        moved = points[0].trial()
+        blind, detected = corrected(moved, drift_settings(self.settings.fast))
         for point in points:
             mismatched = _psnr(moved, moved.psi, point.method)
             if point.strength == 0:
@@ -185,28 +160,27 @@ def measure_mismatch(settings: StabilitySettings, folder: Path, watcher: Watcher
     sweep = MismatchSweep(settings, folder)
     sweep.run(
         (
-            MismatchPoint(scene, *error, method)
-            for scene in settings.scenes
+            Point(capture, *error, method)
+            for capture in settings.captures
             for error in (UNMOVED, *errors)
             for method in methods
         ),
         watcher,
     )
-    for why in sweep.left_out.values():
-        raise NotApplicableError(why)
+    if not sweep.results:
+        raise NotApplicableError(next(iter(sweep.left_out.values())))
     return [
-        _mismatch(point, result, sweep.results[replace(point, error=UNMOVED[0], strength=0.0)])
+        _mismatch(point, result, sweep.results[replace(point, fault=UNMOVED[0], strength=0.0)])
         for point, result in sweep.results.items()
         if point.strength
     ]
 
 
-def _mismatch(point: MismatchPoint, result: dict, ideal: dict) -> Mismatch:
-    fault = find_fault(point.error)
+def _mismatch(point: Point, result: dict, ideal: dict) -> Mismatch:
     dbs = {"ideal": ideal["mismatched"], **{kind: result[kind] for kind in SCENARIOS[1:]}}
     return Mismatch(
-        Path(point.scene).stem,
-        f"{fault.title} {point.strength:g} {fault.unit}",
+        point.scene_name,
+        point.condition,
         point.method,
         **{kind: math.nan if db is None else db for kind, db in dbs.items()},
         told=result["told"],

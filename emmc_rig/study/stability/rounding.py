@@ -17,7 +17,7 @@ from emmc_rig.model import kernels as psi_kernels
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from emmc_rig.study.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import Capture, Trial, trial_of
 from reconstruction.choices import choose_mu, first_light_field, smooth_guess
 from reconstruction.differences import norm_squared
 from reconstruction.errors import ReconstructionError
@@ -148,7 +148,7 @@ def example(camera: str = "rgbw-bayer-1shot", shots: int = 1, binning: int = 1) 
     chosen = find_camera(camera)
     sensor = chosen.sensor.model_copy(update={"binning": binning})
     chosen = chosen.with_shots(shots).model_copy(update={"views": VIEWS, "sensor": sensor})
-    return trial_of(Setup(SCENE, chosen, SIZE, zoom=ZOOM))
+    return trial_of(Capture(SCENE, chosen, SIZE, zoom=ZOOM))
 
 
 def attempted(trial: Trial, method: str, scale: float = 1.0) -> Attempt:

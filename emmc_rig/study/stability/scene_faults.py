@@ -6,46 +6,46 @@ from dataclasses import replace
 
 import numpy as np
 
-from emmc_rig.study.trial import SCENE, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import SCENE, Capture, Fault, Trial, trial_of
 from simulators import changes
 from simulators.scenes import SCENES
 
 
-def disparity_range(setup: Setup, px: float) -> Trial:
+def disparity_range(capture: Capture, px: float) -> Trial:
     """The scene's disparities span a wider range."""
-    setup.need_built_in()
-    known = setup.scene_seen().disparity_px
+    capture.need_built_in()
+    known = capture.scene_seen().disparity_px
     assert known is not None
     factor = px / float(np.ptp(known))
-    changed = setup.scene_seen(change=lambda world: changes.deepened(world, factor))
-    return trial_of(setup, scene=changed)
+    changed = capture.scene_seen(change=lambda world: changes.deepened(world, factor))
+    return trial_of(capture, scene=changed)
 
 
-def occlusion(setup: Setup, percent: float) -> Trial:
+def occlusion(capture: Capture, percent: float) -> Trial:
     """Leaves nearer than everything hide a share of every view."""
-    setup.need_built_in()
-    nearest = SCENES[setup.scene].disparity_px[1]
-    rng = np.random.default_rng([setup.seed, 7])
-    changed = setup.scene_seen(
+    capture.need_built_in()
+    nearest = SCENES[capture.scene].disparity_px[1]
+    rng = np.random.default_rng([capture.seed, 7])
+    changed = capture.scene_seen(
         change=lambda world: changes.overgrown(world, percent / 100, nearest, rng)
     )
-    return trial_of(setup, scene=changed)
+    return trial_of(capture, scene=changed)
 
 
-def specularity(setup: Setup, percent: float) -> Trial:
+def specularity(capture: Capture, percent: float) -> Trial:
     """Every surface mirrors a textured room, which makes a share of its light."""
-    setup.need_built_in()
-    rng = np.random.default_rng([setup.seed, 8])
-    changed = setup.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
-    return trial_of(setup, scene=changed)
+    capture.need_built_in()
+    rng = np.random.default_rng([capture.seed, 8])
+    changed = capture.scene_seen(change=lambda world: changes.mirroring(world, percent / 100, rng))
+    return trial_of(capture, scene=changed)
 
 
-def contrast(setup: Setup, percent: float) -> Trial:
+def contrast(capture: Capture, percent: float) -> Trial:
     """The scene has a share of its contrast; the PSNR is that of the stretched picture."""
-    seen, share = setup.scene_seen(), percent / 100
+    seen, share = capture.scene_seen(), percent / 100
     mean = seen.light_field.mean(axis=(0, 1, 2, 3), keepdims=True, dtype=np.float64)
     faded = np.asarray(mean + share * (seen.light_field - mean), dtype=np.float32)
-    trial = trial_of(setup, scene=replace(seen, light_field=faded))
+    trial = trial_of(capture, scene=replace(seen, light_field=faded))
     return replace(trial, peak=share)
 
 

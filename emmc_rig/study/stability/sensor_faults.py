@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import build_imaging_matrix, pixel_light
+from emmc_rig.model.camera import pixel_light
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.study.trial import SENSOR, Array, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import SENSOR, Array, Capture, Fault, Trial, trial_of
 from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
@@ -20,10 +20,10 @@ CFA_PERIOD = 12
 """Pixels in which every known tile of colour filters repeats."""
 
 
-def exposure(setup: Setup, electrons: float) -> Trial:
+def exposure(capture: Capture, electrons: float) -> Trial:
     """A white reading is worth `electrons`, all shots together."""
-    setup = _with_room(setup, electrons)
-    camera = setup.camera
+    capture = _with_room(capture, electrons)
+    camera = capture.described
     now = camera.sensor.noise.electrons_per_s * float(camera.exposures_s().sum())
     factor = electrons / now
     shots = tuple(
@@ -33,82 +33,77 @@ def exposure(setup: Setup, electrons: float) -> Trial:
         for shot in camera.shots
     )
     return trial_of(
-        setup.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots)
+        capture.with_camera(total_exposure_s=camera.total_exposure_s * factor, shots=shots)
     )
 
 
-def _with_room(setup: Setup, electrons: float) -> Setup:
-    """Return the setup with a gain low enough that white in all shots' light is not clipped."""
-    noise, camera = setup.camera.sensor.noise, setup.camera
+def _with_room(capture: Capture, electrons: float) -> Capture:
+    """Return the capture with a gain low enough that white in all shots' light is not clipped."""
+    noise, camera = capture.described.sensor.noise, capture.described
     share = camera.exposures_s() / camera.exposures_s().sum()
     side = CFA_PERIOD * camera.sensor.binning
     light = float(pixel_light(camera, (side, side)).max())
     room_dn = noise.white_level_dn - noise.black_level_dn
     most = room_dn / (HEADROOM * electrons * float(share.max()) * light)
     if most >= noise.gain_dn_per_electron:
-        return setup
-    return _with_noise(setup, {"gain_dn_per_electron": most})
+        return capture
+    return _with_noise(capture, {"gain_dn_per_electron": most})
 
 
-def read_noise(setup: Setup, electrons: float) -> Trial:
+def read_noise(capture: Capture, electrons: float) -> Trial:
     """Read noise, at least the camera's own."""
-    own = setup.camera.sensor.noise
+    own = capture.described.sensor.noise
     electrons = max(electrons, own.read_noise_electrons)
     # The black level lies clear of the noise, as on any sensor: clipped noise would be a bias.
     black = math.ceil(BLACK_DEVIATIONS * electrons * own.gain_dn_per_electron)
     black = min(max(black, own.black_level_dn), own.white_level_dn - 1)
     return trial_of(
-        _with_noise(setup, {"read_noise_electrons": electrons, "black_level_dn": black})
+        _with_noise(capture, {"read_noise_electrons": electrons, "black_level_dn": black})
     )
 
 
-def saturation(setup: Setup, percent: float) -> Trial:
+def saturation(capture: Capture, percent: float) -> Trial:
     """The white level lies so low that a share of the readings reaches it."""
-    camera, noise = setup.camera, setup.camera.sensor.noise
-    truth = setup.scene_seen().light_field
-    size = (truth.shape[2], truth.shape[3])
-    clean = build_imaging_matrix(camera, size).forward(truth)
-    electrons = noise.electrons(
-        clean, camera.exposures_s()[:, None, None], pixel_light(camera, size)
-    )
+    camera, noise = capture.described, capture.described.sensor.noise
+    psi = capture.psi()
+    clean, light = psi.forward(capture.scene_seen().light_field), pixel_light(camera, psi.size)
+    electrons = noise.electrons(clean, camera.exposures_s()[:, None, None], light)
     level = float(np.quantile(electrons, 1 - percent / 100)) * noise.gain_dn_per_electron
     white = max(noise.black_level_dn + 1, round(noise.black_level_dn + level))
-    return trial_of(_with_noise(setup, {"white_level_dn": min(white, noise.white_level_dn)}))
+    return trial_of(_with_noise(capture, {"white_level_dn": min(white, noise.white_level_dn)}))
 
 
-def _with_noise(setup: Setup, changed: dict[str, object]) -> Setup:
-    sensor = setup.camera.sensor
+def _with_noise(capture: Capture, changed: dict[str, object]) -> Capture:
+    sensor = capture.described.sensor
     noise = SensorNoise.model_validate({**sensor.noise.model_dump(), **changed})
-    return setup.with_camera(sensor=sensor.model_copy(update={"noise": noise}))
+    return capture.with_camera(sensor=sensor.model_copy(update={"noise": noise}))
 
 
-def bad_pixels(setup: Setup, percent: float) -> Trial:
+def bad_pixels(capture: Capture, percent: float) -> Trial:
     """A share of the pixels is dead or hot, half of each, and not marked as unusable."""
-    return _bad(setup, percent, listed=False)
+    return _bad(capture, percent, listed=False)
 
 
-def masked_pixels(setup: Setup, percent: float) -> Trial:
+def masked_pixels(capture: Capture, percent: float) -> Trial:
     """The same pixels, marked as unusable."""
-    return _bad(setup, percent, listed=True)
+    return _bad(capture, percent, listed=True)
 
 
-def _bad(setup: Setup, percent: float, listed: bool) -> Trial:
-    camera = setup.camera
-    truth = setup.scene_seen().light_field
-    k = camera.sensor.binning
-    pixels = (truth.shape[2] // k, truth.shape[3] // k)
-    flaws = SensorFlaws(bad_share=percent / 100, seed=setup.seed + 1)
+def _bad(capture: Capture, percent: float, listed: bool) -> Trial:
+    camera, psi = capture.described, capture.psi()
+    pixels = psi.frames_shape[1:]
+    flaws = SensorFlaws(bad_share=percent / 100, seed=capture.seed + 1)
     hot, dead = flaws.bad(pixels)
     # Hot pixels differ: the brightest saturates no sensor, the faintest hardly shows.
-    rng = np.random.default_rng([setup.seed, 5])
+    rng = np.random.default_rng([capture.seed, 5])
     glow = rng.random(pixels) * flaws.hot_electrons_per_s / camera.sensor.noise.electrons_per_s
-    light = np.maximum(pixel_light(camera, (truth.shape[2], truth.shape[3])), 1)
+    light = np.maximum(pixel_light(camera, psi.size), 1)
 
     def spoilt(clean: Array) -> Array:
         return np.where(dead, DEAD_RESPONSE * clean, clean) + np.where(hot, glow / light, 0)
 
-    bad: NDArray[np.bool_] = np.broadcast_to(hot | dead, (len(camera.shots), *pixels))
-    return trial_of(setup, change_clean=spoilt, unusable=bad if listed else None)
+    bad: NDArray[np.bool_] = np.broadcast_to(hot | dead, psi.frames_shape)
+    return trial_of(capture, change_clean=spoilt, unusable=bad if listed else None)
 
 
 FAULTS = (

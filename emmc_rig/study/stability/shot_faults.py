@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
 from emmc_rig.study.sweep import NotApplicableError
-from emmc_rig.study.trial import SEVERAL, SHOTS, Array, Fault, Setup, Trial, trial_of
+from emmc_rig.study.trial import SEVERAL, SHOTS, Array, Capture, Fault, Trial, trial_of
 from simulators import changes
 from simulators.raycaster import World
 
@@ -26,32 +25,32 @@ def flicker_gains(shots: int, percent: float, seed: int) -> Array:
     return gains / gains.mean()
 
 
-def flicker(setup: Setup, percent: float) -> Trial:
+def flicker(capture: Capture, percent: float) -> Trial:
     """The lamp's brightness differs from shot to shot."""
-    gains = flicker_gains(len(setup.camera.shots), percent, setup.seed)
-    return trial_of(setup, change_clean=lambda clean: clean * gains[:, None, None])
+    gains = flicker_gains(len(capture.described.shots), percent, capture.seed)
+    return trial_of(capture, change_clean=lambda clean: clean * gains[:, None, None])
 
 
-def scene_motion(setup: Setup, px: float) -> Trial:
+def scene_motion(capture: Capture, px: float) -> Trial:
     """Things move to the right before a background that stands, from shot to shot."""
-    setup.need_built_in()
-    return _moving(setup, px, background=False)
+    capture.need_built_in()
+    return _moving(capture, px, background=False)
 
 
-def camera_motion(setup: Setup, px: float) -> Trial:
+def camera_motion(capture: Capture, px: float) -> Trial:
     """The camera turns: the picture moves aslant from shot to shot.
 
     A measured scene is interpolated, and needs to be larger than what is reconstructed.
     """
-    if setup.is_built_in:
-        return _moving(setup, px, background=True)
-    truth = setup.scene_seen()
+    if capture.is_built_in:
+        return _moving(capture, px, background=True)
+    truth = capture.scene_seen()
     rows, columns = truth.light_field.shape[2:4]
-    shots = len(setup.camera.shots)
+    shots = len(capture.described.shots)
     margin = int(np.ceil(px * (shots - 1))) + 2
     size = (rows + 2 * margin, columns + 2 * margin)
     try:
-        wide = open_scene(setup.scene, size, setup.camera.views).light_field
+        wide = open_scene(capture.scene, size, capture.described.views).light_field
     except SceneError as fault:
         raise NotApplicableError(
             f"needs {margin} samples of the scene around what is reconstructed: choose a smaller "
@@ -63,52 +62,51 @@ def camera_motion(setup: Setup, px: float) -> Trial:
         np.stack([[shifted(one, -down * i, -across * i) for one in row] for row in wide])[inside]
         for i in range(shots)
     ]
-    return trial_of(setup, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
+    return trial_of(capture, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
 
 
 DIRECTION = (np.cos(np.pi / 6), np.sin(np.pi / 6))
 """Of the camera's motion: across, down."""
 
 
-def _moving(setup: Setup, px: float, background: bool) -> Trial:
-    truth = setup.scene_seen()
-    width = truth.light_field.shape[3] * (setup.zoom if setup.size is not None else 1)
+def _moving(capture: Capture, px: float, background: bool) -> Trial:
+    truth = capture.scene_seen()
+    width = truth.light_field.shape[3] * (capture.zoom if capture.size is not None else 1)
     across, down = DIRECTION if background else (1.0, 0.0)
     seen = [truth.light_field]
-    for shot in range(1, len(setup.camera.shots)):
+    for shot in range(1, len(capture.described.shots)):
         s, t = across * px * shot / width, down * px * shot / width
 
         def moved(world: World, s: float = s, t: float = t) -> World:
             return changes.moved(world, s, t, background)
 
-        seen.append(setup.scene_seen(change=moved).light_field)
-    return trial_of(setup, shot_scenes=seen)
+        seen.append(capture.scene_seen(change=moved).light_field)
+    return trial_of(capture, shot_scenes=seen)
 
 
-def missing_shot(setup: Setup, count: float) -> Trial:
+def missing_shot(capture: Capture, count: float) -> Trial:
     """The last shots stay dark: no light came through."""
-    dark = len(setup.camera.shots) - _count(setup, count)
+    dark = len(capture.described.shots) - _count(capture, count)
 
     def lost(clean: Array) -> Array:
         kept = clean.copy()
         kept[dark:] = 0
         return kept
 
-    return trial_of(setup, change_clean=lost)
+    return trial_of(capture, change_clean=lost)
 
 
-def repeated_shot(setup: Setup, count: float) -> Trial:
+def repeated_shot(capture: Capture, count: float) -> Trial:
     """The mask stage stays where it is before the last shots."""
-    truth = setup.scene_seen().light_field
-    psi = build_imaging_matrix(setup.camera, (truth.shape[2], truth.shape[3]))
+    psi = capture.psi()
     weights = psi.weights.copy()
-    last = len(setup.camera.shots) - _count(setup, count) - 1
+    last = len(capture.described.shots) - _count(capture, count) - 1
     weights[last + 1 :] = weights[last]
-    return trial_of(setup, true_psi=replace(psi, weights=weights))
+    return trial_of(capture, true_psi=replace(psi, weights=weights))
 
 
-def _count(setup: Setup, count: float) -> int:
-    shots = len(setup.camera.shots)
+def _count(capture: Capture, count: float) -> int:
+    shots = len(capture.described.shots)
     if count >= shots:
         raise NotApplicableError(f"{count:g} of {shots} shots: one at least must be whole")
     return round(count)

@@ -14,8 +14,9 @@ from matplotlib.lines import Line2D
 from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
-from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows
-from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep
+from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows, known_levels
+from emmc_rig.study.stability.fault_sweep import StabilitySweep
+from emmc_rig.study.stability.faults import Point
 
 DASHED = (0, (3, 2))
 PANEL_INCHES = (3.9, 2.75)
@@ -43,20 +44,16 @@ def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None
     fault, strengths = curves[0].fault, curves[0].strengths
     views = next((c.views for c in curves if None not in c.views), curves[0].views)
     mixed = _is_mixed(curves)
-    seen = [(i, view) for i, view in enumerate(views) if view is not None]
-    axes.plot(
-        [i for i, _ in seen], [view for _, view in seen],
-        ":", color=FAINT, linewidth=1.2, zorder=1,
-    )  # fmt: skip
+    axes.plot(*known_levels(views), ":", color=FAINT, linewidth=1.2, zorder=1)
     for curve in curves:
         colour = colours[curve.method]
-        known = [(i, level) for i, level in enumerate(curve.levels) if level is not None]
+        places, levels = known_levels(curve.levels)
         axes.plot(
-            [i for i, _ in known], [level for _, level in known],
+            places, levels,
             linestyle=DASHED if mixed and not curve.screened else "-", color=colour, linewidth=1.5,
             zorder=2,
         )  # fmt: skip
-        for i, level in known:
+        for i, level in zip(places, levels, strict=True):
             (dot,) = axes.plot(
                 i, level, "o", markersize=3.6, color=colour, zorder=3,
                 markerfacecolor="white" if mixed and not curve.screened else colour,
@@ -163,21 +160,22 @@ def stability_page(
     )  # fmt: skip
 
 
-def _head(curves: Sequence[Curve]) -> Head | None:
+def _head(curves: Sequence[Curve]) -> Head:
     """Return the method that breaks under the fewest faults; curves: pooled first."""
     shown = [one for one in curves if one.scene == curves[0].scene]
     faults = len({one.fault.name for one in shown})
     broken = Counter({one.label: 0 for one in shown})
     broken.update(one.label for one in shown if one.below_best() is not None)
     if not broken:
-        return None
+        why = "no method ran under any of the faults"
+        return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
         best,
         f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
         [
             "keep your bench below the strengths of the breaking points",
-            *(f"{name}: under {count} of {faults}" for name, count in others),
+            *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
         ],
     )
 

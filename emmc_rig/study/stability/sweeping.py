@@ -24,13 +24,12 @@ from emmc_rig.progress import Watcher
 from emmc_rig.reconstruct.pool import opened_pool
 from emmc_rig.study.stability.curves import Curve, break_row, curves
 from emmc_rig.study.stability.fault_sweep import (
-    Point,
     StabilitySettings,
     StabilitySweep,
     chosen_methods,
     planned,
 )
-from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.mismatch import measure_mismatch, mismatch_sections, recovered_share
 from emmc_rig.study.stability.numerics import measure_numerics, numerics_section
 from emmc_rig.study.stability.rounding import BROKEN, WEAK
@@ -73,8 +72,8 @@ class Beside:
 def _theory(settings: StabilitySettings, folder: Path, new: Path, watcher: Watcher) -> Beside:
     points = measure_theory(settings, folder, watcher)
     rows = [
-        {"scene": one.scene, "fault": one.fault, "strength": one.strength, **one.figures}
-        for one in points
+        {"scene": one.scene_name, "fault": one.fault, "strength": float(one.strength), **figures}
+        for one, figures in points.items()
     ]
     write_text(new / "theory.csv", csv_text(rows))
     every = compared(points, METHODS_COMPARED)
@@ -274,7 +273,7 @@ def _row(point: Point, result: dict) -> dict[str, object]:
         **result,
         "scene": point.scene_name,
         "fault": point.fault,
-        "unit": FAULTS[point.fault].unit,
+        "unit": FAULTS[str(point.fault)].unit,
         "strength": float(point.strength),
         "method": point.method,
         "screened": point.screened,

@@ -10,21 +10,20 @@ noisy frames (the oracle), and the methods, which are given none of these.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.lightfield import OPPONENT, centre_view
 from emmc_rig.progress import Watcher
 from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.fault_sweep import StabilitySettings, strengths
-from emmc_rig.study.stability.faults import FAULTS
-from emmc_rig.study.sweep import Results, Sweep
+from emmc_rig.study.stability.faults import FAULTS, Point
+from emmc_rig.study.sweep import Results, Sweep, described
 from emmc_rig.study.trial import Trial
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.errors import ReconstructionError
@@ -260,19 +259,9 @@ def measured(seen: Seen, places: Sequence[Place], method: str) -> dict[str, floa
     return found if not off else {**found, "disparity_px": float(np.median(off))}
 
 
-@dataclass(frozen=True)
-class TheoryPoint:
-    """One strength of a fault on a scene. figures: by name, None where not finite."""
-
-    fault: str
-    scene: str
-    strength: float
-    figures: Mapping[str, float | None]
-
-
 @dataclass
-class TheorySweep(Sweep[tuple[str, str, float]]):
-    """The points of theory: scene, fault and strength; settings: StabilitySettings."""
+class TheorySweep(Sweep[Point]):
+    """The points of theory; settings: StabilitySettings."""
 
     methods: Sequence[str]
     journal = "theory.jsonl"
@@ -284,26 +273,14 @@ class TheorySweep(Sweep[tuple[str, str, float]]):
         """How many patches theory looks at, and at how many of these for conditioning."""
         return QUICK_PATCHES if self.settings.fast else PATCHES
 
-    def inputs(self, point: tuple[str, str, float]) -> dict[str, object]:
+    def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
-        scene, fault, strength = point
-        settings = self.settings
-        return {
-            "camera": find_camera(settings.camera).model_dump(mode="json"),
-            "fault": (fault, strength),
-            "scene": scene,
-            "size": settings.size,
-            "zoom": settings.zoom,
-            "methods": self.methods,
-            "patches": self.patches,
-            "seed": settings.seed,
-        }
+        return {**described(point), "methods": self.methods, "patches": self.patches}
 
-    def measured(self, points: Sequence[tuple[str, str, float]], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the figures of theory and of the methods."""
-        for scene, fault, strength in points:
-            made = self.settings.trial(fault, strength, scene)
-            yield self._figures(Seen.of(made))
+        for point in points:
+            yield self._figures(Seen.of(point.trial()))
 
     def _figures(self, seen: Seen) -> dict[str, float]:
         count, conditioned_count = self.patches
@@ -319,30 +296,21 @@ class TheorySweep(Sweep[tuple[str, str, float]]):
             figures |= {f"{method}_{key}": value for key, value in found.items()}
         return figures
 
-    def label(self, point: tuple[str, str, float]) -> str:
-        """Return a point in words."""
-        scene, fault, strength = point
-        return f"{FAULTS[fault].title} {strength:g} {FAULTS[fault].unit}, {Path(scene).stem}"
-
 
 def measure_theory(
     settings: StabilitySettings,
     folder: Path,
     watcher: Watcher,
     methods: Sequence[str] = METHODS_COMPARED,
-) -> list[TheoryPoint]:
-    """Return every point, those that the folder does not hold measured and kept there.
+) -> dict[Point, dict[str, float | None]]:
+    """Return the figures of every point by name, None where not finite; kept in the folder.
 
     Raises what scenes and cameras do for wrong input.
     """
     wanted = (
-        (scene, name, strength)
-        for scene in settings.scenes
+        Point(capture, name, strength)
+        for capture in settings.captures
         for name in (QUICK_SWEPT if settings.fast else SWEPT)
         for strength in strengths(FAULTS[name], settings)
     )
-    results = TheorySweep(settings, folder, methods).run(wanted, watcher)
-    return [
-        TheoryPoint(fault, Path(scene).stem, strength, figures)
-        for (scene, fault, strength), figures in results.items()
-    ]
+    return TheorySweep(settings, folder, methods).run(wanted, watcher)

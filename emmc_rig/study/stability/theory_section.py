@@ -14,10 +14,9 @@ from scipy.stats import spearmanr
 
 from emmc_rig.pages.drawing import COLOURS, FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment, number
-from emmc_rig.study.stability.curves import Span, below_best, span_words, strength_at
-from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.curves import Span, below_best, known_levels, span_words, strength_at
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.stability_page import shown
-from emmc_rig.study.stability.theory import TheoryPoint
 from emmc_rig.study.trial import Fault
 
 BOUND, FOUND, ORACLE = "bound_db", "found_db", "oracle_db"
@@ -41,6 +40,7 @@ FIGURES = {
     BOUND: ("bound of PSNR, disparity known", True),
 }
 """What theory says of a camera, and whether more is better."""
+TheoryFigures = Mapping[Point, Mapping[str, float | None]]
 NEAR = 2.0
 """Factor between a predicted and a measured breaking point that counts as predicted."""
 CLOSE_PLACES = 0.5
@@ -59,14 +59,14 @@ class Compared:
     methods: tuple[str, ...]
 
 
-def compared(points: Sequence[TheoryPoint], methods: Sequence[str]) -> list[Compared]:
+def compared(points: TheoryFigures, methods: Sequence[str]) -> list[Compared]:
     """Return the points fault by fault."""
     found = []
-    for scene, name in dict.fromkeys((point.scene, point.fault) for point in points):
-        some = [point for point in points if (point.scene, point.fault) == (scene, name)]
+    for scene, name in dict.fromkeys((point.scene_name, str(point.fault)) for point in points):
+        some = [one for one in points if (one.scene_name, one.fault) == (scene, name)]
         keys = (*FIGURES, ORACLE, *(f"{method}_db" for method in methods))
-        levels = {key: tuple(point.figures.get(key) for point in some) for key in keys}
-        strengths = tuple(point.strength for point in some)
+        levels = {key: tuple(points[one].get(key) for one in some) for key in keys}
+        strengths = tuple(one.strength for one in some)
         found.append(Compared(scene, FAULTS[name], strengths, levels, tuple(methods)))
     return found
 
@@ -159,24 +159,17 @@ def draw_theory(some: Sequence[Compared], path: Path) -> Path:
 
 def _panel(axes: Axes, one: Compared, colours: Mapping[str, str]) -> None:
     for key, (_, colour, style) in DRAWN_AS.items():
-        places, levels = _known(one.levels[key])
+        places, levels = known_levels(one.levels[key])
         axes.plot(places, levels, color=colour, linestyle=style, linewidth=1.3, zorder=2)
     for method, colour in colours.items():
-        places, levels = _known(one.levels[f"{method}_db"])
+        places, levels = known_levels(one.levels[f"{method}_db"])
         axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=3)
     axes.set_xticks(range(len(one.strengths)), [shown(strength) for strength in one.strengths])
     axes.tick_params(labelsize=7.5)
     titled(axes, one.fault.title, one.fault.unit)
 
 
-def _known(levels: Sequence[float | None]) -> tuple[list[int], list[float]]:
-    known = [(i, level) for i, level in enumerate(levels) if level is not None]
-    return [i for i, _ in known], [level for _, level in known]
-
-
-def theory_sections(
-    points: Sequence[TheoryPoint], methods: Sequence[str], folder: Path
-) -> list[Section]:
+def theory_sections(points: TheoryFigures, methods: Sequence[str], folder: Path) -> list[Section]:
     """Return a section for each scene, its chart written into a folder."""
     sections = []
     every = compared(points, methods)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -21,23 +21,30 @@ from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import Head, Section, fragment, framed, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.study.scores import swept_disparity
 from emmc_rig.study.stability.details import SHAPES, Detail, Shown, shown
-from emmc_rig.study.stability.fault_sweep import FAST_SCENES, SCENES, named_methods
+from emmc_rig.study.stability.fault_sweep import (
+    StabilitySettings,
+    named_methods,
+    stability_settings,
+)
 from emmc_rig.study.stability.worst import Solve, confined, worst_perturbation
 from emmc_rig.study.sweep import (
+    NotApplicableError,
     Results,
     Sweep,
     check_scene_names,
+    check_size,
     csv_text,
+    described,
     dictionary_identity,
     open_folder,
     provenance,
 )
-from emmc_rig.study.trial import Setup, Trial, trial_of
+from emmc_rig.study.trial import Capture, Trial, trial_of
+from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct
 
 Array = NDArray[np.floating]
@@ -53,26 +60,10 @@ JOURNAL, PAGE, COMMAND = "worst.jsonl", "report.html", "stability --worst"
 NOISE = "worst noise"
 
 
-class WorstSettings(Settings):
-    """What to measure: see `emmc-rig stability --worst`."""
-
-    scenes: tuple[str, ...]
-    camera: str = CAMERA
-    methods: tuple[str, ...]
-    size: tuple[int, int]
-    fast: bool = False
-    dictionary: str | None = None
-    seed: int = 0
-
-    def trial(self, scene: str) -> Trial:
-        """Return what a method gets of a scene, nothing at fault."""
-        return trial_of(Setup(scene, find_camera(self.camera), self.size, self.seed))
-
-    @property
-    def details(self) -> tuple[Detail, ...]:
-        """The details to put in."""
-        sizes, contrasts = (FAST_SIZES_PX, FAST_CONTRASTS) if self.fast else (SIZES_PX, CONTRASTS)
-        return tuple(Detail(*one) for one in product(SHAPES, sizes, contrasts))
+def details(fast: bool) -> list[Detail]:
+    """Return the details to put into a scene."""
+    sizes, contrasts = (FAST_SIZES_PX, FAST_CONTRASTS) if fast else (SIZES_PX, CONTRASTS)
+    return [Detail(*one) for one in product(SHAPES, sizes, contrasts)]
 
 
 def worst_settings(
@@ -83,34 +74,31 @@ def worst_settings(
     size: tuple[int, int] | None,
     dictionary: str | None,
     seed: int,
-) -> WorstSettings:
+) -> StabilitySettings:
     """Return the settings, checked; raises AppError and ReconstructionError for wrong ones."""
     size = size or (FAST_SIZE if fast else SIZE)
-    if min(size) < SMALLEST_PX:
-        raise AppError(f"--size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
-    scenes = tuple(scenes) or (FAST_SCENES if fast else SCENES)
-    check_scene_names(scenes)
-    methods = named_methods(methods, fast)
-    camera = camera or CAMERA
-    find_camera(camera)
-    return WorstSettings(
-        scenes=scenes, camera=camera, methods=methods, size=size, fast=fast,
+    check_size(size, SMALLEST_PX)
+    settings = stability_settings(
+        fast, scenes, size, zoom=1, camera=camera or CAMERA, methods=named_methods(methods, fast),
         dictionary=dictionary, seed=seed,
     )  # fmt: skip
+    check_scene_names(settings.scenes)
+    find_camera(settings.camera)
+    return settings
 
 
 @dataclass(frozen=True)
 class Point:
-    """A scene and a method; detail: None for the worst perturbation."""
+    """A capture and a method; detail: None for the worst perturbation."""
 
-    scene: str
+    capture: Capture
     method: str
     detail: Detail | None = None
 
     @property
     def scene_name(self) -> str:
         """The scene as tables call it."""
-        return Path(self.scene).stem
+        return self.capture.scene_name
 
     @property
     def label(self) -> str:
@@ -121,7 +109,7 @@ class Point:
 
 @dataclass
 class WorstSweep(Sweep[Point]):
-    """The points; settings: WorstSettings."""
+    """The points; settings: StabilitySettings."""
 
     journal = JOURNAL
     stage = "worst perturbations and details"
@@ -129,32 +117,25 @@ class WorstSweep(Sweep[Point]):
 
     def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
-        settings: WorstSettings = self.settings
-        detail = point.detail
-        return {
-            "scene": point.scene,
-            "method": point.method,
-            "detail": detail and (detail.kind, detail.size_px, detail.contrast),
-            "camera": find_camera(settings.camera).model_dump(mode="json"),
-            "size": settings.size,
-            "seed": settings.seed,
-            "dictionary": dictionary_identity(settings.dictionary),
-        }
+        return {**described(point), "dictionary": dictionary_identity(self.settings.dictionary)}
 
-    def group(self, point: Point) -> tuple[str, str]:
+    def group(self, point: Point) -> Point:
         """Return what points that share a trial and a reconstruction have in common."""
-        return point.scene, point.method
+        return replace(point, detail=None)
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the figures of each point of one scene and method."""
-        trial, method = self.settings.trial(points[0].scene), points[0].method
+        trial, method = trial_of(points[0].capture), points[0].method
         dictionary = trial.dictionary(method, self.settings.dictionary)
 
         def solve(readings: Array) -> Array:
             frames = readings.astype(np.float32)
             sigma = max(trial.noise_sigma, 1e-9)
-            result = reconstruct(method, trial.psi, frames, sigma, dictionary, usable=trial.usable)
-            return result.light_field
+            given = (trial.psi, frames, sigma, dictionary)
+            try:
+                return reconstruct(method, *given, usable=trial.usable).light_field
+            except ReconstructionError as why:
+                raise NotApplicableError(f"{method}: {why}") from why
 
         base = None
         for point in points:
@@ -217,26 +198,34 @@ def noise_figures(trial: Trial, solve: Solve, seed: int) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class WorstOutcome:
-    """noise: figures by scene and method; details: what is shown of each. page: where to look."""
+    """noise: figures by scene and method; details: what is shown of each. page: where to look.
+
+    left_out: lines about methods that could not be measured.
+    """
 
     noise: Mapping[Point, Mapping[str, float]]
     details: Mapping[Point, Shown]
     page: Path
+    left_out: Sequence[str]
 
 
-def run_worst(settings: WorstSettings, out: Path, watcher: Watcher) -> WorstOutcome:
+def run_worst(settings: StabilitySettings, out: Path, watcher: Watcher) -> WorstOutcome:
     """Measure into a folder, and write page, table and metrics; raises AppError for a wrong one."""
     started = time.monotonic()
     folder = open_folder(out, JOURNAL, COMMAND)
     points = [
-        Point(scene, method, detail)
-        for scene in settings.scenes
+        Point(capture, method, detail)
+        for capture in settings.captures
         for method in settings.methods
-        for detail in (None, *settings.details)
+        for detail in (None, *details(settings.fast))
     ]
-    results = WorstSweep(settings, folder).run(points, watcher)
+    sweep = WorstSweep(settings, folder)
+    results = sweep.run(points, watcher)
+    left_out = list(dict.fromkeys(sweep.left_out.values()))
+    if not results:
+        raise AppError(f"nothing could be measured: {'; '.join(left_out)}")
     noise = {point: one for point, one in results.items() if point.detail is None}
-    details = {point: Shown(**one) for point, one in results.items() if point.detail is not None}
+    fates = {point: Shown(**one) for point, one in results.items() if point.detail is not None}
     rows = [
         {"scene": point.scene_name, "method": point.method, "what": point.label, **one}
         for point, one in results.items()
@@ -244,18 +233,19 @@ def run_worst(settings: WorstSettings, out: Path, watcher: Watcher) -> WorstOutc
     with result_folder(folder, COMMAND, adds=True) as new:
         write_text(new / "worst.csv", csv_text(rows))
         sections = [
-            worst_section(scene, noise, details)
-            for scene in dict.fromkeys(point.scene_name for point in points)
+            worst_section(scene, noise, fates)
+            for scene in dict.fromkeys(point.scene_name for point in results)
         ]
         sections.append(provenance_section(provenance(settings, time.monotonic() - started)))
         about = [
             "Every method under the worst perturbation of the noise's size, and small details."
         ]
-        head = _head(noise, details)
+        head = _head(noise, fates)
         page = framed("The worst that can happen", about, CAVEATS, sections, head=head)
         write_text(new / PAGE, page)
-        write_metrics(new, {"points": rows, "settings": settings.model_dump(mode="json")})
-    return WorstOutcome(noise, details, folder / PAGE)
+        metrics = {"points": rows, "settings": settings.model_dump(mode="json")}
+        write_metrics(new, {**metrics, "left_out": left_out})
+    return WorstOutcome(noise, fates, folder / PAGE, left_out)
 
 
 def _head(noise: Mapping[Point, Mapping[str, float]], details: Mapping[Point, Shown]) -> Head:
@@ -267,9 +257,10 @@ def _head(noise: Mapping[Point, Mapping[str, float]], details: Mapping[Point, Sh
     best = min(losses, key=losses.__getitem__)
     fates = [one.fate for point, one in details.items() if point.method == best]
     invented = [
-        f"{point.method} invents it in {point.scene_name}: {point.label}"
+        f"trust no small detail of {point.method}: in {point.scene_name} it invents a "
+        f"{point.detail.label}"
         for point, one in details.items()
-        if one.fate == "invented"
+        if one.fate == "invented" and point.detail is not None
     ]
     return Head(
         f"{best} loses least",

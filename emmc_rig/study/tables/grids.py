@@ -11,7 +11,6 @@ from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import (
     MASK_TITLES,
     METHOD_TITLES,
-    PARTS,
     SCENARIOS,
     Capture,
     Cell,
@@ -61,7 +60,8 @@ class Grid:
 
 def grids(parts: Sequence[Part], results: Results, scenes: Sequence[str]) -> list[Grid]:
     """Return the grids of the parts that are tables; cells that were not measured stay empty."""
-    return [_MAKERS[part.name](part, results, scenes) for part in parts if part.name in _MAKERS]
+    tables = ("table2", "table3", "table4", "figure8")
+    return [_grid(part, results, scenes) for part in parts if part.name in tables]
 
 
 def pair_of(results: Results, cell: Cell) -> Pair:
@@ -84,7 +84,7 @@ def mean_pair(pairs: Iterable[Pair]) -> Pair:
 def _lines(
     results: Results,
     scenes: Sequence[str],
-    rows: Sequence[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]],
+    rows: Rows,
 ) -> list[Line]:
     """Return lines for every scene, then means, then the paper's own means where scenes differ.
 
@@ -106,9 +106,7 @@ def _lines(
     return lines
 
 
-def _papers_means(
-    part: Part, rows: Sequence[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]]
-) -> list[Line]:
+def _papers_means(part: Part, rows: Rows) -> list[Line]:
     """Return the paper's means over all its scenes of a part."""
     scenes = scenes_of(part, list(paper.TITLES))
     lines = []
@@ -126,45 +124,41 @@ def _papers_means(
     return lines
 
 
-def _table_2(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
+Rows = list[tuple[tuple[str, ...], Sequence[Capture], Sequence[str]]]
+
+
+def _rows(part: Part) -> tuple[tuple[str, ...], tuple[str, ...], list[Rows]]:
+    """Return what heads the lines of a part, its columns, and its rows, in one block or several."""
+    every = part.captures
+    if part.name == "table2":
+        kinds = {"noise-free": False, "noisy": True}
+        blocks: list[Rows] = [
+            [((title,), [c for c in every if c.noisy == noisy], part.methods)]
+            for title, noisy in kinds.items()
+        ]
+        return ("noise",), _names([c for c in every if not c.noisy]), blocks
+    if part.name == "table4":
+        rows: Rows = [
+            ((f"({one}) {title}",), [c for c in every if c.scenario == one], part.methods)
+            for one, title in SCENARIOS.items()
+        ]
+        return ("sensor",), ("1 (RGB 3)", "2 (RGB 6)", "3 (RGB 9)", "4 (RGB 12)"), [rows]
+    columns = _names(every) if part.name == "table3" else [MASK_TITLES[c.mask] for c in every]
+    return (), tuple(columns), [[((), every, part.methods)]]
+
+
+def _grid(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
     shown = scenes_of(part, scenes)
+    # Of Table II the paper's means are those of its four scenes, given or not; Figure 8 has none.
+    same = part.name == "table2" and all(paper.known_as(one) in paper.SYNTHETIC for one in shown)
+    heads, columns, blocks = _rows(part)
     lines: list[Line] = []
-    for noisy, title in ((False, "noise-free"), (True, "noisy")):
-        captures = [capture for capture in part.captures if capture.noisy == noisy]
-        rows = [((title,), captures, part.methods)]
+    for rows in blocks:
         lines += _lines(results, shown, rows)
-        if any(paper.known_as(scene) not in paper.SYNTHETIC for scene in shown):
+        if part.name != "figure8" and not same:
             lines += _papers_means(part, rows)
-    columns = [c for c in part.captures if not c.noisy]
-    return Grid(part.name, part.title, ("scene", "noise", "method"), _names(columns), tuple(lines))
-
-
-def _table_3(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
-    rows = [((), part.captures, part.methods)]
-    lines = [*_lines(results, scenes_of(part, scenes), rows), *_papers_means(part, rows)]
-    return Grid(part.name, part.title, ("scene", "method"), _names(part.captures), tuple(lines))
-
-
-def _table_4(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
-    rows = []
-    for scenario, title in SCENARIOS.items():
-        captures = [capture for capture in part.captures if capture.scenario == scenario]
-        rows.append(((f"({scenario}) {title}",), captures, part.methods))
-    columns = ("1 (RGB 3)", "2 (RGB 6)", "3 (RGB 9)", "4 (RGB 12)")
-    lines = [*_lines(results, scenes_of(part, scenes), rows), *_papers_means(part, rows)]
-    return Grid(part.name, part.title, ("scene", "sensor", "method"), columns, tuple(lines))
-
-
-def _figure_8(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
-    rows = [((), part.captures, part.methods)]
-    columns = tuple(MASK_TITLES[capture.mask] for capture in part.captures)
-    lines = _lines(results, scenes_of(part, scenes), rows)
-    return Grid(part.name, part.title, ("scene", "method"), columns, tuple(lines))
+    return Grid(part.name, part.title, ("scene", *heads, "method"), columns, tuple(lines))
 
 
 def _names(captures: Sequence[Capture]) -> tuple[str, ...]:
     return tuple(f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures)
-
-
-_MAKERS = {"table2": _table_2, "table3": _table_3, "table4": _table_4, "figure8": _figure_8}
-assert set(_MAKERS) <= set(PARTS)
