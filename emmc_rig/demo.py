@@ -45,8 +45,8 @@ from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
-SIZE = (112, 144)
-"""Of a built-in scene: a third of the samples of its own 192x256, for a first run of seconds."""
+SIZE = (96, 128)
+"""Of a built-in scene: a quarter of the samples of its own 192x256, for a first run of seconds."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class DemoSettings:
 
     method: see `reconstruction.methods`; dictionary: see `emmc_rig.files.dictionaries`.
     exact_psi: reconstruct with the exact Psi too, which shows what calibration costs.
+    out: the folder as typed; named in what to do next.
     """
 
     scene: str
@@ -67,6 +68,7 @@ class DemoSettings:
     dictionary: str | None = None
     solver: MethodSettings = field(default_factory=MethodSettings)
     exact_psi: bool = False
+    out: str = ""
 
 
 @dataclass
@@ -161,6 +163,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         metrics = {
             "scene": settings.scene,
             "scene_provenance": fine.scene.provenance,
+            "finer": [fine.aperture_factor, fine.pixel_factor],
             "camera": settings.camera_name,
             "shots": design.shots,
             "size": list(size),
@@ -274,4 +277,5 @@ def _report(
         warnings=metrics["warnings"],
         command=metrics["command"],
         maps=maps,
+        source=settings.out,
     )

@@ -36,8 +36,9 @@ def calibrate(
         typer.Option(
             "--check",
             help="measure what calibration reaches on the simulated bench: psi, few, session, "
-            "bound, plan, sensor, stage, drift, alarms, cost, frames, large, effects (tilt, glass, "
-            "lamp, ...); commas between, or all; exit code 1 where a target is missed",
+            "bound, plan, sensor, stage, drift, alarms, cost, frames, large, streamed, effects "
+            "(tilt, glass, lamp, ...); commas between, or all; exit code 1 where a target is "
+            "missed",
         ),
     ] = None,
     drift: Annotated[
@@ -80,7 +81,12 @@ def calibrate(
         typer.Option("--psnr", help="with --check effects: what each costs a reconstruction, dB"),
     ] = False,
     stage: Annotated[
-        bool, typer.Option("--stage", help="map the mask stage as well: 16 whiteboards more")
+        bool,
+        typer.Option(
+            "--stage",
+            help="map the mask stage as well: of a session by its open whiteboards (stage.json), "
+            "on the simulated bench by 16 more",
+        ),
     ] = False,
     sensor: Annotated[
         bool,
@@ -111,7 +117,7 @@ def calibrate(
         _judge_drift(known, drift, out or Path("emmc-drift"))
         return
     if session is not None:
-        _calibrate_session(session, route, out, sensor)
+        _calibrate_session(session, route, out, sensor, stage)
         return
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
@@ -180,16 +186,15 @@ def _tell_findings(metrics: dict) -> None:
         tell(f"measure again: {line}")
 
 
-def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -> None:
-    import emmc_rig as emmc
+def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, stage: bool) -> None:
+    from emmc_rig.calibrate.session import calibrate_into
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.session.session import CALIBRATION
+    from emmc_rig.session.session import CALIBRATION, Session
 
-    captured, place = emmc.Session(path), path / CALIBRATION
+    captured, place = Session(path), path / CALIBRATION
     out = out or place
     with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
-        calibration = emmc.calibrate(captured, route, sensor=sensor, watcher=bars)
-        calibration.write(folder)
+        calibration = calibrate_into(folder, captured, route, sensor, stage, bars)
     metrics = calibration.metrics
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
@@ -198,8 +203,9 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
     _tell_findings(metrics)
-    if calibration.sensor is not None:
-        for name, value, deviation, unit in calibration.sensor.rows():
+    mapped = None if calibration.stage is None else calibration.stage.map
+    for sheet in (calibration.sensor, mapped):
+        for name, value, deviation, unit in () if sheet is None else sheet.rows():
             spread = "" if deviation is None else f" +- {deviation:.2g}"
             tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
     tell(f"open {out / 'report.html'}")

@@ -16,7 +16,7 @@ from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.output import emit, give_result, json_wanted, say, tell
 from emmc_rig.commands.verdict import show_reason
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError
 
 if TYPE_CHECKING:
     from emmc_rig.capture.control import Control
@@ -61,7 +61,7 @@ def capture(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="only check the plan, and tell what it will take")
+        bool, typer.Option("--dry-run", help="only check the plan, and say what it will take")
     ] = False,
     page: Annotated[
         bool, typer.Option("--page", help="show the running capture on a local page")
@@ -209,10 +209,14 @@ def _page(
     with served(application(page, token, does == "shows", to_act=to_act)) as port:
         say("page", f"http://127.0.0.1:{port}/{token}/", "cyan")
         page.start()
+        why = ""
         try:
             yield page
+        except ERRORS as fault:
+            why = str(fault)
+            raise
         finally:
-            page.close()
+            page.close(why)
 
 
 def _print_line(event: Event) -> None:

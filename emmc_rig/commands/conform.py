@@ -50,7 +50,12 @@ def conform(
     from emmc_rig import conformance
 
     here = Path(conformance.__file__).parent
-    with redirect_stdout(sys.stderr) if json_wanted.get() else nullcontext():
+    with (
+        redirect_stdout(sys.stderr) if json_wanted.get() else nullcontext(),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        # Plug-ins of pytest that other packages brought take longer to load than a suite to run.
+        patch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
         code = pytest.main(
             [
                 *(str(here / SUITES[suite]) for suite in suites),

@@ -66,7 +66,7 @@ def register(app: typer.Typer) -> None:
 
 
 def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
-    """Tell what a camera is, and what it can be set to."""
+    """Show what a camera is, and what it can be set to."""
     camera = _chosen(camera, rig)
     with closing(open_camera(camera)) as device:
         rows = list(camera_rows(device))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emmc_rig.capture.signals import ENDING, handled
+from emmc_rig.capture.signals import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
@@ -318,17 +318,6 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
         except DriverError as fault:
             notes = getattr(fault, "__notes__", [])
             raise AppError("; ".join([str(fault), *notes])) from fault
-
-
-@contextmanager
-def signals_interrupt() -> Iterator[None]:
-    """Let a request to end, or a closed terminal, act as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    with handled(interrupt, ENDING):
-        yield
 
 
 def _show(stage: Stage) -> None:

@@ -1,8 +1,9 @@
 """The first run on a machine compiles kernels: it says so, and other processes compile ahead.
 
-Numba keeps what it compiled on the disk, so that what one process compiled another loads. One
-process reconstructs a small light field through the same camera by the same method while this one
-still simulates the capture; another by `tv`, whose step is a late part of most methods.
+Numba keeps what it compiled on the disk, so that what one process compiled another loads. While
+this process still simulates the capture, one other searches disparities in a small light field and
+one fits it: each needs kernels that the other does not. Of a method that does neither, one process
+reconstructs.
 """
 
 from __future__ import annotations
@@ -10,21 +11,25 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 from numba.core import event
+from numpy.typing import NDArray
 
 from emmc_rig.commands.output import say
+from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
+from reconstruction.result import Progress
 
 SIZE = (48, 64)
 """Of the light field that is compiled for: no kernel depends on it."""
+NOISE = 0.002
 SOLVING = "reconstruct"
 """The stage before which the other processes must be done."""
-STEP = "tv"
-"""The method of the step alone: a quarter of what `adaptive` compiles."""
+PARTS = {"adaptive": ("search", "fit"), "adaptive-fast": ("search", "fit")}
+"""What the other processes do for a method; for one that is not here, the whole of it."""
 
 
 @dataclass
@@ -44,8 +49,8 @@ class Compiling(event.Listener):
         if not self.ahead:
             say("first run", "compiling kernels for this machine, once; later runs start at once")
             quiet = subprocess.DEVNULL  # Ctrl-C reaches it too, and what fails there fails here
-            for method in dict.fromkeys((self.method, STEP)):
-                command = [sys.executable, "-m", __name__, method, *self.arguments]
+            for part in PARTS.get(self.method, (self.method,)):
+                command = [sys.executable, "-m", __name__, part, *self.arguments]
                 self.ahead.append(
                     subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
                 )
@@ -81,19 +86,58 @@ def compiled_ahead(
                 one.wait()
 
 
-def compile_for(method: str, camera: str, shots: int | None) -> None:
-    """Reconstruct a small light field, so that every kernel of it is compiled and kept."""
+def compile_for(part: str, camera: str, shots: int | None) -> None:
+    """Reconstruct a small light field, or do that part of it: its kernels are compiled and kept."""
     import emmc_rig as emmc
 
     described = emmc.camera(camera, shots)
     psi = described.psi(SIZE)
     texture = np.random.default_rng(0).random((*SIZE, 3), dtype=np.float32)
-    near = np.s_[SIZE[0] // 3 :, SIZE[1] // 3 :]
+    near = np.zeros(SIZE, dtype=np.float32)
+    near[SIZE[0] // 3 :, SIZE[1] // 3 :] = 1
     light_field = np.empty((*described.views, *texture.shape), np.float32)
     for v, u in np.ndindex(described.views):  # a near surface before a far one
         light_field[v, u] = texture
-        light_field[v, u][near] = np.roll(texture, (v, u), axis=(0, 1))[near]
-    emmc.reconstruct(psi, psi @ light_field, method)
+        light_field[v, u][near > 0] = np.roll(texture, (v, u), axis=(0, 1))[near > 0]
+    frames = psi @ light_field
+    if part == "search":
+        _search(psi, frames)
+    elif part == "fit":
+        _fit(psi, frames, near, texture)
+    else:
+        emmc.reconstruct(psi, frames, part)
+
+
+def _search(psi: ImagingMatrix, frames: NDArray[np.floating]) -> None:
+    """Reconstruct as far as the first fit: search disparities, and start by total variation."""
+    from reconstruction.adaptive.method import reconstruct_adaptive
+
+    class FitError(Exception):
+        """The first step of a fit is done."""
+
+    def stop(progress: Progress) -> None:
+        if progress.step > 2:
+            raise FitError
+
+    with suppress(FitError):
+        reconstruct_adaptive(psi, frames, NOISE, on_step=stop)
+
+
+def _fit(
+    psi: ImagingMatrix,
+    frames: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    picture: NDArray[np.floating],
+) -> None:
+    """Fit surfaces of this disparity (y, x), sweep a plane with them and draw their views."""
+    from reconstruction.adaptive.joint import TextureSettings, solve
+    from reconstruction.adaptive.sweep import plane_frames
+
+    precision = np.full(psi.frames_shape, NOISE**-2, dtype=np.float32)
+    scene = solve(psi, disparity, 1, frames, precision, picture, TextureSettings())
+    margin = (scene.texture.shape[1] - SIZE[0]) // 2
+    plane_frames(psi, scene.clean, 0.0, margin)
+    scene.surfaces.light_field(scene.texture)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -102,7 +103,10 @@ def live(
             webbrowser.open(address)
         watch.start()
         try:
-            Server(application(SetupPage(watch), token, read_only, hosts)).run(sockets=[listening])
+            words = ("emmc-rig", "capture", str(plan), "--rig", rig or "")
+            following = shlex.join(words) if plan and rig else ""
+            page = SetupPage(watch, following)
+            Server(application(page, token, read_only, hosts)).run(sockets=[listening])
         except KeyboardInterrupt:
             tell("ended; the stage stands")
 
@@ -120,6 +124,7 @@ def _watch(
     plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
+    from drivers.errors import UsbNotFoundError
     from emmc_rig.capture.plan import load_plan
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.live.save import Files
@@ -151,7 +156,10 @@ def _watch(
                 opened.camera, opened.stage, look, targets, centre_um, described, field, files
             )
         else:
-            device = stack.enter_context(closing(open_camera(camera or "ptp:")))
+            try:
+                device = stack.enter_context(closing(open_camera(camera or "ptp:")))
+            except UsbNotFoundError as fault:
+                raise AppError(f"{fault}; to look around without one: --rig simulated") from fault
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
             field = _light_field(psi, scale, method, described, device.shape)
             watch = Watch(device, driven, design=described, light_field=field, files=files)

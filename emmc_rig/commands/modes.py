@@ -20,7 +20,7 @@ STUDIED = {"scene", "camera", "size", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
-        "session": {"route", "sensor", "out"},
+        "session": {"route", "sensor", "stage", "out"},
         "check": {
             "camera",
             "size",
@@ -42,16 +42,19 @@ MODES: dict[str, dict[str, set[str]]] = {
         "kernels": TIMED,
         "guard": STUDIED,
         "live": STUDIED,
+        "pages": STUDIED | {"seed"},
         "stated": STUDIED,
+        "trends": STUDIED | {"seed"},
         "ablation": STUDIED | {"seed"},
         "constants": STUDIED | {"seed"},
         "next_shot": STUDIED | {"seed", "until"},
     },
+    "design": {"check": {"bench", "scene", "size", "seed", "out"}},
     "export": {"list_formats": set()},
     "reconstruct": {"list_methods": set()},
     "stability": {
         "faults": set(),
-        "verdicts": STUDIED | {"fast", "fault", "method", "seed"},
+        "verdicts": STUDIED | {"fast", "fault", "method", "seed", "constants"},
         "worst": STUDIED | {"fast", "method", "dictionary", "seed"},
     },
     "train": {"network": {"camera", "views", "steps", "minutes", "seed", "resume", "out"}},
@@ -62,6 +65,7 @@ NEEDS = {
     "cameras": {"out": "name"},
     "chart": {"until": "next_shot"},
     "export": {"truth": "result"},
+    "stability": {"constants": "verdicts"},
     "train": {"camera": "network", "steps": "network", "minutes": "network"},
 }
 """By command, an option and the one without which it does nothing."""

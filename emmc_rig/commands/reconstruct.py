@@ -79,7 +79,7 @@ def reconstruct(
     from emmc_rig.reconstruct.captures import Request, reconstruct_captures
     from emmc_rig.reconstruct.inputs import load_settings
     from emmc_rig.reconstruct.memory import parse_memory
-    from reconstruction.methods import DEFAULT_METHOD
+    from reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
         _list_methods()
@@ -100,6 +100,8 @@ def reconstruct(
         method, why = advice.method, advice.why
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
+    if dictionary is not None and not find_method(method).needs_dictionary:
+        raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
     requests = [
         Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
         for folder, place in _places(frames, out)

@@ -60,7 +60,7 @@ def list_sessions(
         raise AppError(f"{folder}: none of its {there} session(s) is such; ask for less")
     rows = []
     for one in found:
-        # Its path from here tells sessions of one name in several folders apart.
+        # Its path from here distinguishes sessions of one name in several folders.
         inside = os.path.relpath(one.folder, folder)
         name = one.name if inside == "." else inside
         about = ", ".join(dict.fromkeys(part for part in (one.title, one.camera) if part))

@@ -31,7 +31,7 @@ def stability(
     ] = None,
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help="only this one, or all that are installed; may repeat"),
+        typer.Option("--method", help="only this one, or all; may repeat"),
     ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
@@ -55,6 +55,10 @@ def stability(
     ] = False,
     verdicts: Annotated[
         bool, typer.Option("--verdicts", help="instead: how often verdicts flag broken results")
+    ] = False,
+    constants: Annotated[
+        bool,
+        typer.Option("--constants", help="with --verdicts: 2x, 0.5x of each constant behind them"),
     ] = False,
     worst: Annotated[
         bool,
@@ -87,7 +91,8 @@ def stability(
     check_workers(workers, cluster)
     if verdicts:
         place = out or Path("emmc-verdicts")
-        _verdicts(place, fast, scene, camera, fault, method, parse_size(size), seed)
+        shown = _verdict_constants if constants else _verdicts
+        shown(place, fast, scene, camera, fault, method, parse_size(size), seed)
         return
     if worst:
         _worst(
@@ -161,6 +166,30 @@ def _verdicts(out: Path, *wanted: Any) -> None:
     give_result(out)
 
 
+def _verdict_constants(out: Path, *wanted: Any) -> None:
+    """Measure what the constants of verdicts and screening are worth."""
+    from emmc_rig.study.stability import detector, verdict_constants
+
+    settings = detector.detector_settings(*wanted)
+    with shown_progress() as bars:
+        costs, left_out = verdict_constants.run_verdict_constants(settings, out, bars)
+    show_table(
+        ("constant", "value", "times", "broken: flagged", "good: flagged", "verdicts changed"),
+        [
+            (one.constant, one.value, f"{one.factor:g}", f"{one.broken_flagged:+d}",
+             f"{one.good_flagged:+d}", str(one.changed))
+            for one in costs
+            if one.changed
+        ],
+    )  # fmt: skip
+    same = len({one.constant for one in costs} - {one.constant for one in costs if one.changed})
+    tell(f"{same} more constants change no verdict of these cases")
+    for line in left_out:
+        say("left out", line)
+    tell(f"open {out / verdict_constants.CSV}")
+    give_result(out)
+
+
 def _worst(out: Path, *wanted: Any) -> None:
     """Measure what harms every method most, and which details it keeps, loses or invents."""
     from emmc_rig.study.stability.worst_study import (
@@ -176,5 +205,7 @@ def _worst(out: Path, *wanted: Any) -> None:
     for name in (Path(scene).stem for scene in settings.scenes):
         show_table(*noise_table(name, outcome.noise), name)
         show_table(*details_table(name, outcome.details), name)
+    for line in outcome.left_out:
+        say("left out", line)
     tell(f"open {outcome.page}")
     give_result(out)

@@ -49,7 +49,8 @@ class StageRig(ABC):
     """One stage: simulated firmware, the wire to it, and where its axes really are.
 
     wire: one of `WIRES`. opened: closes what is opened.
-    `senses_stalls`: the controller tells; `replies_are_numbered`: a late one cannot be mistaken.
+    `senses_stalls`: the controller reports them; `replies_are_numbered`: a late one is
+    recognised.
     """
 
     senses_stalls = True

@@ -33,8 +33,9 @@ def _found(spec: str) -> Camera:
     shipped = shipped_camera_files()
     if spec in shipped:
         return load_camera(shipped[spec])
-    nearest = difflib.get_close_matches(spec.lower(), shipped, n=1, cutoff=0)[0]
+    near = difflib.get_close_matches(spec.lower(), shipped, n=1, cutoff=0.5)
+    hint = f"did you mean '{near[0]}'? " if near else ""
     raise CameraError(
-        f"no camera is called '{spec}': did you mean '{nearest}'? `emmc-rig cameras` lists them; "
+        f"no camera is called '{spec}': {hint}`emmc-rig cameras` lists them; "
         "a camera of your own is given by the path of its .yaml file"
     )

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
+from emmc_rig.files.frames import FRAMES
 from emmc_rig.files.results import METRICS
-from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.errors import SceneError
+from emmc_rig.files.scenes import fine_scene, open_scene
+from emmc_rig.model.errors import SceneError, nearest_of
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.model.reading import stored_arrays
+from simulators.scenes import SCENES
 
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 """Of a result's folder."""
@@ -38,21 +40,35 @@ def open_export(spec: str, truth: str | None = None) -> Export:
         light_field, maps = load_hdf5(folder / LIGHT_FIELD), read_maps(folder)
         metrics = _metrics(folder)
         caption = _caption(metrics)
+    elif (folder / FRAMES).is_file():
+        raise AppError(f"{spec}: holds frames, no light field; run: emmc-rig reconstruct {spec}")
+    elif not folder.exists() and spec not in SCENES:
+        near = nearest_of(spec, SCENES)
+        raise AppError(f"no folder or file '{spec}', and no built-in scene: {near}")
     else:
         scene = open_scene(spec)
         light_field, caption, metrics = scene.light_field, scene.provenance, {}
         maps = {} if scene.disparity_px is None else {"disparity": scene.disparity_px}
     true = None
     if truth is not None:
-        true = open_scene(truth, light_field.shape[2:4], light_field.shape[:2]).light_field
+        true = _true(truth, light_field.shape, metrics)
         if true.shape != light_field.shape:
             raise SceneError(f"{truth}: shape {true.shape}, but {spec} has {light_field.shape}")
     fitting = {name: one for name, one in maps.items() if _fits(one, light_field.shape)}
     return Export(
-        folder.resolve().name, caption, light_field, true, metrics=metrics, **{
+        folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
             name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")
         },
     )  # fmt: skip
+
+
+def _true(spec: str, shape: tuple[int, ...], metrics: dict) -> NDArray:
+    """Return a scene's light field as a result's capture averaged it: `demo` draws it finer."""
+    size, views = (shape[2], shape[3]), (shape[0], shape[1])
+    match metrics:
+        case {"scene": scene, "finer": [int(a), int(p)], "seed": int(seed)} if scene == spec:
+            return fine_scene(spec, a, p, size, views, seed).scene.light_field
+    return open_scene(spec, size, views).light_field
 
 
 def read_maps(folder: Path) -> dict[str, NDArray]:

@@ -6,13 +6,28 @@ Numba's own parallel loops take two to four times as long to compile.
 from __future__ import annotations
 
 import inspect
+import os
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import wraps
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache, wraps
 from typing import Any
 
 import numpy as np
 from numba import get_num_threads, njit
+
+_inside = threading.local()
+"""Set in a thread that works on a band: what it calls runs in that thread alone."""
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Return the threads of this process: to start them anew takes longer than a small kernel."""
+    return ThreadPoolExecutor(threads, "band")
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None = None) -> None:
@@ -20,13 +35,22 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
     threads = get_num_threads()
     count = min(rows, threads if bands is None else bands)
     edges = np.linspace(0, rows, count + 1).round().astype(int)
-    spans = [(band, int(edges[band]), int(edges[band + 1])) for band in range(count)]
-    if threads == 1:
-        for span in spans:
-            work(*span)
+
+    def one(band: int) -> None:
+        outer, _inside.band = getattr(_inside, "band", False), True
+        try:
+            work(band, int(edges[band]), int(edges[band + 1]))
+        finally:
+            _inside.band = outer
+
+    if threads == 1 or count == 1 or getattr(_inside, "band", False):
+        for band in range(count):
+            one(band)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda span: work(*span), spans))
+    at_work = [_pool(threads).submit(one, band) for band in range(count)]
+    wait(at_work)
+    for band in at_work:
+        band.result()
 
 
 def row_kernel(

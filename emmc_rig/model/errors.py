@@ -7,7 +7,7 @@ from collections.abc import Iterable
 def nearest_of(name: str, known: Iterable[str]) -> str:
     """Return a hint for a name that is not known: the nearest one, if any is near, and all."""
     known = list(known)
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     return (f"did you mean '{near[0]}'? " if near else "") + f"known are {', '.join(known)}"
 
 

@@ -159,12 +159,12 @@ class StoredArrays:
 def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[StoredArrays]:
     """Yield the data sets of an HDF5 file; whatever fails in reading them raises `error`.
 
-    remedy: what to do about a file that is missing, damaged or not what was expected.
+    remedy: what to do about a file that is damaged or not what was expected.
     """
     try:
         size = path.stat().st_size
     except FileNotFoundError as fault:
-        raise error(f"{shown_path(path)}: no such file; {remedy}") from fault
+        raise error(f"{shown_path(path)}: no such file") from fault
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
         raise error(f"{shown_path(path)}: cannot be read ({why})") from fault

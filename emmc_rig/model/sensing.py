@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -68,6 +68,11 @@ class PsiLayout:
         return self.shape[3], self.shape[5]
 
     @property
+    def shots(self) -> int:
+        """Number of shots."""
+        return self.shape[0]
+
+    @property
     def frames_shape(self) -> tuple[int, int, int]:
         """(shot, pixel_y, pixel_x)."""
         return self.shape[0], self.size[0] // self.binning, self.size[1] // self.binning
@@ -78,7 +83,8 @@ class ImagingMatrix:
     """Psi.
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
-        pixel sees one colour only, else three.
+        pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
+        it is saved and looked at, view by view, and no operator.
     colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
@@ -109,7 +115,7 @@ class ImagingMatrix:
             raise SensingError("the colour map names colours beyond red, green and blue")
         if self.size[0] % self.binning or self.size[1] % self.binning:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
-        if not np.isfinite(self.weights).all():
+        if not all(np.isfinite(plane).all() for plane in self.view_planes()):
             raise SensingError("the imaging matrix has entries that are not finite")
 
     def __repr__(self) -> str:
@@ -299,10 +305,14 @@ class ImagingMatrix:
         difference = np.linalg.norm((self.weights - reference.weights).ravel())
         return float(difference / np.linalg.norm(reference.weights.ravel()))
 
+    def view_planes(self) -> Iterator[Array]:
+        """Yield the weights of every shot and view, (y, stored colour, x)."""
+        return (self.weights[place] for place in np.ndindex(*self.weights.shape[:3]))
+
     def checksum(self) -> str:
         """Return the SHA-256 of weights, colours, binning and camera."""
         digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{self.camera_json}".encode())
-        for array in (self.weights, self.colour_map):
+        for array in (*self.view_planes(), self.colour_map):
             digest.update(np.ascontiguousarray(array).view(np.uint8).data)
         return digest.hexdigest()
 
@@ -310,17 +320,17 @@ class ImagingMatrix:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
         try:
             with whole_file(path) as partial, h5py.File(partial, "w") as file:
-                file.attrs.update(
-                    format=FORMAT,
-                    binning=self.binning,
-                    camera=self.camera_json,
-                    sha256=self.checksum(),
-                )
-                if self.colour is not None:
-                    file["colour"] = self.colour
                 file["weights"] = self.weights
+                self.describe(file)
         except OSError as fault:
             raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+
+    def describe(self, file: h5py.File) -> None:
+        """Write what makes a file that holds the weights one of Psi."""
+        facts = {"format": FORMAT, "binning": self.binning, "camera": self.camera_json}
+        file.attrs.update(**facts, sha256=self.checksum())
+        if self.colour is not None:
+            file["colour"] = self.colour
 
     @classmethod
     def load(cls, path: Path) -> ImagingMatrix:

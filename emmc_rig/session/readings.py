@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,10 @@ from calibration.frames import MeanFrame, SensorGain, average, before_and_after
 from calibration.levels import Check, check_of
 from calibration.routes import Outcome, calibrate
 from calibration.sensor import Pair
-from calibration.whiteboard import Calibration, Whiteboards, measure_psi
+from calibration.whiteboard import Calibration, NewArray, Whiteboards, in_memory, measure_psi
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
+from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame
@@ -126,13 +127,16 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     turned: dict[float, dict[bool, MeanFrame]] = defaultdict(dict)
     for (kind, _), frames in groups.items():
         bench = frames[0].bench
-        mean = _mean(session, frames)
         if kind == "turned":
-            turned[bench.board_turn_deg][bench.masks_in] = mean
+            turned[bench.board_turn_deg][bench.masks_in] = _mean(session, frames)
             continue
-        stage_um = bench.offsets_um.get("mask_x", 0.0), bench.offsets_um.get("mask_y", 0.0)
+        alike = _alike(session, frames)
+        stage_um = _stage_um(frames[0])
         view, window = frames[0].view, frames[0].window
-        found[kind].append(BoardFrame(mean, stage_um, bench.shot, view, bench.lamp, window))
+        read = partial(_mean, session, alike)
+        found[kind].append(
+            BoardFrame(read, len(alike), stage_um, bench.shot, view, bench.lamp, window)
+        )
     references = {key: _mean(session, frames) for key, frames in _references(session).items()}
     # The white lamp's first: the sensor's gain follows from it.
     references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
@@ -146,7 +150,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     )
     own_um = next((one.stage_um for one in found["open"]), (0.0, 0.0))
     boards = {
-        turn_deg: BoardSet(darks, {(0, "white"): by[False]}, (BoardFrame(by[True], own_um),))
+        turn_deg: BoardSet(darks, {(0, "white"): by[False]}, (BoardFrame.held(by[True], own_um),))
         for turn_deg, by in turned.items()
     }
     return SessionBoards(fit, free, held_out, boards)
@@ -155,7 +159,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
 def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> Iterator[Check]:
     """Yield every look at a whiteboard that was seen before, single frames each.
 
-    Nothing where none was planned: references alone tell no drift.
+    Nothing where none was planned: references alone show no drift.
     """
     checks = [frame for frame in session.frames if frame.kind == "check"]
     if not checks:
@@ -165,6 +169,34 @@ def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> 
         mean = _mean(session, [frame])
         dark_dn = boards.dark_at(mean.exposure_s).mean_dn
         yield check_of(mean, frame.bench.masks_in, dark_dn, channels)
+
+
+def stage_frames(session: Session) -> tuple[list[PlannedFrame], BoardSet]:
+    """Return each single frame of the open aperture with the masks in, planned and as a whiteboard.
+
+    Of the first shot, under the white lamp: each shows where the mask stage stood.
+    """
+    planned = [
+        frame
+        for frame in session.frames
+        if frame.kind in ("open", "held-out", "check")
+        and frame.bench.masks_in
+        and frame.bench.shot == 0
+        and frame.bench.lamp == "white"
+    ]
+    white = _references(session).get((0, "white"))
+    references = {} if white is None else {(0, "white"): _mean(session, white)}
+    boards = tuple(
+        BoardFrame(partial(_mean, session, [one]), 1, _stage_um(one), window=one.window)
+        for one in planned
+    )
+    return planned, BoardSet(_board_darks(session), references, boards)
+
+
+def _stage_um(frame: PlannedFrame) -> tuple[float, float]:
+    """Return where the mask stage was sent, from where it is centred, x and y."""
+    offsets = frame.bench.offsets_um
+    return offsets.get("mask_x", 0.0), offsets.get("mask_y", 0.0)
 
 
 def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
@@ -237,6 +269,14 @@ def _darks(session: Session) -> list[PlannedFrame]:
     return darks
 
 
+def _frame_shape(session: Session) -> tuple[int, int]:
+    """Return rows and columns of the frames captured; raises AppError where no dark was."""
+    first = _darks(session)[0]
+    _exposure_s(session, first)
+    rows, columns = session.stored[first.id]["shape"]
+    return rows, columns
+
+
 def _exposure_s(session: Session, frame: PlannedFrame) -> float:
     """Return how long a frame was exposed; raises AppError where it was not captured yet."""
     entry = session.stored.get(frame.id)
@@ -262,22 +302,23 @@ def _taken_s(session: Session, entry: Entry) -> float:
     return (entry.get("host_time_s") or 0.0) + offset
 
 
+def _alike(session: Session, frames: list[PlannedFrame]) -> list[PlannedFrame]:
+    """Return the most repeats that are alike in exposure: an amendment of the plan may change it.
+
+    Raises AppError where one was not captured yet.
+    """
+    exposures_s = [_exposure_s(session, frame) for frame in frames]
+    (exposure_s, _), *_ = Counter(exposures_s).most_common()
+    return [one for one, own_s in zip(frames, exposures_s, strict=True) if own_s == exposure_s]
+
+
 def _mean(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
-    first = session.stored.get(frames[0].id)
-    if first is None:
-        raise AppError(f"{session.folder}: frame {frames[0].id} was not captured yet; resume it")
-    # After an amendment of the plan repeats may differ in exposure: the most that are alike count.
-    entries = [session.stored.get(frame.id, first) for frame in frames]
-    (exposure_s, _), *_ = Counter(entry["exposure_s"] for entry in entries).most_common()
-    alike = [
-        frame
-        for frame, entry in zip(frames, entries, strict=True)
-        if frame.id not in session.stored or entry["exposure_s"] == exposure_s
-    ]
-    lit = frames[0].kind != "dark"
+    alike = _alike(session, frames)
+    entries = [session.stored[frame.id] for frame in alike]
     mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
     taken_s = float(np.mean([_taken_s(session, entry) for entry in entries]))
-    return average(mosaics, exposure_s, first["white_level_dn"], frames[0].id, taken_s, lit)
+    first, what, lit = entries[0], alike[0].id, alike[0].kind != "dark"
+    return average(mosaics, first["exposure_s"], first["white_level_dn"], what, taken_s, lit)
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
@@ -335,16 +376,24 @@ def session_outcome(
     session: Session,
     routes: Sequence[str] | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
+    empty: NewArray = in_memory,
+    on_plane: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Return Psi by the routes named, with the choice among them.
 
-    By default by every route that the session has the whiteboards for.
+    By default by every route that the session has the whiteboards for. empty, on_plane: of the
+    free route, see `measure_psi`.
 
     Raises AppError where the session has not what a route needs, or CalibrationError.
     """
     camera = camera_of(session)
-    design = designed_psi(session, mean_dark(session))
-    boards = board_sets(session, channels_of(design.layout))
+    k = camera.sensor.binning
+    rows, columns = _frame_shape(session)
+    size = k * rows, k * columns
+    # Only where a pixel has several samples does the design say more than its layout.
+    design = psi_layout(camera, size) if k == 1 else build_imaging_matrix(camera, size)
+    layout = psi_layout(camera, size)
+    boards = board_sets(session, channels_of(layout))
     few, pinholes, held_out = boards.fit, boards.pinholes, boards.held_out
     if routes is None:
         routes = ("parametric", "mixed") if few is not None else ("free",)
@@ -370,10 +419,12 @@ def session_outcome(
         design,
         routes,
         held_out,
-        few,
+        few if set(routes) - {"free"} else None,
         pinholes,
         on_stage=on_stage,
         turned=boards.turned,
+        empty=empty,
+        on_plane=on_plane,
     )
 
 

@@ -24,7 +24,7 @@ class Export:
     disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
     (v, u, y, x). model: (y, x), indices of `emmc_rig.pages.viewer.MODEL_NAMES`. misfit: (y, x),
     readings missed, in deviations of their noise. truth: as light_field. caption: one line.
-    metrics: what metrics.json says of a result.
+    metrics: what metrics.json says of a result. source: what was opened, as typed.
     """
 
     title: str
@@ -36,6 +36,7 @@ class Export:
     model: NDArray | None = None
     misfit: Array | None = None
     metrics: Mapping[str, object] = field(default_factory=dict)
+    source: str = ""
 
 
 @dataclass(frozen=True)

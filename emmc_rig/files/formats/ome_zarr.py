@@ -31,7 +31,7 @@ def _write(folder: Path, export: Export) -> None:
     attributes = json.loads(path.read_text())
     attributes["emmc_rig"] = {"views": [rows, columns], "colour": "linear RGB, 1 is white"}
     path.write_text(json.dumps(attributes))
-    # Where Zarr keeps its metadata together too, it must not tell otherwise.
+    # Where Zarr keeps its metadata together too, both must agree.
     (folder / NAME / ".zmetadata").unlink(missing_ok=True)
 
 
