@@ -2,10 +2,13 @@
 
 import os
 import tempfile
+from functools import partial
 from pathlib import Path
 
 # As many processes as cores: threads of BLAS in each would wait on each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Threads of numba's loops sleep until they have work: spinning takes the other process's core.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest
@@ -34,11 +37,14 @@ def pytest_xdist_auto_num_workers(config):
     return os.cpu_count() if everything and not real else 0
 
 
+NO_LIGHT_FIELDS = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
+
+
 def pytest_collection_modifyitems(config, items):
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     skips = {}
     if not (folder and Path(folder).is_dir()):
-        skips["real_data"] = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
+        skips["real_data"] = NO_LIGHT_FIELDS
     for item in items:
         for marker, reason in skips.items():
             if marker in item.keywords:
@@ -48,6 +54,26 @@ def pytest_collection_modifyitems(config, items):
             if not config.getoption(f"--{device}"):
                 reason = f"no real {device}: name one with --{device}"
                 item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Name the checks that ran on real light fields, or say why none of those chosen did."""
+    told = {
+        outcome: [
+            report.nodeid
+            for report in terminalreporter.stats.get(outcome, [])
+            if "real_data" in report.keywords
+        ]
+        for outcome in ("passed", "failed", "error", "skipped")
+    }
+    skipped = told.pop("skipped")
+    ran = [f"{outcome}: {name}" for outcome, names in told.items() for name in names]
+    if ran or skipped:
+        terminalreporter.section("real light fields")
+        why = "" if ran else f": {NO_LIGHT_FIELDS}"
+        terminalreporter.write_line(f"{len(ran)} checks ran on real light fields{why}")
+        for line in ran:
+            terminalreporter.write_line(line)
 
 
 @pytest.fixture
@@ -79,6 +105,15 @@ def run(monkeypatch, capsys, tmp_path):
         return code, shown.out, shown.err
 
     return call
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    """`devices bench` times pictures of a quarter of a megapixel, twice, not of 24, nine times."""
+    from emmc_rig.study.benchmarks import devices
+
+    for name in ("picture_timing", "unpacking_timings", "stream_timing"):
+        monkeypatch.setattr(devices, name, partial(getattr(devices, name), (400, 600), 2))
 
 
 @pytest.fixture(scope="session")

@@ -381,7 +381,7 @@ def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi, doubt):
     assert expected[0] == pytest.approx(np.diag(posterior)[inner].mean(), rel=1e-3)
 
 
-def test_the_mask_position_that_tells_more_is_expected_to_err_less(bayer, planted):
+def test_the_mask_position_with_more_information_is_expected_to_err_less(bayer, planted):
     maps = planted[3].maps
     moved = np.concatenate([bayer.weights, np.roll(bayer.weights, 9, axis=5)])
     psi = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())

@@ -11,7 +11,7 @@ from emmc_rig.session.session import Session
 from emmc_rig.study import ablation, constants, next_shot
 from emmc_rig.study.oracle import STEP_PX, matched_disparity
 from emmc_rig.study.sweep import open_folder
-from emmc_rig.study.trial import Setup
+from emmc_rig.study.trial import Capture
 from reconstruction.adaptive import parsimony, search
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.search import DECISIVE
@@ -27,7 +27,7 @@ def test_an_ablation_compares_the_whole_with_what_is_left_and_with_rivals(monkey
     some = {"sharpening": ablation.LEFT_OUT["sharpening of the disparity"]}
     monkeypatch.setattr(ablation, "LEFT_OUT", some)
     monkeypatch.setattr(ablation, "RIVALS", ("tv",))
-    given = Setup("deep-occlusions", find_camera(CAMERA), SIZE)
+    given = Capture("deep-occlusions", find_camera(CAMERA), SIZE)
     rows = ablation.ablations(given, tmp_path, Silent())
     assert [row.name for row in rows] == [
         "adaptive",
@@ -62,7 +62,7 @@ def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp
         return reconstruct("tv", psi, frames, noise_sigma, settings=QUICK, usable=usable)
 
     monkeypatch.setattr(constants, "reconstruct_adaptive", reconstructed)
-    given = [Setup("deep-occlusions", find_camera(CAMERA), SIZE)]
+    given = [Capture("deep-occlusions", find_camera(CAMERA), SIZE)]
     costs, left_out = constants.constant_costs(given, tmp_path, Silent())
     own = DECISIVE, DECISIVE, 0.5
     assert sorted(seen) == sorted(

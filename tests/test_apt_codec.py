@@ -31,7 +31,7 @@ def test_a_short_message_is_id_two_parameters_destination_and_source(arguments, 
     assert codec.encode(*arguments) == bytes.fromhex(wire)
 
 
-def test_a_message_with_data_flags_its_destination_and_tells_the_length():
+def test_a_message_with_data_flags_its_destination_and_states_the_length():
     # MOT_MOVE_ABSOLUTE to 2048 counts (thorlabs-apt-protocol, README)
     data = codec.encode_position(1, 2048)
     wire = bytes.fromhex("53 04 06 00 d0 01 01 00 00 08 00 00")

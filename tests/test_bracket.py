@@ -105,7 +105,7 @@ def test_the_order_of_the_exposures_does_not_matter(ramp):
     np.testing.assert_array_equal(one.dn_per_s, other.dn_per_s)
 
 
-def test_a_bracket_without_frames_is_told():
+def test_a_bracket_without_frames_is_reported():
     dark = dark_frame((4, 4), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="needs frames"):
         fuse([], [], dark, GAIN, 4095)

@@ -257,7 +257,7 @@ def frames_of(folder, camera, truth):
     return folder
 
 
-def test_a_capture_after_the_mask_has_moved_is_told_and_psi_mended(calibrated, tmp_path):
+def test_that_the_mask_has_moved_is_reported_and_psi_mended(calibrated, tmp_path):
     known, camera, truth = calibrated
     moved = moved_truth(truth, (9.0, -8.0, 0.0, 0.0, 0.0))
     frames = frames_of(tmp_path / "frames", camera, moved)
@@ -310,7 +310,7 @@ def test_drift_refuses_frames_of_another_size(run, calibrated, tmp_path):
             file[name] = cut
     code, _, error = run("calibrate", "--drift", frames, "--known", known)
     assert code == 1
-    assert "this calibration is for (1, 48, 64)" in " ".join(error.split())
+    assert "this calibration is for 1 of 48 x 64" in " ".join(error.split())
     code, _, error = run("calibrate", "--drift", frames, "--known", tmp_path)
     assert code == 1
     assert "name a folder that `emmc-rig calibrate` wrote" in " ".join(error.split())

@@ -60,7 +60,7 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def test_info_tells_who_the_camera_is_and_what_it_can(run):
+def test_info_names_the_camera_and_what_it_can_do(run):
     shown = run("camera", "--camera", "simulated").output
     for text in ("EMMC simulated camera", "from 0.0002 to 30 s", "from 1 to 16", "87 %", "GB free"):
         assert text in shown

@@ -108,7 +108,7 @@ def test_a_session_holds_every_frame_that_the_plan_asks_for(undisturbed):
     assert verify(session).is_complete
 
 
-def test_the_journal_tells_where_everything_stood_and_by_what_it_was_taken(undisturbed):
+def test_the_journal_records_where_everything_stood_and_by_what_it_was_taken(undisturbed):
     session, _ = undisturbed
     entry = session.stored["board-s1-v0-u4-white-r0"]
     assert entry["commanded_um"]["mask_x"] == 270
@@ -462,7 +462,7 @@ def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
     assert names == [frame.id for frame in session.frames]
 
 
-def test_a_full_disk_is_told_in_one_line_with_what_is_safe():
+def test_a_full_disk_is_reported_in_one_line_with_what_is_safe():
     rig = still_rig()
     session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
     line = "disk is full; make room, then run the same"
@@ -473,7 +473,7 @@ def test_a_full_disk_is_told_in_one_line_with_what_is_safe():
     assert rig.stage.stops == 1
 
 
-def test_a_read_only_disk_is_told_in_one_line():
+def test_a_read_only_disk_is_reported_in_one_line():
     rig = still_rig()
     disk = SimulatedDisk()
     session, plan = started(rig, disk=disk)
@@ -488,7 +488,7 @@ def test_a_read_only_disk_is_told_in_one_line():
     assert rig.stage.moves == 0
 
 
-def test_a_disk_that_is_too_small_is_told_before_anything_is_made():
+def test_a_disk_that_is_too_small_is_reported_before_anything_is_made():
     rig = still_rig()
     wish = wish_for(Path("/"))
     expected = estimated(planned_frames(wish, rig), wish.plan, rig)
@@ -497,7 +497,7 @@ def test_a_disk_that_is_too_small_is_told_before_anything_is_made():
         refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1000))
 
 
-def test_an_axis_out_of_reach_is_told_before_anything_moves():
+def test_an_axis_out_of_reach_is_reported_before_anything_moves():
     rig = still_rig()
     rig = replace(rig, zero_um={**rig.zero_um, "mask_x": 99_990.0})
     session, plan = started(rig)
@@ -506,7 +506,7 @@ def test_an_axis_out_of_reach_is_told_before_anything_moves():
     assert rig.stage.moves == 0
 
 
-def test_an_exposure_beyond_the_camera_is_told_before_anything_moves():
+def test_an_exposure_beyond_the_camera_is_reported_before_anything_moves():
     rig = still_rig()
     session, plan = started(rig, ONE_SHOT.replace("0.05", "7200"))
     with pytest.raises(AppError, match="the camera exposes from"):

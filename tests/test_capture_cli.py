@@ -227,7 +227,7 @@ def test_a_plan_for_a_camera_is_written_once(run, tmp_path):
     assert "exists already" in one_line(err)
 
 
-def test_a_dry_run_tells_what_it_will_take_and_makes_nothing(run, tmp_path):
+def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
     plan_file(tmp_path)
     code, _, err = run("capture", "plan.yaml", *RIG, "--dry-run")
     assert code == 0
@@ -326,7 +326,7 @@ def test_another_scene_does_not_go_on_with_the_session(captured, run, tmp_path):
     assert "another rig" in one_line(err)
 
 
-def test_a_plan_edited_inside_the_session_is_told(captured, run, tmp_path):
+def test_a_plan_edited_inside_the_session_is_reported(captured, run, tmp_path):
     copy = tmp_path / "copy"
     subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
     (copy / "plan.yaml").write_text("camera: conventional\nshots: [{}]\n")
@@ -348,7 +348,7 @@ def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written_is_told(run, tmp_path):
+def test_a_folder_that_may_not_be_written_is_reported(run, tmp_path):
     plan_file(tmp_path)
     (tmp_path / "locked").mkdir(mode=0o500)
     code, _, err = run("capture", "plan.yaml", *RIG, "--out", "locked/s")
@@ -356,7 +356,7 @@ def test_a_folder_that_may_not_be_written_is_told(run, tmp_path):
     assert "cannot be made" in one_line(err)
 
 
-def test_a_disk_without_room_is_told_before_anything_is_made(run, tmp_path, monkeypatch):
+def test_a_disk_without_room_is_reported_before_anything_is_made(run, tmp_path, monkeypatch):
     from emmc_rig.session.storage import SystemDisk
 
     plan_file(tmp_path)
@@ -367,7 +367,7 @@ def test_a_disk_without_room_is_told_before_anything_is_made(run, tmp_path, monk
     assert not (tmp_path / "plan-session").exists()
 
 
-def test_work_by_hand_without_a_terminal_is_told(run, tmp_path, monkeypatch):
+def test_work_by_hand_without_a_terminal_is_reported(run, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     plan_file(tmp_path)
     axes = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0)
@@ -506,7 +506,8 @@ def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, ax
         f"kind: simulated\nfocus_um: 9000\nstands_um: {{{axis}: 100}}\n"
     )
     plan_file(tmp_path)
-    code, _, err = run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
+    rig = ("--rig", tmp_path / "rig.yaml", "--size", "24x32")
+    code, _, err = run("capture", tmp_path / "plan.yaml", *rig)
     assert code == 1
     assert told in one_line(err)
     assert not (tmp_path / "plan-session").exists()

@@ -186,13 +186,13 @@ def test_a_bad_plan_gives_one_line_that_names_what_is_wrong(tmp_path, changes, l
     assert "\n" not in str(told.value)
 
 
-def test_a_view_that_the_camera_has_not_is_told():
+def test_a_view_that_the_camera_has_not_is_reported():
     plan = plan_of(whiteboards={"views": [[5, 0]]})
     with pytest.raises(AppError, match="5x5 views"):
         frames_of(plan)
 
 
-def test_a_mask_to_move_that_is_not_there_is_told():
+def test_a_mask_to_move_that_is_not_there_is_reported():
     plan = plan_of(camera="conventional", shots=[{"mask_um": [1, 1]}])
     with pytest.raises(AppError, match="no mask to move"):
         planned_camera(plan)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import replicate_centre
-from emmc_rig.study.chart.captures import Capture, kept_capture, read_frames, read_truth
+from emmc_rig.study.chart.captures import kept_capture, read_frames, read_truth
 from emmc_rig.study.chart.chart_sweep import timing_lock
 from emmc_rig.study.chart.front import POOLED, Mark, charts, growths, pareto_front
 from emmc_rig.study.chart.peers import PEERS
@@ -21,6 +22,7 @@ from emmc_rig.study.chart.points import (
     scalings,
 )
 from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
+from emmc_rig.study.trial import Capture
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.methods import MethodSettings, installed_methods, reconstruct
 from simulators.scenes import render
@@ -178,12 +180,12 @@ def test_the_peak_of_memory_is_not_the_parents():
 
 
 def test_a_capture_is_made_once_and_its_truth_kept_apart(tmp_path):
-    capture = Capture("wide-disparity", "rgbw-bayer-1shot", (20, 24), 2)
-    path, digest = kept_capture(capture, 0, tmp_path)
+    capture = Capture("wide-disparity", "rgbw-bayer-1shot", (20, 24), zoom=2)
+    path, digest = kept_capture(capture, tmp_path)
     before = path.stat().st_mtime_ns
-    assert kept_capture(capture, 0, tmp_path) == (path, digest)
+    assert kept_capture(capture, tmp_path) == (path, digest)
     assert path.stat().st_mtime_ns == before
-    assert kept_capture(capture, 1, tmp_path)[1] != digest
+    assert kept_capture(replace(capture, seed=1), tmp_path)[1] != digest
     (psi, frames), (truth, disparity) = read_frames(path), read_truth(path)
     assert truth.shape == psi.light_field_shape == (5, 5, 20, 24, 3)
     rendered = render("wide-disparity", size=(40, 48))
@@ -197,7 +199,7 @@ def given(size=(20, 24)):
     capture = Capture("deep-occlusions", "rgbw-bayer-1shot", size)
     from emmc_rig.model.camera import build_imaging_matrix
 
-    psi = build_imaging_matrix(capture.described(), size)
+    psi = build_imaging_matrix(capture.described, size)
     usable = np.random.default_rng(0).random(psi.frames_shape) < 0.9
     frames = np.where(usable, psi.forward(truth), 9).astype(np.float32)
     return psi, Frames(frames, np.full(frames.shape, 1e-3), usable)

@@ -17,13 +17,14 @@ from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
 from emmc_rig.study.chart import chart_sweep, measure, points
-from emmc_rig.study.chart.captures import Capture, kept_capture
+from emmc_rig.study.chart.captures import kept_capture
 from emmc_rig.study.chart.chart_sweep import ChartSweep, timing_lock, working
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
 from emmc_rig.study.chart.measure import Reference, measured
 from emmc_rig.study.chart.peers import Peer
 from emmc_rig.study.chart.points import chart_settings
 from emmc_rig.study.sweep import SweepStopped, digest_of
+from emmc_rig.study.trial import Capture
 from simulators.scenes import render
 
 SIZE = (24, 32)
@@ -150,8 +151,8 @@ def test_growth_is_charted(quick, monkeypatch, tmp_path):
 
     monkeypatch.setattr(ChartSweep, "_measured", as_quick_as_small)
 
-    def always_the_same(asked, seed, folder):
-        path, _ = kept_capture(capture, seed, folder)
+    def always_the_same(asked, folder):
+        path, _ = kept_capture(capture, folder)
         return path, digest_of({"asked": repr(asked)})
 
     monkeypatch.setattr(chart_sweep, "kept_capture", always_the_same)
@@ -166,7 +167,7 @@ def test_growth_is_charted(quick, monkeypatch, tmp_path):
 @pytest.fixture
 def job(tmp_path):
     """Three steps of total variation on a small capture."""
-    path, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", SIZE), 0, tmp_path)
+    path, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", SIZE), tmp_path)
     return {
         "capture": str(path), "settings": {"tv": {"max_steps": 3}}, "method": "tv",
         "needs_dictionary": False, "dictionary": None, "repeats": 2, "enough_s": 60,
@@ -175,7 +176,7 @@ def job(tmp_path):
 
 
 def test_a_worker_outlives_what_fails_and_tells_each_jobs_peak(job, tmp_path):
-    large, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", (96, 160)), 0, tmp_path)
+    large, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", (96, 160)), tmp_path)
     later = {**job, "capture": str(large), "picture": str(tmp_path / f"{digest}-x.webp")}
     wrong = {**job, "needs_dictionary": True, "dictionary": str(tmp_path / "none.h5")}
     with (

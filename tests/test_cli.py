@@ -213,7 +213,7 @@ def test_wrong_usage_is_exit_code_2(run):
         assert "Traceback" not in err
 
 
-def test_the_version_and_help_are_told(run):
+def test_version_and_help_are_printed(run):
     assert run("--version")[:2] == (0, f"emmc-rig {__version__}\n")
     code, out, _ = run("--help")
     assert code == 0
@@ -273,3 +273,23 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
     assert code == 1
     assert "No space left" in one_line(err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_export_says_what_is_missing_of_what_it_was_given(run, tmp_path):
+    assert run("simulate", "--size", "32x32", "--out", "taken")[0] == 0
+    for given, told in {
+        "taken": "holds frames, no light field; run: emmc-rig reconstruct taken",
+        "near-plana": "did you mean 'near-planar'?",
+        "nothing": "no folder or file 'nothing', and no built-in scene: known are",
+    }.items():
+        code, _, err = run("export", given, "--out", "r")
+        assert code == 1
+        assert told in one_line(err)
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("command", [["demo"], ["reconstruct", "taken"]])
+def test_a_dictionary_that_the_method_would_not_read_is_refused(run, command):
+    code, _, err = run(*command, "--dictionary", "nothing.h5")
+    assert code == 2
+    assert "no effect on --method adaptive" in err

@@ -58,7 +58,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_cluster_that_is_not_there_is_told_in_one_line(monkeypatch, tmp_path):
+def test_a_cluster_that_is_not_there_is_reported_in_one_line(monkeypatch, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     monkeypatch.setattr(pools, "CONNECT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense"):

@@ -6,7 +6,7 @@ import pytest
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.study.trial import Setup, trial_of
+from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.choices import smooth_guess
 from reconstruction.colour import chroma_of, coloured, unseen_colour
 from reconstruction.flat import flat_psi
@@ -62,7 +62,7 @@ def test_colour_filters_leave_no_colour_unseen():
 def test_more_shots_leave_less_colour_unseen():
     def unseen(shots):
         camera = find_camera("scenario-iii-mono").with_shots(shots)
-        given = trial_of(Setup("deep-occlusions", camera, SIZE, zoom=3))
+        given = trial_of(Capture("deep-occlusions", camera, SIZE, zoom=3))
         flat = flat_psi(given.psi)
         picture = smooth_guess(flat, given.readings, given.usable)
         return unseen_colour(flat, given.readings, given.usable, picture).mean()
@@ -72,7 +72,7 @@ def test_more_shots_leave_less_colour_unseen():
 
 @pytest.mark.parametrize("scene", ["deep-occlusions", "near-planar"])
 def test_the_deviation_of_colours_is_that_of_their_error(scene):
-    given = trial_of(Setup(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
+    given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
     flat, truth = flat_psi(given.psi), given.truth @ OPPONENT[1:].T
     picture = smooth_guess(flat, given.readings, given.usable)
     error = np.square(picture @ OPPONENT[1:].T - truth).sum(axis=-1).mean() / 3
@@ -81,7 +81,7 @@ def test_the_deviation_of_colours_is_that_of_their_error(scene):
 
 
 def test_coloured_light_fields_are_seen_better_than_grey_ones():
-    given = trial_of(Setup("deep-occlusions", find_camera("scenario-iii-mono"), SIZE, zoom=3))
+    given = trial_of(Capture("deep-occlusions", find_camera("scenario-iii-mono"), SIZE, zoom=3))
     flat, usable = flat_psi(given.psi), given.usable
     picture = smooth_guess(flat, given.readings, usable)
     grey = np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)

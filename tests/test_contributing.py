@@ -7,7 +7,7 @@ import numpy as np
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.study.trial import Setup
+from emmc_rig.study.trial import Capture
 from reconstruction.method import Given
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +47,7 @@ def test_the_mask_pattern_draws_stripes():
 def test_the_fault_darkens_so_much_of_the_readings():
     (fault,) = example("A fault")["FAULTS"]
     assert fault.explained.startswith("A share of the picture")
-    trial = fault.make(Setup("near-planar", find_camera("rgbw-bayer-1shot"), (20, 20)), 25)
+    trial = fault.make(Capture("near-planar", find_camera("rgbw-bayer-1shot"), (20, 20)), 25)
     assert np.mean(trial.readings == 0) >= 0.25
 
 

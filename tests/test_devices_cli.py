@@ -148,7 +148,7 @@ def test_the_rigs_own_chain_gets_the_rigs_own_names():
         ("apt", AptController, "KDC101, serial number 27000001"),
     ],
 )
-def test_probing_tells_what_answers(run, protocol, firmware, told):
+def test_probing_names_what_answers(run, protocol, firmware, told):
     with PtyServer(firmware(SYSTEM_CLOCK)) as server:
         code, out, _ = run("probe", server.port)
     assert code == 0
@@ -187,6 +187,7 @@ def test_the_udev_rule_is_printed(run):
     assert (code, out.splitlines()[-1]) == (0, 'LABEL="emmc_rig_end"')
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_what_a_command_costs_is_measured(run, tmp_path):
     code, out, _ = run("bench", "--repeats", 3, "--out", "bench")
     assert code == 0

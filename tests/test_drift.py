@@ -101,7 +101,7 @@ def left_px(found, drift, size=SIZE):
         ((0.0, 0.0, 0.0, 0.0, 0.0, 0.017, 0.0), "tilt_x"),
     ],
 )
-def test_a_drift_is_told_with_its_kind_and_mended_from_one_shot(drift, kind):
+def test_a_drift_is_reported_with_its_kind_and_mended_from_one_shot(drift, kind):
     found = found_for(drift)
     assert found.drifted
     assert left_px(found, drift) < 0.05
@@ -151,7 +151,7 @@ def test_a_mask_beyond_what_is_searched_is_refused_and_not_repaired(drift, words
     assert "shifts up to 8 pixels, turns up to 2 degrees, scales up to 3%" in found.words
 
 
-def test_a_darker_second_shot_is_told_as_brightness_and_not_as_a_move():
+def test_a_darker_second_shot_is_reported_as_brightness_and_not_as_a_move():
     found = found_for((0.0,) * 5, shots=2, gains=(1.0, 0.93))
     assert found.values["brightness_2"] == pytest.approx(-0.07, abs=0.01)
     assert not found.drifted

@@ -192,7 +192,7 @@ def test_badly_exposed_shots_are_a_doubt(shots, said):
     assert all(said in reason.what for reason in reasons)
 
 
-def test_less_light_than_metering_asks_for_is_told_with_its_true_cost_in_noise():
+def test_less_light_than_metering_asks_for_is_reported_with_its_true_cost_in_noise():
     text = AUTO.replace("auto", "0.02")
     session, _ = captured(text)
     (reason,) = exposure_reasons(shot_exposures(session))

@@ -5,6 +5,8 @@ import sys
 from numba import njit
 
 from emmc_rig.commands import first_run
+from reconstruction import kernels
+from reconstruction.adaptive import evidence, rays
 
 
 class Recorder:
@@ -42,12 +44,11 @@ def test_the_first_kernel_compiled_starts_processes_that_the_solver_waits_for(mo
         watcher.step("one")
         watcher.begin("reconstruct", None)
     assert started == [
-        [sys.executable, "-m", "emmc_rig.commands.first_run", method, "rgbw-mono", "2"]
-        for method in ("adaptive", "tv")
+        [sys.executable, "-m", "emmc_rig.commands.first_run", part, "rgbw-mono", "2"]
+        for part in ("search", "fit")
     ]
     assert recorder.seen == [
-        "scene", "step one", "compile", "waited", "waited", "reconstruct", "killed", "waited",
-        "killed", "waited",
+        "scene", "step one", "compile", *2 * ["waited"], "reconstruct", *2 * ["killed", "waited"],
     ]  # fmt: skip
     assert capsys.readouterr().err.count("compiling kernels for this machine, once") == 1
 
@@ -58,3 +59,39 @@ def test_a_run_that_compiles_nothing_starts_nothing(monkeypatch):
     with first_run.compiled_ahead(recorder, "adaptive", "rgbw-mono", None) as watcher:
         watcher.begin("reconstruct", None)
     assert recorder.seen == ["reconstruct"]
+
+
+def test_a_method_of_other_parts_is_compiled_by_one_process(monkeypatch):
+    started = []
+    monkeypatch.setattr(
+        first_run.subprocess, "Popen", lambda typed, **_: started.append(typed[3:]) or Recorder()
+    )
+
+    @njit
+    def half(x):
+        return x / 2
+
+    with first_run.compiled_ahead(Recorder(), "dict-omp", "rgbw-mono", None):
+        assert half(3.0) == 1.5
+    assert started == [["dict-omp", "rgbw-mono"]]
+
+
+def test_each_part_runs_the_kernels_that_it_is_named_after(monkeypatch):
+    ran = []
+
+    def note(module, kernel):
+        real = getattr(module, kernel)
+        monkeypatch.setattr(module, kernel, lambda *given: ran.append(kernel) or real(*given))
+
+    for module, kernel in (
+        (evidence, "evidence"), (kernels, "_sweep_band"), (rays, "_render"),
+    ):  # fmt: skip
+        note(module, kernel)
+    done = {}
+    for part in first_run.PARTS["adaptive"]:
+        first_run.compile_for(part, "rgbw-bayer-3shots", 2)
+        done[part] = set(ran)
+        ran.clear()
+    assert done == {
+        "search": {"evidence", "_sweep_band"}, "fit": {"_render"},
+    }  # fmt: skip

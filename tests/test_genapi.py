@@ -230,7 +230,7 @@ def test_texts_and_truths_are_read_and_set():
         (register("X", address=-5), "lies at"),
     ],
 )
-def test_a_description_that_cannot_be_followed_is_told_by_name(body, complaint):
+def test_a_description_that_cannot_be_followed_is_named(body, complaint):
     with pytest.raises(CameraDescriptionError, match=complaint):
         features(body).number("X")
 

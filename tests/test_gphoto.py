@@ -4,6 +4,7 @@ The simulated camera runs in a process of its own: libgphoto2 holds Python's loc
 """
 
 import json
+import os
 import subprocess
 import sys
 from contextlib import closing, contextmanager
@@ -173,10 +174,9 @@ EOS_CONTROLS = {*EosOperation} - {
 
 @pytest.mark.parametrize("age", ["new", "old"])
 def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_makes(age):
-    card = {"capturetarget": "Memory card"}
     with served(eos=age) as (name, known):
         for _ in range(2):
-            with closing(GphotoCamera(name, settings=card)) as camera:
+            with closing(GphotoCamera(name)) as camera:
                 take(camera)
     theirs = [one for one in known[1] if one[0] in EOS_CONTROLS and "1cd1" not in one[2]]
     ours = []
@@ -196,6 +196,19 @@ def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_ma
     assert theirs == [one for one in ours if one[0] in EOS_CONTROLS]
 
 
+def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(tmp_path):
+    program = (
+        "import sys; from drivers.gphoto import GphotoCamera; camera = GphotoCamera(sys.argv[1]);"
+        "camera.set_exposure_s(0.5); print(camera.snap().mosaic.shape); camera.close()"
+    )
+    home = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}
+    with served(eos="new") as (name, _):
+        ran = subprocess.run(
+            [sys.executable, "-c", program, name], env=home, capture_output=True, text=True
+        )
+    assert ran.stdout.strip() == "(40, 48)", ran.stderr
+
+
 def take(camera):
     """Set what has exactly one code, and expose."""
     camera.set_exposure_s(0.5)
@@ -205,7 +218,7 @@ def take(camera):
     assert camera.exposure_s == pytest.approx(0.5)
 
 
-def test_a_camera_set_to_jpeg_is_told_so():
+def test_a_camera_set_to_jpeg_is_refused():
     with (
         served("jpeg") as (name, _),
         closing(GphotoCamera(name)) as camera,

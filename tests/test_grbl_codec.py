@@ -117,7 +117,7 @@ def test_bytes_that_are_no_message_are_an_error_in_one_line(line, reason):
     assert "\n" not in str(caught.value)
 
 
-def test_codes_are_told_in_words():
+def test_codes_are_reported_in_words():
     assert "travel" in Refusal(15).meaning
     assert "position lost" in Alarm(1).meaning
     assert "position kept" in Alarm(2).meaning

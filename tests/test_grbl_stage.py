@@ -387,7 +387,7 @@ def test_work_offset_and_overrides_come_in_some_reports_only(bench):
     assert not any("WCO:" in report and "Ov:" in report for report in reports)
 
 
-def test_settings_are_told_line_by_line(bench):
+def test_settings_are_reported_line_by_line(bench):
     lines = bench.say(b"$$\n").splitlines()
     assert "$110=480.000" in lines
     assert "$130=25.400" in lines

@@ -15,7 +15,7 @@ def one_noise(monkeypatch):
 
 
 def test_a_figure_that_fell_fails_and_is_named(run, one_noise, monkeypatch, tmp_path):
-    key = guard.cases(["near-planar"], (32, 40))[0].key
+    key = guard.key(guard.cases(["near-planar"], (32, 40))[0])
     monkeypatch.setattr(guard, "stored_figures", lambda: {key: 99.0})
     code, out, err = run(*SMALL)
     assert code == 1
@@ -38,7 +38,7 @@ def test_without_a_stored_figure_nothing_fails_and_the_row_says_so(run, one_nois
 def test_every_built_in_case_has_a_stored_figure(monkeypatch):
     monkeypatch.delenv("EMMC_LIGHTFIELDS", raising=False)
     stored = guard.stored_figures()
-    assert {case.key for case in guard.cases()} <= set(stored)
+    assert {guard.key(case) for case in guard.cases()} <= set(stored)
 
 
 def test_real_light_fields_are_measured_where_they_are(monkeypatch, tmp_path):

@@ -33,7 +33,7 @@ def checks(drift=0.0, bend=0.0, noise=0.0, seed=0):
     return found
 
 
-def test_drift_and_bend_are_told_apart_and_taken_out():
+def test_drift_and_bend_are_separated_and_taken_out():
     levels = fit_levels(checks(drift=0.02, bend=0.01, noise=5e-5))
     assert levels is not None
     assert levels.drifting
@@ -101,7 +101,7 @@ def open_board(psi, radiance, noise, rng):
     )  # fmt: skip
 
 
-def test_a_board_turned_tells_its_unevenness_from_the_cameras():
+def test_a_turned_board_separates_its_unevenness_from_the_cameras():
     psi, rng = random_psi(), np.random.default_rng(1)
     v = np.linspace(-1, 1, 5)
     true = 1 + 0.03 * v + 0.02 * v[:, None] + 0.01 * (v**2 - v[:, None] ** 2)

@@ -175,7 +175,7 @@ def test_frames_follow_each_other_and_wishes_are_carried_out_between_them():
         until(watch, lambda state: not state["trouble"]["setting"])
 
 
-def test_a_camera_in_trouble_is_told_and_asked_again(monkeypatch):
+def test_a_camera_in_trouble_is_reported_and_asked_again(monkeypatch):
     monkeypatch.setattr(watch_module, "RETRY_S", 0.01)
     camera = FakeCamera()
     with watching(camera) as watch:
@@ -441,7 +441,7 @@ def test_the_page_its_state_and_its_pictures_are_served():
         assert b"emmc-rig live" in page
         assert b"http://" not in page
         assert b"https://" not in page
-        for name in ("common.js", "field.js", "page.js", "page.css"):
+        for name in SetupPage.files[1:]:
             assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
         status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
@@ -552,8 +552,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
 
 def test_there_are_no_views_without_a_light_field():
     with watching(FakeCamera()) as watch, served(watch) as ask:
-        assert ask("GET", f"/{TOKEN}/views.jpg")[0] == 503
-        assert ask("GET", f"/{TOKEN}/disparity.png")[0] == 503
+        assert ask("GET", f"/{TOKEN}/light-field.json")[0] == 503
 
 
 def program(*arguments):
@@ -593,14 +592,14 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         (("--rig", "simulated", "--size", "32x48", "--psi", "nowhere"), 1, "no Psi"),
     ],
 )
-def test_bad_arguments_are_told_in_one_line(arguments, code, told, capsys):
+def test_bad_arguments_are_reported_in_one_line(arguments, code, told, capsys):
     assert exit_code("live", *arguments) == code
     shown = capsys.readouterr().err
     assert told in shown.replace("\n", " ")
     assert "Traceback" not in shown
 
 
-def test_a_port_in_use_is_told(capsys):
+def test_a_port_in_use_is_reported(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert exit_code("live", "--rig", "simulated", "--port", port) == 1

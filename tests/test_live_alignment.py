@@ -7,6 +7,7 @@ import pytest
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.live import focus
 from emmc_rig.live.alignment import MaskGauge, grid_direction
 from emmc_rig.live.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.model.camera import shipped_cameras
@@ -156,3 +157,24 @@ def test_a_blurred_picture_is_less_sharp_than_the_best_until_that_is_forgotten()
     assert later["share"] > 0.8
     meter.forget()
     assert meter.add(noisy(2.0, 5), REMEMBERED_S + 3) is None
+
+
+def test_what_was_seen_may_be_forgotten_while_the_best_of_it_is_looked_for(monkeypatch):
+    meter = FocusMeter()
+
+    class Forgetful:
+        """A sharpness that, when it is looked at, makes the meter forget, as another thread may."""
+
+        deviation = 0.1
+
+        @property
+        def value(self):
+            meter.forget()
+            return 1.0
+
+    monkeypatch.setattr(focus, "sharpness", lambda *_: Forgetful())
+    frame = noisy(1.0, 0)
+    meter._before = frame
+    told = meter.add(frame, 1.0)
+    assert told is not None
+    assert told["share"] == 1.0

@@ -3,15 +3,18 @@
 import re
 
 import pytest
-from browsers import MARKS, open_browser
+from browsers import MARKS, complaints, open_browser
 
+from emmc_rig.capture.control import Control
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.scale import designed_scale
 from emmc_rig.live.server import application, served
+from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
+from emmc_rig.pages.page import source
 from emmc_rig.rig.hardware import simulated_rig
 from simulators.bench import MountingErrors
 
@@ -25,7 +28,8 @@ from selenium.webdriver.support.ui import WebDriverWait
 pytestmark = MARKS
 
 TOKEN = "a-secret"
-PATIENCE_S = 30
+PATIENCE_S = 60
+WIDTH = "return document.getElementById('viewer-picture').width"
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +94,7 @@ def click(driver, css):
 
 def place_um(driver, axis):
     found = re.search(
-        r"-?[\d.]+(?= um)", driver.find_element(By.CSS_SELECTOR, f"tr[data-axis={axis}]").text
+        r"-?[\d.]+(?= \u00b5m)", driver.find_element(By.CSS_SELECTOR, f"tr[data-axis={axis}]").text
     )
     return float(found.group()) if found else float("nan")
 
@@ -123,18 +127,33 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     assert stretched == pytest.approx(0.2, abs=0.1)
     click(page, "#targets button:nth-child(1)")
     click(page, "[data-show=views]")
-    field = page.find_element(By.ID, "field")
+    field = page.find_element(By.ID, "viewer")
     wait(page, lambda: int(field.get_attribute("data-number") or 0) > 0)
-    wait(page, lambda: "as `reconstruct`" in text(page, "field-stage"))
+    turned = page.find_element(By.ID, "viewer-picture")
+    ActionChains(page).drag_and_drop_by_offset(turned, -60, 0).perform()
+    turned.send_keys("+", "+")
+    looked = text(page, "viewer-status").split(";")[0]
+    assert looked != "View v 2.00, u 2.00"
+    wait(page, lambda: "as emmc-rig reconstruct" in text(page, "field-stage"))
     assert re.search("trust|cannot tell|doubt|do not use", text(page, "field-stage"))
-    before = text(page, "focused")
-    ActionChains(page).move_to_element_with_offset(field, 60, 40).perform()
-    wait(page, lambda: text(page, "focused") != before)
-    field.send_keys("+")
-    wait(page, lambda: text(page, "focused").startswith("focus at"))
-    click(page, "[data-show=depth]")
-    wait(page, lambda: "px per view" in text(page, "focused") or "decided" in text(page, "focused"))
-    assert page.get_log("browser") == []
+    # The reconstruction takes the preview's place, seen from where the hand had turned it.
+    wait(page, lambda: page.execute_script(WIDTH) == 64)
+    assert text(page, "viewer-status").split(";")[0] == looked
+    assert text(page, "viewer-aperture-value") == "0.50"
+    assert field.get_attribute("data-renderer") == "WebGL2"
+    click(page, "#viewer-overlays label:nth-of-type(2) input")
+    assert "readings missed" in text(page, "viewer-overlays")
+    wait(page, lambda: page.find_element(By.ID, "viewer-legend").is_displayed())
+    assert complaints(page) == []
+
+
+def test_the_viewer_of_the_page_is_that_of_the_reports(page):
+    served = page.execute_async_script(
+        "const done = arguments[0];"
+        "Promise.all(['viewer.js', 'viewer.css'].map(async (one) => (await fetch(one)).text()))"
+        ".then(done)"
+    )
+    assert served == [str(source(name)) for name in ("viewer.js", "viewer.css")]
 
 
 def test_keys_stop_jog_and_expose_and_a_button_keeps_the_focus(page, rig):
@@ -179,6 +198,12 @@ def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page, widt
             " || one.getAttribute('aria-label') || one.labels?.length)).map((one) => one.outerHTML)"
         )
         assert nameless == []
+        low = page.execute_script(
+            "return innerWidth > 500 ? [] : [...document.querySelectorAll('button, summary')]"
+            ".filter((one) => one.offsetParent && one.getBoundingClientRect().height < 36)"
+            ".map((one) => one.outerHTML)"
+        )
+        assert low == []  # a finger hits them
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
@@ -214,7 +239,7 @@ def test_zoom_view_and_exposure_answer(page, rig):
     wait(page, lambda: rig.camera.exposure_s == pytest.approx(0.04))
 
 
-def test_what_is_refused_is_told_on_the_page(page):
+def test_what_is_refused_is_reported_on_the_page(page):
     step = page.find_element(By.ID, "step")
     step.clear()
     step.send_keys("ten")
@@ -229,4 +254,30 @@ def test_what_is_refused_is_told_on_the_page(page):
 def test_a_wrong_token_is_refused(browser, address):
     browser.get(address.replace(TOKEN, "guess"))
     assert "wrong token" in browser.find_element(By.TAG_NAME, "body").text
+    browser.get_log("browser")
+
+
+def test_a_refusal_floats_over_the_page_and_can_be_hidden(page):
+    click(page, "#centre")
+    wait(page, lambda: text(page, "busy") == "")
+    where = page.find_element(By.ID, "home").location
+    page.execute_script("act('jog', { axis: 'mask_x', distance_um: 1e9 })")
+    wait(page, lambda: "mask_x cannot go to" in text(page, "trouble"))
+    assert page.find_element(By.ID, "home").location == where
+    click(page, "#trouble-close")
+    assert not page.find_element(By.ID, "trouble").is_displayed()
+    page.execute_script("act('jog', { axis: 'mask_x', distance_um: 1e9 })")
+    wait(page, lambda: "mask_x cannot go to" in text(page, "trouble"))
+
+
+def test_a_lost_connection_says_so_and_what_to_do(browser, tmp_path):
+    shown = SessionPage(tmp_path / "session", Control(), computes=False)
+    with served(application(shown, TOKEN)) as port:
+        browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
+        wait(browser, lambda: text(browser, "count") == "no frame yet")
+        assert "waiting for the first frame" in text(browser, "stage")
+    wait(browser, lambda: "No connection since" in text(browser, "trouble"))
+    assert "start it again" in text(browser, "trouble")
+    browser.execute_script("act('pause')")
+    wait(browser, lambda: "pause: the program does not answer" in text(browser, "trouble"))
     browser.get_log("browser")

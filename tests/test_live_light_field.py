@@ -1,5 +1,6 @@
 """The light field while the camera watches: coarse at once, `reconstruct`'s own once all stands."""
 
+import json
 import time
 
 import numpy as np
@@ -178,10 +179,25 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
     )
     assert np.abs(refined[0].light_field - expected.light_field).max() < 1e-5
     assert told["verdict"]["level"] == expected.verdict.level
-    assert "as `reconstruct`" in told["stage"]
+    assert "as emmc-rig reconstruct" in told["stage"]
     shown = live.pictures()
     assert shown is not None
-    assert shown.sheet.shape == (5 * SIZE[0], 5 * SIZE[1], 3)
+    assert shown.export.light_field is refined[0].light_field
+    drawn = json.loads(shown.encoded())
+    assert drawn["scale"] == 1
+    (missed,) = drawn["overlays"]
+    assert missed["label"] == "readings missed"
+
+
+def test_a_preview_states_disparities_in_the_cameras_samples(one_shot):
+    camera, psi, scene = one_shot
+    live = LiveLightField(designed_scale(psi), "tv", clock=Seconds())
+    live.update(live_frames(camera, psi, scene)[0])
+    shown = live.pictures()
+    assert shown is not None
+    given = json.loads(shown.encoded())
+    assert given["views"]["width"] == SIZE[1] // 4
+    assert given["scale"] == 1 / 4
 
 
 def test_noise_is_no_change_and_a_changed_scene_ends_the_reconstruction(one_shot):

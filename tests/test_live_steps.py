@@ -81,7 +81,7 @@ def test_without_a_focus_axis_it_is_said_why_and_what_to_do():
     _, rig, centre_um = lit_rig()
     with watching(rig.camera, rig.stage, None, (), centre_um) as watch:
         state = until(watch, lambda state: state["steps"])
-        with pytest.raises(AppError, match="no axis `focus`"):
+        with pytest.raises(AppError, match="no axis named focus"):
             watch.autofocus(100.0)
         step = next(one for one in state["steps"] if one["name"] == "focus")
         assert "by hand" in step["text"]

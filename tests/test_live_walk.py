@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from browsers import MARKS, open_browser
+from browsers import MARKS, complaints, open_browser
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException
@@ -33,6 +33,8 @@ def pictured(driver, name):
     for size, width in WIDTHS.items() if folder else ():
         at = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
         driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at)
+        driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": size == "phone"})
+        driver.execute_script("scrollTo(0, 0)")
         # Two frames of the browser: the page is laid out and painted anew.
         driver.execute_async_script(
             "const end = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(end))"
@@ -42,6 +44,7 @@ def pictured(driver, name):
         file = Path(str(folder)) / f"{name}-{size}.webp"
         assert cv2.imwrite(str(file), seen, [cv2.IMWRITE_WEBP_QUALITY, 60])
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
 
 
 def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
@@ -104,12 +107,15 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
             wait(lambda: "+  - exposure_s: " in text("#diff"))
             click("#save")
             wait(lambda: "wrote plan.yaml" in text("#saved"))
+            assert text("#saved").endswith("next: emmc-rig capture plan.yaml --rig simulated")
+            assert not driver.find_element(By.ID, "diff").is_displayed()
             click("[data-show=views]")
             wait(lambda: "adaptive: " in text("#field-stage"))
-            assert "as `reconstruct`" in text("#field-stage")
+            assert "as emmc-rig reconstruct" in text("#field-stage")
             assert re.search("trust|doubt|do not use", text("#field-stage"))
+            wait(lambda: driver.find_element(By.ID, "viewer").get_attribute("data-complete"))
             pictured(driver, "light-field")
-            assert driver.get_log("browser") == []
+            assert complaints(driver) == []
         finally:
             running.send_signal(signal.SIGINT)
     assert running.wait(PATIENCE_S) == 0

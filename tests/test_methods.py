@@ -7,8 +7,13 @@ import textwrap
 
 import pytest
 
+from reconstruction.adaptive.settings import AdaptiveSettings, fast
+from reconstruction.dictionary import usual_patch
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
+from reconstruction.methods.surfaces import sparse_patches, takes_patches
+from reconstruction.patches import regular_grid
+from reconstruction.sparse import SparseSettings
 
 MEAN_PICTURE = textwrap.dedent('''
     """The method `mean`: one grey for all, from the mean reading."""
@@ -82,3 +87,21 @@ def test_every_method_finds_its_part_of_the_settings():
 
 def test_the_default_method_needs_no_dictionary():
     assert not find_method(DEFAULT_METHOD).needs_dictionary
+
+
+@pytest.mark.parametrize(
+    ("shots", "size", "binning", "takes"),
+    [(1, (24, 24), 1, False), (2, (24, 24), 1, True), (2, (8, 24), 1, False), (2, (8, 8), 2, True)],
+)
+def test_adaptive_takes_patches_from_two_shots_where_one_fits(
+    random_psi, shots, size, binning, takes
+):
+    psi = random_psi(shots, (2, 2), size, binning=binning)
+    assert takes_patches(psi, AdaptiveSettings()) == takes
+    assert not takes_patches(psi, fast(AdaptiveSettings()))
+
+
+@pytest.mark.parametrize("binning", range(1, 18))
+def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(binning):
+    stride = sparse_patches(SparseSettings(), binning).stride
+    assert len(regular_grid((20 * binning,) * 2, usual_patch(binning), stride, binning)) > 1

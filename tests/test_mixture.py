@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from reconstruction.adaptive.mixture import excess, mean_light_field, shares_of, spread
+from reconstruction.adaptive.mixture import (
+    HIDDEN,
+    PATCHES_POWER,
+    beside_patches,
+    excess,
+    mean_light_field,
+    shares_of,
+    spread,
+)
 
 SHAPE, NOISE = (2, 60, 80), 1e-6
 
@@ -40,6 +48,22 @@ def test_models_that_miss_no_more_than_the_noise_weigh_alike(held):
     share = shares_of(misses(0.0, 0.0), noise(), held)
     assert np.abs(share - 0.5).max() < 0.45
     assert np.abs(share.mean(axis=(1, 2)) - 0.5).max() < 0.2
+
+
+def test_surfaces_that_err_alike_count_once_beside_patches(held):
+    surfaces, patches = misses(0.01, 0.01)
+    share = beside_patches([surfaces, surfaces, patches], noise(), held)
+    np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-5)
+    np.testing.assert_allclose(share[0], share[1], rtol=1e-5)
+    odds = np.median(share[2] / (share[0] + share[1]))
+    assert odds == pytest.approx(HIDDEN**PATCHES_POWER, rel=0.3)
+
+
+@pytest.mark.parametrize(("surface", "patch"), [(0.02, 0.01), (0.01, 0.02)])
+def test_surfaces_or_patches_of_half_the_error_take_nearly_all(held, surface, patch):
+    surfaces, patches = misses(surface, patch)
+    share = beside_patches([surfaces, patches], noise(), held)
+    assert share[int(patch < surface)].min() > 0.9
 
 
 def test_the_mean_of_light_fields_follows_the_shares_of_pixels():

@@ -1,11 +1,16 @@
 """What napari opens: layers of a light field, a Psi and a session; and the plug-in's manifest."""
 
 import importlib
+import json
 import os
+import shutil
 import subprocess
 import sys
+import time
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -31,6 +36,43 @@ viewer.open(sys.argv[1], plugin="emmc-rig")
 print(len(viewer.layers), viewer.dims.axis_labels, viewer.dims.nsteps)
 viewer.dims.set_current_step(1, 4)
 print(viewer.layers[0].get_value((3, 4, 2, 10, 20)))
+"""
+WINDOW = """
+import json
+import sys
+import napari
+import npe2
+import numpy as np
+from qtpy.QtWidgets import QApplication
+plugins = npe2.PluginManager.instance()
+if "emmc-rig" not in plugins:
+    plugins.register(npe2.PluginManifest.from_file(sys.argv[1]))
+folder, *paths = sys.argv[2:]
+
+def seen(viewer):
+    for _ in range(20):
+        QApplication.processEvents()
+    return viewer.screenshot(canvas_only=True, flash=False)[..., :3]
+
+told = []
+for number, path in enumerate(paths):
+    viewer = napari.Viewer(show=True)
+    viewer.open(path, plugin="emmc-rig")
+    sliders = viewer.window._qt_viewer.dims.slider_widgets
+    shown = {"sliders": [one.axis_label.text() for one in sliders if one.isVisible()]}
+    pictures = {"opened": seen(viewer)}
+    if "focus" in shown["sliders"]:
+        sliders[1].slider.setValue(4)
+        sliders[2].slider.setValue(0)
+        pictures["view"] = seen(viewer)
+        viewer.layers[1].visible = True
+        sliders[0].slider.setValue(20)
+        pictures["focused"] = seen(viewer)
+        shown["focused"] = viewer.layers[1].metadata["disparities_px"][20]
+    np.savez(f"{folder}/{number}.npz", **pictures)
+    told.append(shown)
+    viewer.close()
+print(json.dumps(told))
 """
 
 
@@ -127,3 +169,62 @@ def test_napari_opens_a_result_without_a_screen(result, scene):
     assert all(f"'{name}'" in count for name in AXES)
     shown = np.array(value.strip("[]").split(), float)
     np.testing.assert_allclose(shown, srgb_of(scene.light_field[4, 2, 10, 20]), atol=1e-5)
+
+
+@contextmanager
+def screen(folder):
+    """Yield the environment of a screen with OpenGL that nobody looks at."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("napari's window draws by OpenGL: needs Xvfb on PATH")
+    with (folder / "display").open("w+b") as name:
+        server = subprocess.Popen(
+            ["Xvfb", "-displayfd", str(name.fileno()), "-screen", "0", "1400x900x24"],
+            pass_fds=[name.fileno()],
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            while not (shown := (folder / "display").read_text().strip()):
+                assert server.poll() is None
+                time.sleep(0.05)
+            yield {**os.environ, "DISPLAY": f":{shown}", "QT_QPA_PLATFORM": "xcb"}
+        finally:
+            server.terminate()
+            server.wait()
+
+
+def pictured(canvas, size):
+    """What a canvas shows, without the black around it, as a picture of that size."""
+    rows, columns = (np.flatnonzero((canvas.max(axis=2) > 9).any(axis=axis)) for axis in (1, 0))
+    cut = canvas[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return cv2.resize(cut.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA)
+
+
+def test_naparis_window_shows_views_refocus_psi_and_session_by_sliders(result, scene, tmp_path):
+    pytest.importorskip("napari", reason="extra `napari`")
+    pytest.importorskip("qtpy", reason="a window needs Qt: extra `napari`")
+    emmc.camera("rgbw-bayer-2shots").psi(SIZE).save(tmp_path / "psi.h5")
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("{camera: rgbw-bayer-2shots, shots: [{}, {}], whiteboards: null, darks: null}")
+    session = emmc.capture(plan, emmc.rig("simulated", scene="near-planar", size=SIZE, rays=16))
+    paths = [str(one) for one in (result, tmp_path / "psi.h5", session.folder)]
+    with screen(tmp_path) as environment:
+        done = subprocess.run(
+            [sys.executable, "-c", WINDOW, str(MANIFEST), str(tmp_path), *paths],
+            env=environment, capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+    if "no Qt platform plugin could be initialized" in done.stderr:
+        pytest.skip("Qt cannot open a window here: its xcb plug-in lacks libraries")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert [one["sliders"] for one in told] == [
+        ["focus", "v", "u"], ["shot", "v", "u"], ["frame"],
+    ]  # fmt: skip
+    drawn = [dict(np.load(tmp_path / f"{number}.npz")) for number in range(3)]
+    view = pictured(drawn[0]["view"], SIZE) - 255 * srgb_of(scene.light_field[4, 0])
+    assert np.abs(view).mean() < 3
+    other = pictured(drawn[0]["opened"], SIZE) - 255 * srgb_of(scene.light_field[4, 0])
+    assert np.abs(other).mean() > 10
+    focused = srgb_of(refocus(scene.light_field, told[0]["focused"]))
+    assert np.abs(pictured(drawn[0]["focused"], SIZE) - 255 * focused).mean() < 3
+    for one in drawn[1:]:
+        assert one["opened"].std() > 10

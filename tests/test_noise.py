@@ -121,7 +121,7 @@ def test_the_variance_of_a_reading_below_black_is_that_of_a_dark_one():
     )
 
 
-def test_a_pixel_that_no_light_reaches_reads_0_and_tells_nothing():
+def test_a_pixel_that_no_light_reaches_reads_0_and_has_no_weight():
     sensor = SensorNoise()
     light = np.array([1.0, 0.0])
     dn = sensor.expose_dn(np.array([0.5, 0.0]), EXPOSURE_S, light, np.random.default_rng(6))

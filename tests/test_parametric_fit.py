@@ -228,7 +228,7 @@ def test_registration_finds_a_mask_that_sits_far_off(design, x, y, turn_deg):
     assert found.correlation > 0.6
 
 
-def test_flicker_and_a_moved_stage_are_told_by_the_board_that_has_them(design):
+def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
     boards = synthetic(design, truth)
     flickered = replace(boards[1], reading=(boards[1].reading * 1.05).astype(np.float32))
@@ -320,7 +320,7 @@ def test_the_expected_error_of_psi_is_the_error_of_psi(design):
 
 def test_frames_of_another_camera_are_refused(few, design):
     cut = [
-        BoardFrame(replace(one.frame, mean_dn=one.frame.mean_dn[:-2]), one.stage_um, one.shot)
+        BoardFrame.held(replace(one.frame, mean_dn=one.frame.mean_dn[:-2]), one.stage_um, one.shot)
         for one in few.frames
     ]
     with pytest.raises(CalibrationError, match="42 x 60 pixels, the camera has 44 x 60"):
@@ -329,10 +329,10 @@ def test_frames_of_another_camera_are_refused(few, design):
 
 def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
     dark = few.dark_at(few.frames[0].frame.exposure_s)
-    off = BoardFrame(replace(few.frames[0].frame, mean_dn=dark.mean_dn), (0.0, 0.0))
+    off = BoardFrame.held(replace(few.frames[0].frame, mean_dn=dark.mean_dn), (0.0, 0.0))
     with pytest.raises(CalibrationError, match="is the lamp on, and the aperture open"):
         as_readings(few.with_frames([off]), design.layout)
-    red = BoardFrame(few.frames[0].frame, (0.0, 0.0), lamp="amber")
+    red = BoardFrame.held(few.frames[0].frame, (0.0, 0.0), lamp="amber")
     with pytest.raises(CalibrationError, match="no reference whiteboard under that lamp"):
         as_readings(few.with_frames([red]), design.layout)
     with pytest.raises(CalibrationError, match="no dark frame"):

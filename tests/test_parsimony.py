@@ -92,7 +92,7 @@ def test_grey_psi_is_psi_of_grey_light_fields(random_psi):
         np.testing.assert_allclose(grey_psi(psi).forward(only), psi.forward(field), rtol=1e-5)
 
 
-def test_a_grey_plane_is_modelled_as_one_and_told(bayer):
+def test_a_grey_plane_is_modelled_as_one_and_reported(bayer):
     truth, _ = plane_scene(bayer, 0.7)
     grey = np.repeat(truth.mean(axis=-1, keepdims=True), 3, axis=-1).astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 0.003, bayer.frames_shape)

@@ -74,7 +74,7 @@ def test_each_frame_is_the_one_just_exposed(bench):
     assert names == ["EMMC0001.DNG", "EMMC0002.DNG", "EMMC0003.DNG"]
 
 
-def test_the_first_frame_tells_the_size_and_colours(bench):
+def test_size_and_colours_follow_from_the_first_frame(bench):
     camera = bench.open()
     assert camera.shape == SHAPE
     assert camera.cfa == "rggb"
@@ -132,7 +132,7 @@ def test_gain_is_iso_over_the_lowest_and_acts_above_the_black_level(bench):
     assert (frame.mosaic == 64 + 4 * 100).all()
 
 
-def test_the_camera_tells_its_time_and_battery(bench):
+def test_the_camera_reports_its_time_and_battery(bench):
     camera = bench.open()
     first, second = camera.snap(), camera.snap()
     assert second.camera_time_s >= first.camera_time_s > 1.7e9
@@ -146,7 +146,7 @@ def test_pictures_arrive_whole_with_or_without_parts(partial, packet_size):
     bench.snap_is_good(bench.open())
 
 
-def test_progress_is_told_to_the_end(bench):
+def test_progress_is_reported_to_the_end(bench):
     seen = []
     bench.settings = PtpSettings(part_bytes=4000)
     camera = bench.open()
@@ -164,7 +164,7 @@ def test_of_a_pair_the_raw_file_is_taken():
         assert bench.snap_is_good(camera).metadata["name"] == f"EMMC000{number}.DNG"
 
 
-def test_a_camera_set_to_jpeg_is_told_what_to_set():
+def test_a_camera_set_to_jpeg_is_refused_with_what_to_set():
     bench = Bench(quality="jpeg")
     with pytest.raises(CaptureError, match=r"EMMC0001\.JPG: set its image quality to RAW"):
         bench.open().snap()
@@ -191,7 +191,7 @@ def test_pictures_stay_on_the_card_unless_they_are_to_go():
         ("noname", "", 0xB101, False),
     ],
 )
-def test_raw_files_are_told_by_format_or_name(name, kind, format_, raw):
+def test_raw_files_are_recognised_by_format_or_name(name, kind, format_, raw):
     assert is_raw(ObjectInfo(1, format_, 100, 0, name)) is raw
 
 

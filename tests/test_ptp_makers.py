@@ -144,7 +144,7 @@ def test_a_setting_that_the_camera_does_not_take_is_seen_in_what_it_says(eos):
         assert camera.exposure_s == before_s
 
 
-def test_a_camera_that_sends_pictures_to_the_computer_is_told_to_use_its_card():
+def test_a_camera_that_sends_pictures_to_the_computer_is_set_to_use_its_card():
     bench = Bench(EosCameraSimulator)
     destination = EosProperty.CAPTURE_DESTINATION
     bench.body._codes[destination] = 4

@@ -106,7 +106,7 @@ def test_events_of_a_session_that_left_are_not_given_to_the_next(server):
         events.read()
 
 
-def test_a_second_initiator_is_told_that_the_camera_is_busy(server):
+def test_a_second_initiator_hears_that_the_camera_is_busy(server):
     command, number = connect(server)
     second = Connection(server, ptpip.INIT_COMMAND, bytes(16) + b"t\0\0\0")
     assert second.read() == (ptpip.INIT_FAIL, struct.pack("<I", ptpip.BUSY))

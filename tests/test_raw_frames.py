@@ -205,7 +205,7 @@ def test_what_a_dng_cannot_hold_is_refused(mosaic, arguments, complaint):
         encode_dng(mosaic, **(options | arguments))
 
 
-def test_a_camera_exposes_for_the_time_it_was_told():
+def test_a_camera_exposes_for_the_time_that_was_set():
     clock = ManualClock()
     asked_s = []
 

@@ -102,7 +102,7 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
         reconstruct_folder(frames, tmp_path, "dict-omp", dictionary_spec=str(tmp_path / "small.h5"))
 
 
-def test_a_misspelt_method_is_told_first(tmp_path):
+def test_a_misspelt_method_is_reported_first(tmp_path):
     with pytest.raises(ReconstructionError, match="did you mean 'tv'"):
         reconstruct_folder(tmp_path, tmp_path, "tvv")
 

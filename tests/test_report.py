@@ -1,5 +1,6 @@
 import base64
 import json
+import math
 import os
 import re
 from dataclasses import replace
@@ -10,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.pages.display import DisplayCurve
+from emmc_rig.pages.display import HEAT, DisplayCurve
+from emmc_rig.pages.page import Head
 from emmc_rig.pages.report import ReportContent, render, write_report
 
 VIEWS, HEIGHT, WIDTH = 5, 48, 64
@@ -185,7 +187,6 @@ def test_headline_figures_are_written_with_their_units(content):
 
 
 def test_the_verdict_comes_first_with_what_to_do_next(content):
-    assert 'aria-label="Verdict"' not in render(content)
     reasons = [{"level": "doubt", "what": "shots differ", "remedy": "capture shot 2 again"}]
     verdict = {"level": "doubt", "reasons": reasons}
     page = render(replace(content, metrics={**content.metrics, "verdict": verdict}))
@@ -194,6 +195,46 @@ def test_the_verdict_comes_first_with_what_to_do_next(content):
         for words in ('aria-label="Verdict"', "shots differ", "capture shot 2 again", "20.00 dB")
     ]
     assert places == sorted(places)
+
+
+@pytest.mark.parametrize("metrics", [{"verdict": {"level": "trust", "reasons": []}}, {}])
+def test_a_result_with_nothing_against_it_says_what_to_use_it_for(content, metrics):
+    page = render(replace(content, metrics=metrics, source="my results/one"))
+    head = page[page.index("What to do next") : page.index("</aside>")]
+    assert "<code>emmc-rig export &#39;my results/one&#39;</code>" in head
+    assert "<code>emmc-rig figure &#39;my results/one&#39;</code>" in head
+
+
+def test_the_verdicts_remedy_stands_alone(content):
+    reasons = [{"level": "doubt", "what": "shots differ", "remedy": "capture shot 2 again"}]
+    metrics = {"verdict": {"level": "doubt", "reasons": reasons}}
+    page = render(replace(content, metrics=metrics, source="result"))
+    head = page[page.index("What to do next") : page.index("</aside>")]
+    assert "emmc-rig figure" not in head
+
+
+def test_the_head_of_a_page_must_say_what_to_do_next():
+    with pytest.raises(ValueError, match="what to do next"):
+        Head("trust", "all agree", [])
+
+
+def test_commands_in_the_head_are_code_and_its_words_are_escaped(content):
+    reasons = [{"level": "doubt", "what": "<b>", "remedy": "run `a <b> c`, see <i>"}]
+    page = render(replace(content, metrics={"verdict": {"level": "doubt", "reasons": reasons}}))
+    assert "run <code>a &lt;b&gt; c</code>, see &lt;i&gt;" in page
+
+
+def test_the_stages_are_bars_as_long_as_their_seconds(content):
+    page = render(replace(content, stage_s={"one": 1.0, "two": 4.0, "lost": math.nan}))
+    bars = re.findall(r'<th scope="row">(\w+)</th><td><i style="width: ([\d.]+)%"></i></td>', page)
+    assert bars == [("one", "25.0"), ("two", "100.0"), ("lost", "0.0")]
+    assert "1.00 s (20%)" in page
+    assert "not a number" in page
+
+
+def test_the_heat_bar_has_the_colours_of_the_pictures(content):
+    stops = ", ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in HEAT)
+    assert f".bar .heat {{ background: linear-gradient(90deg, {stops}); }}" in render(content)
 
 
 def test_values_that_are_not_finite_in_the_estimate_are_counted(content):

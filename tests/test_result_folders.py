@@ -252,7 +252,7 @@ def test_whatever_ends_a_command_anywhere_the_folder_is_one_whole_result(
     assert at > 20
 
 
-def test_an_edit_after_a_kill_between_two_moves_is_kept_and_told(out):
+def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out):
     with pytest.MonkeyPatch.context() as patch:
         moves = []
 

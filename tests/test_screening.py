@@ -7,7 +7,8 @@ import pytest
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import Point
+from emmc_rig.study.trial import Capture
 from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.neighbour_kernels import neighbour_range
@@ -18,7 +19,7 @@ CAMERA = find_camera("rgbw-bayer-3shots")
 
 
 def made(name, strength, camera=CAMERA, scene="near-planar"):
-    return trial(FAULTS[name], strength, scene, camera, SIZE, zoom=3)
+    return Point(Capture(scene, camera, SIZE, zoom=3), name, strength).trial()
 
 
 def screen(one):
@@ -174,3 +175,20 @@ def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():
     seen = screen(made("exposure", 5, scene="deep-occlusions"))
     assert np.isfinite(seen.frames).all()
     assert (seen.gains == 1).all()
+
+
+def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
+    one = made(None, 0.0)
+    plain = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
+    glint, hot = (20, 30), (30, 20)
+    assert not plain[glint]
+    assert not plain[hot]
+    frames = one.readings.copy()
+    frames[(slice(None), *glint)] *= 8
+    frames[(slice(None), *hot)] += 0.5
+    found = bad_pixels(flat_psi(one.psi), frames, one.usable)
+    assert not found[glint]
+    assert found[hot]
+    alone = one.usable.copy()
+    alone[1:] = False
+    assert bad_pixels(flat_psi(one.psi), frames, alone)[glint], "one shot cannot tell"

@@ -63,7 +63,7 @@ def test_the_full_well_is_where_every_pixel_is_full_whatever_the_steps_of_exposu
     assert sheet.dynamic_range_db == pytest.approx(expected, abs=0.5)
 
 
-def test_the_pixels_own_differences_are_told_from_noise_and_from_the_lamp(sheet):
+def test_the_pixels_own_differences_are_separated_from_noise_and_lamp(sheet):
     for one, scale, truth in ((sheet.prnu, 100, 1.0), (sheet.dsnu, 1, 1.5)):
         value, deviation = one.figure("total", scale)
         assert abs(value - truth) < 4 * deviation
@@ -82,7 +82,7 @@ def test_the_stated_deviation_of_dsnu_is_that_of_repeated_measurements():
     assert 0.5 < np.std(values, ddof=1) / np.mean(stated) < 1.8
 
 
-def test_rows_and_columns_are_told_from_pixels_and_a_pattern_stands_in_the_spectrogram(sheet):
+def test_rows_and_columns_are_separated_from_pixels_and_a_pattern_stands_in_the_spectrogram(sheet):
     rng = np.random.default_rng(3)
     rows, columns = rng.normal(0, 3.0, (SIZE[0], 1)), rng.normal(0, 2.0, (1, SIZE[1]))
     columns = columns + 4.0 * np.sqrt(2) * np.sin(2 * np.pi * np.arange(SIZE[1]) / 16)

@@ -1,7 +1,9 @@
 """The page of a running capture, and what it does to it: pause, retake, edit the plan, finish."""
 
+import http.client
 import json
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -13,6 +15,8 @@ from emmc_rig.capture.command import capture_session
 from emmc_rig.capture.control import Control
 from emmc_rig.capture.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError
+from emmc_rig.live import server
+from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.session.session import Session
 
@@ -179,7 +183,42 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     assert told["shots"] == [2, 2]
     assert "states" in told["stage"]
     assert told["pictures"]["views"] == [5, 5]
-    wanted = page.pictures["views.jpg"]({})
+    wanted = page.pictures["light-field.json"]({})
     assert wanted is not None
-    assert wanted.make()[:2] == b"\xff\xd8"
+    given = json.loads(wanted.make())
+    assert given["views"] == {"rows": 5, "columns": 5, "height": 32, "width": 40}
+    assert {one["key"] for one in given["overlays"]} >= {"disparity", "sigma"}
     assert page.state()["ended"]
+
+
+def test_the_last_state_reaches_who_looks_though_the_program_ends_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "PAUSE_S", 3600)  # the end comes before the next round of states
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
+    page.start()
+    page.tell("the lamp is warm")
+    with served(application(page, "a-secret")) as port:
+        link = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        link.request("GET", "/a-secret/events")
+        pushed = link.getresponse()
+        first = pushed.readline()
+        page.close("the camera is gone: plug it in")
+    states = [json.loads(line[6:]) for line in (first, *pushed) if line.startswith(b"data: ")]
+    link.close()
+    assert not states[0]["ended"]
+    assert states[-1]["ended"]
+    assert states[-1]["why"] == "the camera is gone: plug it in"
+
+
+def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
+    page.start()
+    with served(application(page, "a-secret")) as port:
+        link = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        link.request("GET", "/a-secret/events")
+        pushed = link.getresponse()
+        first = pushed.readline()
+        time.sleep(0.3)
+        page.close()
+    states = [line for line in (first, *pushed) if line.startswith(b"data: ")]
+    link.close()
+    assert len(states) <= 3

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 import yaml
-from browsers import MARKS, open_browser
+from browsers import MARKS, complaints, open_browser
 
 import emmc_rig as emmc
 from emmc_rig.capture.command import capture_session
@@ -65,7 +65,8 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
         assert "% of white" in tiles[0].text
         wait(lambda: "adaptive-fast: " in one("#field-stage").text)
         one("[data-show=views]").click()
-        wait(lambda: one("#field").get_attribute("data-number"))
+        wait(lambda: one("#viewer").get_attribute("data-complete"))
+        assert one("#viewer-overlays").text.split("\n")[1:3] == ["nothing", "disparity"]
         tiles[0].click()
         assert one("#chosen").text == "1 chosen"
         one("#retake").click()
@@ -85,4 +86,4 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
         page.close()
         wait(lambda: "Complete: every frame verified" in one("#end").text)
         assert not one("#finish").is_displayed()
-        assert driver.get_log("browser") == []
+        assert complaints(driver) == []

@@ -46,7 +46,7 @@ def test_writing_counts_as_hidden_only_while_the_bench_works():
     assert told.hidden_share == 0.5
 
 
-def test_runs_are_told_apart_and_other_lines_passed_over():
+def test_runs_are_kept_apart_and_other_lines_passed_over():
     entries = [entry("a", 1, write=(0, 1)), {"kind": "retry"}, entry("b", 2, write=(0, 1))]
     assert [[e["id"] for e in run] for run in run_entries(entries)] == [["a"], ["b"]]
 

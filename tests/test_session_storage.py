@@ -168,7 +168,7 @@ def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
-def test_a_disk_that_is_really_full_is_told_by_the_system():
+def test_a_disk_that_is_really_full_is_reported_by_the_system():
     file = SYSTEM_DISK.append(Path("/dev/full"))
     with pytest.raises(OSError, match="space"):
         file.write(b"one byte too many")
@@ -302,7 +302,7 @@ def test_a_torn_journal_line_costs_one_frame(on_disk, tmp_path):
     assert json.loads(path.read_bytes().splitlines()[-1])["kind"] == "complete"
 
 
-def test_an_edited_plan_in_the_session_is_told(on_disk):
+def test_an_edited_plan_in_the_session_is_reported(on_disk):
     with open(on_disk.folder / PLAN, "a") as file:
         file.write("# an afterthought\n")
     verdict = verify(Session(on_disk.folder))
@@ -399,6 +399,6 @@ def test_two_programs_do_not_work_on_one_session(on_disk):
     assert not (on_disk.folder / LOCK).exists()
 
 
-def test_a_folder_that_is_no_session_is_told(tmp_path):
+def test_a_folder_that_is_no_session_is_reported(tmp_path):
     with pytest.raises(AppError, match="no session"):
         Session(tmp_path)

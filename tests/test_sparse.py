@@ -141,7 +141,7 @@ def test_the_same_frames_give_the_same_bits(random_psi, scene):
     np.testing.assert_array_equal(first.light_field, second.light_field)
 
 
-def test_a_step_limit_is_told_with_advice(random_psi, scene):
+def test_a_step_limit_is_reported_with_advice(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     solver = BPDNSettings(method="ista", max_steps=1)

@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 from pages import Page
@@ -28,10 +29,11 @@ from emmc_rig.study.stability.curves import (
     span_words,
     strength_at,
 )
-from emmc_rig.study.stability.fault_sweep import Point, StabilitySweep, planned, stability_settings
-from emmc_rig.study.stability.faults import FAULTS
+from emmc_rig.study.stability.fault_sweep import StabilitySweep, planned, stability_settings
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.sweeping import BREAKS_CSV, POINTS_CSV, run_stability
 from emmc_rig.study.sweep import SweepStopped
+from emmc_rig.study.trial import Capture
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from simulators.scenes import render
@@ -111,12 +113,15 @@ def test_breaking_points_in_words():
 def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
     levels = {"a": (30, 20, 10), "b": (20, 18, 14)}
     results: dict[Point, dict] = {
-        Point(scene, "mask-shift", strength, "tv"): {"psnr_db": level, "view_db": 15}
+        Point(Capture(scene, "cam"), "mask-shift", strength, "tv"): {
+            "psnr_db": level,
+            "view_db": 15,
+        }
         for scene, row in levels.items()
         for strength, level in zip((0, 1, 4), row, strict=True)
     }
-    results[Point("a", "occlusion", 0, "tv")] = {"psnr_db": 30, "view_db": 15}
-    results[Point("a", "occlusion", 10, "tv")] = {"failed": "no light"}
+    results[Point(Capture("a", "cam"), "occlusion", 0, "tv")] = {"psnr_db": 30, "view_db": 15}
+    results[Point(Capture("a", "cam"), "occlusion", 10, "tv")] = {"failed": "no light"}
     found = curves(results)
     pooled = [curve for curve in found if curve.scene == POOLED]
     assert [curve.levels for curve in pooled] == [(25, 19, 12), (30, None)]
@@ -174,6 +179,15 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
     run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
     lines = (tmp_path / "out" / StabilitySweep.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
+
+
+def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
+    missing = replace(METHODS["unrolled"], package="no_such_module")
+    monkeypatch.setitem(METHODS, "unrolled", missing)
+    outcome = run_stability(quick(methods=("tv", "unrolled")), tmp_path / "out", Silent())
+    assert outcome.left_out == ["unrolled needs no_such_module, which is not installed"]
+    assert {curve.method for curve in outcome.curves} == {"tv"}
+    assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 
 
 def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undrawn, tmp_path):

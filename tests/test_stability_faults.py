@@ -8,11 +8,11 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import save_views
-from emmc_rig.study.stability.faults import FAULTS, find_fault, trial
+from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.stability.mask_faults import misplaced_psi
 from emmc_rig.study.stability.shot_faults import flicker_gains
 from emmc_rig.study.sweep import NotApplicableError
-from emmc_rig.study.trial import Setup
+from emmc_rig.study.trial import Capture
 from simulators import changes
 from simulators.scenes import render
 
@@ -27,7 +27,7 @@ FAINT = {
 
 def made(name, strength, **more):
     chosen = {"scene": SCENE, "camera": CAMERA, "size": SIZE, **more}
-    return trial(FAULTS[name], strength, **chosen)
+    return Point(Capture(**chosen), name, strength).trial()
 
 
 def spanned(one):
@@ -85,7 +85,7 @@ def test_a_stronger_fault_moves_psi_further(name):
     assert (np.diff(errors) > 0).all()
 
 
-def test_the_method_is_told_the_design_and_the_readings_are_the_real_camera_s():
+def test_the_method_is_given_the_design_and_the_readings_are_the_real_camera_s():
     one = made("mask-shift", 2)
     design = build_imaging_matrix(CAMERA, SIZE)
     assert one.psi.checksum() == design.checksum()
@@ -95,7 +95,7 @@ def test_the_method_is_told_the_design_and_the_readings_are_the_real_camera_s():
 
 
 def test_the_placement_of_a_camera_as_designed_is_its_psi():
-    placed = misplaced_psi(CAMERA, SIZE, designed_placement(CAMERA))
+    placed = misplaced_psi(Capture(SCENE, CAMERA, SIZE), designed_placement(CAMERA))
     assert placed.relative_difference(build_imaging_matrix(CAMERA, SIZE)) < 1e-3
 
 
@@ -125,7 +125,7 @@ def test_so_many_readings_saturate(percent):
     assert brightest[~one.usable].mean() > brightest[one.usable].mean()
 
 
-def test_bad_pixels_are_bad_in_every_shot_and_told_only_when_masked(clean):
+def test_bad_pixels_are_bad_in_every_shot_and_known_only_when_masked(clean):
     silent, told = made("bad-pixels", 20), made("masked-pixels", 20)
     assert silent.usable.all()
     bad = ~told.usable[0]
@@ -218,7 +218,7 @@ def test_contrast_fades_towards_the_mean_and_the_peak_with_it(clean):
     assert one.peak == 0.1
 
 
-def test_designs_are_told_to_the_method():
+def test_designs_are_given_to_the_method():
     for name, strength in (("mask-cell", 4), ("mask-distance", 2), ("shots", 2), ("r", 0.25)):
         one = made(name, strength)
         assert one.psi.checksum() == one.true_psi.checksum()
@@ -243,13 +243,13 @@ def test_a_measured_scene_is_not_made_up(name, measured):
         made(name, 2, scene=measured)
 
 
-def test_what_a_camera_cannot_have_is_told():
+def test_what_a_camera_cannot_have_is_reported():
     aperture = find_camera("coded-aperture-random")
     for name in ("mask-shift", "mask-cell"):
         with pytest.raises(NotApplicableError, match="one mask"):
             made(name, 1, camera=aperture)
     with pytest.raises(NotApplicableError, match="were not measured"):
-        FAULTS["views"].make(Setup("nowhere", CAMERA, SIZE), 9)
+        FAULTS["views"].make(Capture("nowhere", CAMERA, SIZE), 9)
 
 
 def test_equal_seeds_make_equal_trials():

@@ -10,7 +10,7 @@ from calibration.drift import DriftSettings
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.study.stability import mismatch
 from emmc_rig.study.stability.fault_sweep import stability_settings
-from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.stability.mismatch import (
     Mismatch,
     corrected,
@@ -19,6 +19,8 @@ from emmc_rig.study.stability.mismatch import (
     recovered_share,
 )
 from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.trial import Capture
+from reconstruction.methods import METHODS
 
 SIZE = (48, 56)
 DRIFT = DriftSettings(blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6)
@@ -45,7 +47,7 @@ def camera(tmp_path):
 
 def test_a_moved_mask_is_detected_and_psi_corrected_from_the_readings_alone():
     camera = find_camera("rgbw-bayer-1shot").model_copy(update={"views": (3, 3)})
-    moved = trial(FAULTS["mask-shift"], 0.5, "deep-occlusions", camera, SIZE, 0, 3)
+    moved = Point(Capture("deep-occlusions", camera, SIZE, 0, 3), "mask-shift", 0.5).trial()
     psi, detected = corrected(moved, DRIFT)
     assert detected
     before = moved.psi.relative_difference(moved.true_psi)
@@ -54,7 +56,7 @@ def test_a_moved_mask_is_detected_and_psi_corrected_from_the_readings_alone():
 
 def test_a_camera_without_a_mask_before_its_sensor_is_refused_in_words():
     camera = find_camera("conventional").model_copy(update={"views": (3, 3)})
-    moved = trial(FAULTS["exposure"], 500.0, "deep-occlusions", camera, SIZE, 0, 3)
+    moved = Point(Capture("deep-occlusions", camera, SIZE, 0, 3), "exposure", 500.0).trial()
     with pytest.raises(NotApplicableError, match="one mask between lens and sensor"):
         corrected(moved, DRIFT)
 
@@ -70,10 +72,13 @@ def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera
     assert abs(row.oracle - row.ideal) < 1.0
     assert row.recovered is not None
     assert row.recovered > 0.6
-    # A second run measures nothing again.
+    # A second run measures nothing again, and one with a method that is not installed no more.
     again = Counted()
-    monkeypatch.setattr(type(settings), "trial", None)
+    monkeypatch.setattr(Point, "trial", None)
     assert measure_mismatch(settings, tmp_path, again) == [row]
+    monkeypatch.setitem(METHODS, "unrolled", replace(METHODS["unrolled"], package="no_such_module"))
+    more = settings.model_copy(update={"methods": ("tv", "unrolled")})
+    assert measure_mismatch(more, tmp_path, again) == [row]
     sections = mismatch_sections([row], tmp_path)
     assert f"{row.blind:.2f}" in sections[0].body
     assert f"{row.recovered:.0%}" in sections[0].body

@@ -144,7 +144,7 @@ def test_no_condition_of_psi_breaks_total_variation(capture, condition):
         assert found.db > numerics.card_db(capture)
 
 
-def test_absurd_steps_stay_finite_and_are_told(capture):
+def test_absurd_steps_stay_finite_and_are_reported(capture):
     findings = step_sizes(capture)
     assert len(findings) == len(rounding_checks.STEP_FACTORS) + 2
     assert {one.verdict for one in findings} == {SOUND}

@@ -9,13 +9,13 @@ from typer.testing import CliRunner
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.study.stability import fault_sweep, sweeping, theory
+from emmc_rig.study import trial
+from emmc_rig.study.stability import sweeping, theory
 from emmc_rig.study.stability.fault_sweep import stability_settings
-from emmc_rig.study.stability.faults import FAULTS, trial
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.theory import (
     Place,
     Seen,
-    TheoryPoint,
     measure_theory,
     misplaced,
     patch_texture,
@@ -28,11 +28,12 @@ from emmc_rig.study.stability.theory_section import (
     rank_correlation,
     theory_sections,
 )
-from emmc_rig.study.trial import Trial
+from emmc_rig.study.trial import Capture, Trial
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.theory.patch import SIDE, PatchModel, Texture
 
 CAMERA = find_camera("rgbw-bayer-1shot").model_copy(update={"views": (3, 3)})
+CAPTURE = Capture("near-planar", CAMERA, (32, 40), 0, 4)
 
 
 class Counted:
@@ -48,7 +49,7 @@ class Counted:
 
 @pytest.fixture(scope="module")
 def capture():
-    return trial(FAULTS["exposure"], 15_500, "near-planar", CAMERA, (32, 40), 0, 4)
+    return Point(CAPTURE, "exposure", 15_500).trial()
 
 
 def test_the_variogram_gives_back_the_texture_that_was_drawn():
@@ -104,7 +105,7 @@ def test_less_light_and_unusable_pixels_lower_the_bound(capture):
         return predicted(seen, seen.places(4))["bound_db"]
 
     usual = bound(capture)
-    dim = trial(FAULTS["exposure"], 50, "near-planar", CAMERA, (32, 40), 0, 4)
+    dim = Point(CAPTURE, "exposure", 50).trial()
     assert bound(dim) < usual - 3
     holes = np.random.default_rng(0).random(capture.usable.shape) < 0.6
     assert bound(replace(capture, usable=~holes)) < usual - 1
@@ -137,30 +138,29 @@ def test_rank_correlation_takes_infinity_as_largest():
 
 def test_points_are_kept_and_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(theory, "QUICK_SWEPT", ("exposure",))
-    for module in (theory, fault_sweep):
-        monkeypatch.setattr(module, "find_camera", lambda name: CAMERA)
+    monkeypatch.setattr(trial, "find_camera", lambda name: CAMERA)
     monkeypatch.setattr(theory, "QUICK_PATCHES", (4, 1))
     settings = stability_settings(True, ["near-planar"], (32, 40), camera="small")
     watcher = Counted()
     points = measure_theory(settings, tmp_path, watcher, ("tv",))
     assert watcher.steps == watcher.total == len(FAULTS["exposure"].quick)
-    bounds = [point.figures["bound_db"] or np.nan for point in points]
+    bounds = [one["bound_db"] or np.nan for one in points.values()]
     assert all(bounds[i] > bounds[i + 1] for i in range(len(bounds) - 1))
-    monkeypatch.setattr(type(settings), "trial", None)
+    monkeypatch.setattr(Point, "trial", None)
     assert measure_theory(settings, tmp_path, Counted(), ("tv",)) == points
     (section,) = theory_sections(points, ("tv",), tmp_path)
     assert "Exposure" in section.body
     assert (tmp_path / "theory-near-planar.png").is_file()
     one = compared(points, ("tv",))[0]
-    assert one.levels["tv_db"] == tuple(point.figures["tv_db"] for point in points)
+    assert one.levels["tv_db"] == tuple(found["tv_db"] for found in points.values())
 
 
 def test_parts_are_measured_into_the_folder_of_the_sweeps(tmp_path, monkeypatch):
     figures = {"bound_db": 30.0, "oracle_db": 29.5, "tv_db": 28.0, "adaptive-fast_db": 27.0}
-    points = [
-        TheoryPoint("exposure", "near-planar", s, {k: v - 5 * i for k, v in figures.items()})
+    points = {
+        Point(CAPTURE, "exposure", s): {k: v - 5 * i for k, v in figures.items()}
         for i, s in enumerate((15_500.0, 500.0, 5.0))
-    ]
+    }
     monkeypatch.setattr(sweeping, "measure_theory", lambda *_: points)
     settings = stability_settings(True, ["near-planar"], None)
     found = sweeping.measure_beside(settings, ["theory"], tmp_path / "out", Counted())

@@ -1,6 +1,8 @@
 """The worst perturbation against methods whose worst is known; details kept, lost and invented."""
 
+import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.study.stability.details import SHAPES, Detail, shown
 from emmc_rig.study.stability.sensor_faults import exposure
 from emmc_rig.study.stability.worst import TILE_PX, confined, worst_perturbation
-from emmc_rig.study.trial import Setup
+from emmc_rig.study.trial import Capture
+from reconstruction.methods import METHODS
 
 SHAPE = (1, 2 * TILE_PX, 2 * TILE_PX)
 GREY = np.full((3, 3, 32, 40, 3), 0.4, dtype=np.float32)
@@ -95,7 +98,7 @@ def test_a_detail_that_cannot_be_brighter_is_darker():
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-mono", "scenario-i-rgb"])
 def test_a_million_electrons_are_not_clipped_and_less_noisy(camera):
-    setup = Setup("near-planar", find_camera(camera), (24, 32))
+    setup = Capture("near-planar", find_camera(camera), (24, 32))
     many, few = exposure(setup, 1e6), exposure(setup, 15_500)
     assert many.usable.all()
     assert many.noise_sigma < 0.3 * few.noise_sigma
@@ -115,6 +118,33 @@ def test_the_command_says_what_harms_a_method_and_goes_on_where_it_stopped(run, 
     kept = (tmp_path / "emmc-worst/worst.jsonl").read_bytes()
     assert run(*arguments)[0] == 0
     assert (tmp_path / "emmc-worst/worst.jsonl").read_bytes() == kept
+
+
+@pytest.fixture
+def without_torch(monkeypatch):
+    """Two methods, one of which is not installed."""
+    missing = replace(METHODS["unrolled"], package="no_such_module")
+    for name in set(METHODS) - {"tv", "unrolled"}:
+        monkeypatch.delitem(METHODS, name)
+    monkeypatch.setitem(METHODS, "unrolled", missing)
+
+
+def test_every_method_is_measured_but_one_not_installed_which_is_named_once(
+    run, without_torch, tmp_path
+):
+    command = ("stability", "--worst", "--fast", "--method", "all", "--size", "24x32")
+    code, out, err = run(*command, "--out", "out")
+    assert code == 0, err
+    told = " ".join((out + err).split())
+    assert told.count("unrolled needs no_such_module, which is not installed") == 1
+    with open(tmp_path / "out" / "worst.csv", newline="") as rows:
+        assert {row["method"] for row in csv.DictReader(rows)} == {"tv"}
+
+
+def test_nothing_but_a_method_that_is_not_installed_is_one_line(run, without_torch):
+    code, _, err = run("stability", "--worst", "--fast", "--method", "unrolled", "--size", "24x32")
+    assert code == 1
+    assert "unrolled needs no_such_module" in err
 
 
 @pytest.mark.parametrize(

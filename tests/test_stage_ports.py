@@ -151,7 +151,7 @@ def test_a_port_that_comes_back_late_is_waited_for(tmp_path):
         stage.close()
 
 
-def test_the_second_process_on_a_port_is_told_who_holds_it(served):
+def test_the_second_process_on_a_port_hears_who_holds_it(served):
     command = [sys.executable, "-c", HOLD_A_PORT, served.port]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as holder:
@@ -167,7 +167,7 @@ def test_the_second_process_on_a_port_is_told_who_holds_it(served):
     SerialTransport(served.port).close()
 
 
-def test_a_lock_tells_its_holder_even_where_open_files_may_not_be_seen(served, monkeypatch):
+def test_a_lock_names_its_holder_even_where_open_files_may_not_be_seen(served, monkeypatch):
     transport = SerialTransport(served.port)
     monkeypatch.setattr(ports, "_pids_with_open_file", lambda device: iter(()))
     assert holder_of(served.port).endswith(f"(pid {os.getpid()})")
@@ -271,7 +271,7 @@ def test_a_fault_strikes_at_the_moment_it_was_armed_for():
         Faults(["stall"]).inject("stall", after_s=1.0)
 
 
-def test_a_second_client_of_a_tcp_stage_is_told_that_it_is_busy_and_the_first_goes_on():
+def test_a_second_client_of_a_tcp_stage_hears_that_it_is_busy_and_the_first_goes_on():
     chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): AxisSpec()})
     with TcpServer(chain) as server:
         first = SerialTransport(server.port, timeout_s=2.0)

@@ -7,10 +7,10 @@ import pytest
 from emmc_rig.advice.trial import CANDIDATES, Prospect
 from emmc_rig.files.results import METRICS
 from emmc_rig.study import guard
-from emmc_rig.study.guard import Case
 from emmc_rig.study.stated import Stated, summary
+from emmc_rig.study.trial import Capture
 
-CASE = Case("near-planar", (48, 64), noise=0.004)
+CASE = Capture("near-planar", guard.CAMERA, (48, 64), noise=0.004)
 
 
 def row(expected_db, half_db, true_db, within=(None, None)):

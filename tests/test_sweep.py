@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import pytest
 
 from emmc_rig.errors import AppError
-from emmc_rig.pages.page import Section, fragment, framed, inline_svg, number
+from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
 from emmc_rig.progress import Silent
 from emmc_rig.study.sweep import NotApplicableError, Sweep, SweepStopped, csv_text, plain
 
@@ -142,8 +142,11 @@ def test_a_result_is_kept_as_json_gives_it_back():
 
 def test_text_on_a_page_is_escaped_and_data_cannot_end_its_script():
     body = fragment("figures.html", heads=["<b>"], rows=[["</td>", "&"]], pictures={})
-    page = framed("<i>", ["&"], ["'"], [Section("one", "One", body)], data={"d": ["</script>"]})
-    assert "<b>" not in page
+    head = Head("<trust>", "<u>", ["look at `<s>`"])
+    sections = [Section("one", "One", body)]
+    page = framed("<i>", ["&"], ["'"], sections, data={"d": ["</script>"]}, head=head)
+    for mark in ("<b>", "<i>", "<trust>", "<u>", "<s>"):
+        assert mark not in page
     assert "&lt;/td&gt;" in page
     assert page.count("</script>") == 1
     (data,) = re.findall(r'id="d">(.*?)</script>', page)

@@ -241,7 +241,7 @@ def test_a_dictionary_that_saw_the_scene_is_refused(run, scenes, tmp_path):
     assert (code, "was trained on 'attic'" in one_line(err)) == (1, True)
 
 
-def test_ctrl_c_is_told_with_how_to_go_on(run, scenes, monkeypatch):
+def test_ctrl_c_is_reported_with_how_to_go_on(run, scenes, monkeypatch):
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
 

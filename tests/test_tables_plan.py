@@ -69,7 +69,7 @@ def test_parts_are_chosen_by_name_in_the_papers_order():
 @pytest.mark.parametrize(
     ("only", "told"), [("tabel3", "did you mean 'table3'"), ("xyz", "known are table2"), (",", "")]
 )
-def test_an_unknown_part_is_told_with_the_nearest(only, told):
+def test_an_unknown_part_is_reported_with_the_nearest(only, told):
     with pytest.raises(AppError, match="--only") as fault:
         chosen_parts(only)
     assert told in str(fault.value)

@@ -168,7 +168,7 @@ def test_sharing_the_first_stage_changes_no_result(scenes, tmp_path):
         assert kept["status"] == alone.status
 
 
-def test_patches_are_coded_by_the_papers_solver_unless_told():
+def test_patches_are_coded_by_the_papers_solver_by_default():
     for settings in (TablesSettings(), FAST):
         for method in ("dict-admm", "tv-dict"):
             assert settings.of(method, Capture("ii", 1)).sparse.solver.method == "admm"
@@ -345,7 +345,7 @@ def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
     assert Journal(folder / TablesSweep.journal).get("a") == {"psnr_db": 1.0}
 
 
-def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
     run = a_run(scenes, tmp_path / "out")
     add, left = Journal.add, itertools.count(3, -1)
 
@@ -362,7 +362,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost(scenes, tmp_path, monkeypatch):
     assert len(do_cells(run, Silent())) == 27
 
 
-def test_a_folder_without_scenes_is_told(tmp_path):
+def test_a_folder_without_scenes_is_reported(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(AppError, match="no scenes"):
         scene_specs(tmp_path / "empty")
@@ -373,7 +373,7 @@ def test_a_folder_without_scenes_is_told(tmp_path):
         scene_specs(tmp_path)
 
 
-def test_scenes_too_small_or_of_other_views_are_told(tmp_path):
+def test_scenes_too_small_or_of_other_views_are_reported(tmp_path):
     save_hdf5(tmp_path / "small.h5", light_field(0, (15, 30)), {})
     save_hdf5(tmp_path / "few.h5", light_field(0, views=(3, 3)), {})
     library = Library(scene_specs(tmp_path), (Cut(),))
@@ -400,7 +400,7 @@ def test_noise_depends_on_seed_and_scene_not_on_what_came_before():
     assert not np.array_equal(first.frames, one.take(noisy, lf, "shed").frames)
 
 
-def test_the_noise_told_is_the_noise_there_is():
+def test_the_noise_stated_is_the_noise_there_is():
     lf = light_field(0, (64, 64))
     for capture in (Capture("i", 3, noisy=True), Capture("iii", 3, noisy=True)):
         shots = Sensors(0).take(capture, lf, "attic")

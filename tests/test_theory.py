@@ -231,7 +231,7 @@ def test_condition_and_gain_are_those_of_the_dense_matrix(patch):
     assert found.gain == pytest.approx(per_value, rel=0.03)
 
 
-def test_more_modes_than_readings_cannot_be_told(patch):
+def test_more_modes_than_readings_cannot_be_determined(patch):
     both = union([subspace(patch, d, TEXTURE, patch.readings) for d in (-1.5, 1.5)])
     assert both.size > patch.readings
     assert condition(patch, both).number == np.inf

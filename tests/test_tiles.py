@@ -15,6 +15,7 @@ from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
 from reconstruction.sparse import SparseSettings
 from reconstruction.tiles import (
     Grid,
+    in_few_words,
     reconstruct_in_blocks,
     samples,
     surveyed,
@@ -77,10 +78,14 @@ def scene(random_psi, binning=1, shots=2):
     return psi, (psi.forward(truth) + noise).astype(np.float32), truth
 
 
+def settings_of(method, **more):
+    """Patches of the default's own size overlap by less: each has atoms of its own to sense."""
+    sparse = SparseSettings(stride=2 if "dict" in method else 8)
+    return MethodSettings(tv=TVSettings(max_steps=60), sparse=sparse, **more)
+
+
 def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step=None):
-    settings = MethodSettings(
-        tv=TVSettings(max_steps=60), sparse=SparseSettings(stride=2), blocks=blocks
-    )
+    settings = settings_of(method, blocks=blocks)
     usable = np.ones(frames.shape, dtype=bool) if usable is None else usable
     return reconstruct_in_blocks(
         method, psi, frames, 0.01, dictionary, settings, usable, on_step, lambda: 0.0
@@ -96,13 +101,13 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
         ("tv-dict", 2),
         ("adaptive-fast", 1),
         ("adaptive-fast", 2),
+        ("adaptive", 1),
     ],
 )
 def test_every_method_works_in_blocks_and_loses_little(random_psi, method, binning):
     psi, frames, truth = scene(random_psi, binning)
     dictionary = dct_dictionary(VIEWS, (4, 4)) if "dict" in method else None
-    settings = MethodSettings(tv=TVSettings(max_steps=60), sparse=SparseSettings(stride=2))
-    whole = reconstruct(method, psi, frames, 0.01, dictionary, settings)
+    whole = reconstruct(method, psi, frames, 0.01, dictionary, settings_of(method))
     result, verdict = in_blocks(method, psi, frames, SMALL, dictionary=dictionary)
     assert result.light_field.shape == psi.light_field_shape
     assert psnr_db(result.light_field, truth) > psnr_db(whole.light_field, truth) - 0.5
@@ -156,7 +161,7 @@ def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
         SavedPsi(tmp_path / "psi.h5")
 
 
-def test_progress_is_told_block_by_block(random_psi):
+def test_progress_is_reported_block_by_block(random_psi):
     psi, frames, _ = scene(random_psi)
     told = []
     in_blocks("tv", psi, frames, SMALL, on_step=lambda step: told.append((step.step, step.total)))
@@ -240,3 +245,13 @@ def test_places_are_those_of_the_whole(blocks):
     evidence = combined([JudgedBlock(verdict, 0, 0, 1), JudgedBlock(verdict, 50, 60, 1)])
     hole = verdict.evidence.hole_at
     assert evidence.hole_at in (hole, (hole[0] + 50, hole[1] + 60))
+
+
+def test_what_many_blocks_say_is_one_line_with_the_range_of_its_numbers():
+    flat = "the evidence is flat: {}% of the patches, beyond 24 px"
+    said = [[flat.format(82), "grey"], [], [flat.format(100)], [flat.format(9.5)]]
+    assert in_few_words(said, 5) == [
+        "the evidence is flat: 9.5 to 100% of the patches, beyond 24 px, in 3 of 5 blocks",
+        "grey, in 1 of 5 blocks",
+    ]
+    assert in_few_words([], 5) == []

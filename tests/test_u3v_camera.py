@@ -392,7 +392,9 @@ LOST = [
 
 @pytest.mark.parametrize(("fault", "complaint"), LOST)
 @pytest.mark.parametrize("shape", [SHAPE, (1000, 1202)])
-def test_a_frame_that_does_not_come_whole_is_told_and_the_next_one_comes(fault, complaint, shape):
+def test_a_frame_that_does_not_come_whole_is_reported_and_the_next_one_comes(
+    fault, complaint, shape
+):
     mosaic = np.resize(MOSAIC, shape)
     bench = Bench(mosaic)
     camera = bench.open()

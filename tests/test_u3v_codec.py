@@ -98,7 +98,7 @@ def test_a_command_that_the_format_cannot_carry_is_refused(request_id, address, 
         (PENDING[:8] + b"\0\0" + PENDING[10:12], "pending acknowledge with 0 bytes"),
     ],
 )
-def test_a_garbled_acknowledge_is_told(wire, complaint):
+def test_a_garbled_acknowledge_is_reported(wire, complaint):
     with pytest.raises(U3vFormatError, match=complaint):
         decode_acknowledge(wire)
 
@@ -122,7 +122,7 @@ def test_a_trailer_is_read_with_and_without_lines():
         (LEADER[:18] + b"\2\0" + LEADER[20:], "payload type 0x0002"),
     ],
 )
-def test_what_is_no_leader_is_told(wire, complaint):
+def test_what_is_no_leader_is_reported(wire, complaint):
     with pytest.raises(U3vFormatError, match=complaint):
         decode_leader(wire)
 
@@ -135,7 +135,7 @@ def test_a_recorded_frame_comes_apart_again():
 
 
 @pytest.mark.parametrize("cut", [1, 31, 33, 200])
-def test_a_torn_recorded_frame_is_told(cut):
+def test_a_torn_recorded_frame_is_reported(cut):
     with pytest.raises(U3vFormatError):
         split_frame((LEADER + bytes(500) + TRAILER)[:-cut])
 

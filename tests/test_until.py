@@ -310,7 +310,7 @@ def test_enough_is_enough_and_all_is_all(coded_psi):
     assert (found.next, found.why) == (None, "every planned shot is taken")
 
 
-def test_what_a_session_needs_follows_from_the_last_thing_it_was_told(tmp_path: Path):
+def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):
     session, _ = begun(tmp_path, SimulatedDisk(), still_rig())
     shots = {f.bench.shot for f in session.frames if f.kind == "shot"}
     assert shots == {0, 1}

@@ -253,7 +253,9 @@ def processes(folder, holder, pid):
         ("stranger", "close that program"),
     ],
 )
-def test_a_claimed_device_tells_by_whom_and_how_to_free_it(bus, echo, tmp_path, holder, advice):
+def test_a_claimed_device_is_reported_with_its_holder_and_how_to_free_it(
+    bus, echo, tmp_path, holder, advice
+):
     bus.seize(echo)
     proc = processes(tmp_path, holder, 4321)
     device = open_device(KIND, backend=bus, proc=proc)
@@ -274,7 +276,7 @@ def test_this_program_is_not_among_the_holders(tmp_path):
     assert find_holders(1, 1, processes(tmp_path, "me", os.getpid())) == ()
 
 
-def test_the_second_to_claim_is_told(bus):
+def test_the_second_to_claim_is_refused(bus):
     with open_device(KIND, backend=bus) as first:
         first.claim(KIND)
         with pytest.raises(UsbClaimedError):

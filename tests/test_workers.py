@@ -223,7 +223,7 @@ def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
     assert content(place / "damaged") == content(place / "alone")
 
 
-def test_a_full_disk_is_told_in_one_line_and_the_same_command_goes_on(place, monkeypatch):
+def test_a_full_disk_is_reported_in_one_line_and_the_same_command_goes_on(place, monkeypatch):
     pool, written = Here(), block_tasks._write_arrays
 
     def write_arrays(path, arrays):
@@ -270,7 +270,7 @@ def test_memory_is_read_with_its_unit(text, count):
     assert parse_memory(text) == count
 
 
-def test_ceilings_and_places_that_cannot_be_are_told_in_one_line(place):
+def test_ceilings_and_places_that_cannot_be_are_reported_in_one_line(place):
     with pytest.raises(WrongUsageError, match="2GiB"):
         parse_memory("much")
     with pytest.raises(WrongUsageError, match="a unit"):

@@ -544,7 +544,7 @@ def test_devices_are_found_with_their_axes(bench):
     assert found[0].firmware == "7.38"
 
 
-def test_two_devices_with_one_address_are_told_apart_by_nobody():
+def test_nothing_distinguishes_two_devices_with_one_address():
     clock = ManualClock()
     first, second = ZaberChain(clock, {(1, 1): SPEC}), ZaberChain(clock, {(1, 1): SPEC})
     feed = first.feed

@@ -1,0 +1,63 @@
+"""Every page has one head: the verdict, then what to do next."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emmc_rig.files.formats import Export
+from emmc_rig.pages.page import light_field_head, typed
+from emmc_rig.pages.viewer import render_viewer
+from emmc_rig.study.chart.charting import chart_page
+from emmc_rig.study.stability.stability_page import stability_page
+from emmc_rig.study.tables.reproducing import tables_page
+
+NOT_ASKED: Any = None
+"""The sweep, where nothing was measured."""
+
+
+def head_of(page):
+    """Return the words of the first thing in the page's main part."""
+    main = page[page.index("<main>") :].removeprefix("<main>").lstrip()
+    assert main.startswith("<aside class="), main[:80]
+    assert 'aria-label="Verdict"' in main[:80]
+    return main[: main.index("</aside>")]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        lambda: tables_page([], [], [], {}, {}, {}),
+        lambda: chart_page(NOT_ASKED, [], {}, [], {}, {}),
+        lambda: stability_page([], [], NOT_ASKED, []),
+    ],
+    ids=["tables", "chart", "stability"],
+)
+def test_a_page_with_nothing_measured_still_says_what_to_do_next(page):
+    head = head_of(page())
+    assert "What to do next" in head
+    assert "<code>emmc-rig " in head
+
+
+def test_a_viewer_of_a_scene_has_the_head_too(light_field):
+    head = head_of(render_viewer(Export("a", "", light_field, source="my views")))
+    assert "no verdict" in head
+    assert "<code>emmc-rig figure &#39;my views&#39;</code>" in head
+
+
+def test_a_result_in_memory_is_offered_no_command_without_a_path():
+    head = light_field_head({"verdict": {"level": "trust", "reasons": []}})
+    assert head.next
+    assert not any("emmc-rig" in line for line in head.next)
+
+
+def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert typed(tmp_path / "one/two") == "one/two"
+    assert typed("my own") == "'my own'"
+    assert typed(tmp_path.parent) == str(tmp_path.parent)
+
+
+@pytest.fixture(scope="module")
+def light_field():
+    return np.random.default_rng(0).random((3, 3, 24, 32, 3), dtype=np.float32)
