@@ -5,7 +5,9 @@ import select
 import socket
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -230,6 +232,16 @@ class _Server(ABC):
             if self._opened:
                 self._close()
 
+    def _send(self, channel: Any, send: Callable[[bytes], int], data: bytes) -> None:
+        """Send bytes as the host takes them; one that takes none does not delay unplug or end."""
+        while data and not self._firmware.unplugged:
+            ready, free, _ = select.select([self._wake_read], [channel], [], TICK_S)
+            if ready:
+                return
+            if free:
+                with suppress(BlockingIOError):
+                    data = data[send(data) :]
+
     def _follow_plug(self) -> None:
         plugged = not self._firmware.unplugged
         if self._opened and not plugged:
@@ -257,6 +269,7 @@ class PtyServer(_Server):
 
         self._device, self._line = os.openpty()
         tty.setraw(self._line)
+        os.set_blocking(self._device, False)
         self.port = os.ttyname(self._line)
         if self._link is not None:
             if self._link.is_symlink() and self._link.readlink().parent == Path(self.port).parent:
@@ -278,8 +291,7 @@ class PtyServer(_Server):
         return os.read(self._device, READ_SIZE)
 
     def _write(self, data: bytes) -> None:
-        while data:
-            data = data[os.write(self._device, data) :]
+        self._send(self._device, partial(os.write, self._device), data)
 
 
 class TcpServer(_Server):
@@ -315,6 +327,7 @@ class TcpServer(_Server):
         if source is self._listener:
             self._client, _ = self._listener.accept()
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._client.setblocking(False)
             return b""
         data = b""
         with suppress(ConnectionError):
@@ -326,7 +339,7 @@ class TcpServer(_Server):
     def _write(self, data: bytes) -> None:
         if self._client is not None:
             try:
-                self._client.sendall(data)
+                self._send(self._client, self._client.send, data)
             except ConnectionError:
                 self._hang_up()
 

@@ -1,6 +1,7 @@
 """What all tests share: options, and which optional checks this machine can run."""
 
 import os
+import signal
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Threads of numba's loops sleep until they have work: spinning takes the other process's core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# A script's background job ignores Ctrl-C, and so would every program that a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import numpy as np
 import pytest

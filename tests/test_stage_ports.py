@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -284,6 +285,39 @@ def test_a_second_client_of_a_tcp_stage_hears_that_it_is_busy_and_the_first_goes
         first.write(b"/1 0 02\n")
         assert b"@01 0 02 OK" in first.read_until(b"\n")
         first.close()
+
+
+class Chatterbox:
+    """Firmware that always has more to say."""
+
+    unplugged, plugs = False, 1
+    said = 0
+
+    def feed(self, data):
+        return b""
+
+    def due(self):
+        self.said += 1
+        return bytes(1 << 20)
+
+    def next_due_s(self):
+        return 0.0
+
+
+@pytest.mark.parametrize("served_on", [PtyServer, TcpServer])
+def test_a_host_that_reads_nothing_keeps_no_simulator_from_ending(served_on):
+    firmware = Chatterbox()
+    server = served_on(firmware)
+    server.__enter__()
+    with serial.serial_for_url(server.port, timeout=0):
+        said = 0
+        while not said or said != firmware.said:  # until it waits for the host
+            said = firmware.said
+            time.sleep(0.2)
+        ended = threading.Thread(target=server.__exit__, args=(None, None, None), daemon=True)
+        ended.start()
+        ended.join(20)
+        assert not ended.is_alive()
 
 
 def test_a_flood_is_shortened_in_the_message():
