@@ -10,8 +10,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Threads of numba's loops sleep until they have work: spinning takes the other process's core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# A script's background job ignores Ctrl-C, and so would every program that a test starts.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import numpy as np
 import pytest
@@ -19,6 +17,9 @@ from programs import exit_code
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+
+# A script's background job ignores Ctrl-C, and so would every program that a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest.register_assert_rewrite("emmc_rig.conformance.cameras", "emmc_rig.conformance.stages")
 

@@ -57,18 +57,21 @@ MODES: dict[str, dict[str, set[str]]] = {
         "verdicts": STUDIED | {"fast", "fault", "method", "seed", "constants"},
         "worst": STUDIED | {"fast", "method", "dictionary", "seed"},
     },
-    "train": {"network": {"camera", "views", "steps", "minutes", "seed", "resume", "out"}},
+    "train": {
+        "aperture": {"camera", "seed", "out"},
+        "network": {"camera", "views", "steps", "minutes", "seed", "resume", "out"},
+    },
 }
 """By command and mode, as its function names them: what else may be given."""
-NEEDS = {
+NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
     "calibrate": {"known": "drift", "frames": "plan", "psnr": "check", "sensor": "session"},
     "cameras": {"out": "name"},
     "chart": {"until": "next_shot"},
     "export": {"truth": "result"},
     "stability": {"constants": "verdicts"},
-    "train": {"camera": "network", "steps": "network", "minutes": "network"},
+    "train": {"camera": ("network", "aperture"), "steps": "network", "minutes": "network"},
 }
-"""By command, an option and the one without which it does nothing."""
+"""By command, an option and the one, or those, without which it does nothing."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
 
@@ -97,8 +100,10 @@ class ModalCommand(TyperCommand):
                 refuse(ctx, given - used - {mode}, f"with {option_of(ctx, mode)}")
                 break
         for name, needed in NEEDS.get(self.name or "", {}).items():
-            if name in given and needed not in given:
-                refuse(ctx, (name,), f"without {option_of(ctx, needed)}")
+            modes = (needed,) if isinstance(needed, str) else needed
+            if name in given and not given.intersection(modes):
+                where = " or ".join(option_of(ctx, mode) for mode in modes)
+                refuse(ctx, (name,), f"without {where}")
         return super().invoke(ctx)
 
 

@@ -1,4 +1,4 @@
-"""The command `emmc-rig train`: a dictionary of light-field patches from scenes."""
+"""The command `emmc-rig train`: a dictionary of patches, a network, or a coded aperture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ NETWORK_CAMERAS = (
 
 
 def train(
-    out: Annotated[Path, typer.Option("--out", help="the dictionary to write, FILE.h5")],
+    out: Annotated[
+        Path, typer.Option("--out", help="the file to write: FILE.h5, of --aperture FILE.yaml")
+    ],
     scenes: Annotated[
         list[str] | None,
         typer.Option(
@@ -47,17 +49,27 @@ def train(
     ] = False,
     camera: Annotated[
         list[str] | None,
-        typer.Option("--camera", help="of --network: whose kinds of masks it sees; may repeat"),
+        typer.Option(
+            "--camera",
+            help="of --network: whose kinds of masks it sees, may repeat; of --aperture: whose "
+            "transmittances are learned (default: learned-aperture)",
+        ),
     ] = None,
+    aperture: Annotated[
+        bool, typer.Option("--aperture", help="instead: the masks in the plane of a lens")
+    ] = False,
     steps: Annotated[int, typer.Option("--steps", min=1, help="of --network, in all")] = 6000,
     minutes: Annotated[
         float | None,
         typer.Option("--minutes", min=0, help="of --network: then write it; --resume goes on"),
     ] = None,
 ) -> None:
-    """Train a dictionary of light-field patches, or a network; Ctrl-C leaves a checkpoint."""
+    """Train a dictionary of patches or a network (Ctrl-C leaves a checkpoint), or an aperture."""
     from emmc_rig.files.results import parse_size
 
+    if aperture:
+        _train_aperture(out, camera or ["learned-aperture"], seed)
+        return
     if network:
         _train_network(out, camera or list(NETWORK_CAMERAS), views, steps, minutes, seed, resume)
         return
@@ -111,3 +123,19 @@ def _train_network(
     )
     tell(f"wrote {out}")
     give_result(out, weights=count, steps=learner.steps, psnr_db=sum(last) / len(last))
+
+
+def _train_aperture(out: Path, cameras: list[str], seed: int) -> None:
+    from emmc_rig.reconstruct.aperture_training import ApertureTraining, train_aperture
+
+    if len(cameras) > 1:
+        raise typer.BadParameter("--aperture learns the masks of one --camera")
+    with shown_progress() as bars:
+        figures = train_aperture(ApertureTraining(out, cameras[0], seed=seed), bars)
+    tell(
+        f"expected by the best linear decoder: {figures['before_db']:.2f} dB as the camera was, "
+        f"{figures['after_db']:.2f} dB now; from other starts "
+        + ", ".join(f"{end:.2f}" for end in figures["ends_db"][1:])
+    )
+    tell(f"wrote {out}")
+    give_result(out, **figures)

@@ -22,17 +22,21 @@ def find_camera(spec: str, shots: int | None = None) -> Camera:
     >>> len(emmc.camera("rgbw-bayer-3shots", shots=2).shots)
     2
     """
-    camera = _found(spec)
+    camera = load_camera(camera_file(spec))
     return camera if shots is None else camera.with_shots(shots)
 
 
-def _found(spec: str) -> Camera:
+def camera_file(spec: str) -> Path:
+    """Return the YAML file of a shipped camera by its name, or of one's own by its path.
+
+    Raises CameraError naming the nearest shipped camera when there is none.
+    """
     path = Path(spec)
     if path.suffix.lower() in (".yaml", ".yml") or os.sep in spec:
-        return load_camera(path)
+        return path
     shipped = shipped_camera_files()
     if spec in shipped:
-        return load_camera(shipped[spec])
+        return shipped[spec]
     near = difflib.get_close_matches(spec.lower(), shipped, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'? " if near else ""
     raise CameraError(

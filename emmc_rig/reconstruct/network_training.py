@@ -66,7 +66,8 @@ class NetworkTraining:
 
 
 @lru_cache(maxsize=2 * WORLDS)
-def _world(seed: int, number: int, views: tuple[int, int]) -> NDArray[np.float32]:
+def world(seed: int, number: int, views: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the light field of a random world (v, u, y, x, c), of WORLD_SIZE pixels."""
     rng = np.random.default_rng([seed, 0, number])
     return rendered(tabulated(random_world(rng)), views, WORLD_SIZE).light_field
 
@@ -99,16 +100,16 @@ def example(training: NetworkTraining, cameras: list[Camera], step: int):
 
     rng = np.random.default_rng([training.seed, 1, step])
     number = step // STEPS_A_WORLD + int(rng.integers(WORLDS))
-    world = _world(training.seed, number, training.architecture.views)
+    light_field = world(training.seed, number, training.architecture.views)
     # Of a few crops the one of most contrast: most of a world is even, which teaches little.
     corners = rng.integers(np.array(WORLD_SIZE) - training.crop + 1, size=(CROPS, 2))
     side = training.crop
-    middle = world[world.shape[0] // 2, world.shape[1] // 2]
+    middle = light_field[light_field.shape[0] // 2, light_field.shape[1] // 2]
     corner = max(
         corners, key=lambda at: _detail(middle[at[0] : at[0] + side, at[1] : at[1] + side])
     )
-    symmetry = rng.integers(8 if world.shape[0] == world.shape[1] else 4, size=1)
-    (truth,) = cut_patches(world, corner[None], symmetry, (side, side))
+    symmetry = rng.integers(8 if light_field.shape[0] == light_field.shape[1] else 4, size=1)
+    (truth,) = cut_patches(light_field, corner[None], symmetry, (side, side))
     light = np.exp(rng.uniform(np.log(DARKEST), 0))
     truth = np.ascontiguousarray(light * truth[..., rng.permutation(3)], np.float32)
     psi = drawn_masks(cameras[rng.integers(len(cameras))], rng).psi((side, side))

@@ -1,0 +1,159 @@
+"""`emmc-rig train --aperture`: what is learned, what the error is, and what is refused."""
+
+import math
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import camera_file, find_camera
+from emmc_rig.model.camera import load_camera
+from emmc_rig.progress import Silent
+from emmc_rig.reconstruct.aperture_training import (
+    PATCH_PX,
+    ApertureTraining,
+    Moments,
+    aperture_of,
+    learned_cells,
+    patch_moments,
+    train_aperture,
+)
+
+VIEWS = 25
+
+
+@pytest.fixture(scope="module")
+def moments():
+    """Of patches of three worlds."""
+    return patch_moments(
+        ApertureTraining(Path("unused.yaml"), "learned-aperture", worlds=3), (5, 5), Silent()
+    )
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """Return a maker of the shipped camera's file, changed as plain data."""
+
+    def make(change):
+        text = yaml.safe_load(camera_file("learned-aperture").read_text(encoding="utf-8"))
+        change(text)
+        path = tmp_path / "camera.yaml"
+        path.write_text(yaml.safe_dump(text), encoding="utf-8")
+        return path
+
+    return make
+
+
+def test_the_cells_weigh_the_views_as_psi_does():
+    camera = find_camera("learned-aperture")
+    aperture = aperture_of(camera)
+    weights = np.einsum("c,scv->sv", aperture.cells(), aperture.basis)
+    of_psi = camera.psi((PATCH_PX, PATCH_PX)).weights.sum(axis=4)
+    assert np.allclose(weights, of_psi[..., 2, 2].reshape(2, VIEWS), rtol=1e-4)
+
+
+def test_the_error_is_that_of_the_best_linear_decoder_on_simulated_patches(moments):
+    """Draw Gaussian patches and readings, fit a decoder to them by least squares, and compare."""
+    camera = find_camera("learned-aperture")
+    aperture = aperture_of(camera)
+    rng = np.random.default_rng(0)
+    flat = moments.covariance.reshape(VIEWS * PATCH_PX**2, -1)
+    patches = rng.multivariate_normal(np.zeros(len(flat)), flat, 40_000, method="eigh")
+    patches = patches.reshape(-1, VIEWS, PATCH_PX**2)
+    psi = camera.psi((PATCH_PX, PATCH_PX))
+    weights = psi.weights.sum(axis=4)[..., 2, 2].reshape(2, VIEWS)
+    readings = np.einsum("sv,nvp->nsp", weights, patches)
+    variance = camera.sensor.noise.variance(weights @ moments.mean, camera.exposures_s(), 3.0)
+    readings += np.sqrt(variance)[:, None] * rng.standard_normal(readings.shape)
+    readings = readings.reshape(len(readings), -1)
+    wanted = patches[:, :, PATCH_PX**2 // 2]
+    decoder, *_ = np.linalg.lstsq(readings, wanted, rcond=None)
+    missed = float(np.mean(np.square(readings @ decoder - wanted)))
+    assert aperture.error(aperture.cells(), moments) == pytest.approx(missed, rel=0.03)
+
+
+def test_learning_beats_every_random_aperture_and_leaves_little_light_out(moments):
+    aperture = aperture_of(find_camera("learned-aperture"))
+    cells, errors = learned_cells(aperture, moments, 0, Silent())
+    rng = np.random.default_rng(7)
+    random = [aperture.error(rng.uniform(0, 1, cells.size), moments) for _ in range(20)]
+    assert errors == sorted(errors)
+    assert errors[0] < min(random) / 10**0.1  # by a decibel
+    assert ((cells >= 0) & (cells <= 1)).all()
+    assert errors[0] <= aperture.error(aperture.cells(), moments)
+    assert aperture.error(cells, moments) == pytest.approx(errors[0])
+    assert cells.reshape(2, -1).sum(axis=0).mean() > 0.8  # most views are seen by one shot
+
+
+def test_one_view_of_no_noise_is_known_and_nothing_else_of_independent_views():
+    """Views that say nothing of each other: a shot's error is what it does not see."""
+    aperture = aperture_of(find_camera("learned-aperture"))
+    size = VIEWS * PATCH_PX**2
+    alone = Moments(np.full(VIEWS, 1e-9), np.eye(size).reshape(2 * (VIEWS, PATCH_PX**2)) * 1e6)
+    cells = np.zeros(2 * VIEWS)
+    cells[[3, VIEWS + 7]] = 1
+    assert aperture.error(cells, alone) == pytest.approx(1e6 * (VIEWS - 2) / VIEWS, rel=1e-4)
+
+
+def test_the_command_writes_a_camera_that_other_commands_take(run, monkeypatch, tmp_path):
+    from emmc_rig.reconstruct import aperture_training
+
+    monkeypatch.setattr(aperture_training, "ApertureTraining", partial(ApertureTraining, worlds=2))
+    code, out, err = run("train", "--aperture", "--out", "a.yaml", "--seed", 1)
+    assert code == 0, err
+    assert "expected by the best linear decoder" in out
+    camera = load_camera(tmp_path / "a.yaml")
+    assert "train --aperture" in (tmp_path / "a.yaml").read_text()
+    assert camera.psi((8, 8)).light_efficiency() > 0.3
+    code, _, err = run("train", "--aperture", "--out", "a.yaml")
+    assert code == 1
+    assert "a.yaml" in err
+
+
+def no_parameters(text):
+    text["masks"]["first"]["pattern"] = {"kind": "random_binary", "open_probability": 0.5}
+
+
+def near_the_sensor(text):
+    text["masks"]["second"].update(distance_mm=1.0, cell_um=400.0)
+
+
+def coloured(text):
+    cells = text["masks"]["first"]["pattern"]["cells"]
+    text["masks"]["first"]["pattern"]["cells"] = [[[c, c, c] for c in row] for row in cells]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (no_parameters, "random_binary"),
+        (coloured, "coloured cells"),
+        (near_the_sensor, "distance_mm: 50"),
+        (lambda text: text["sensor"].update(cfa="rggb"), "cfa: mono"),
+        (lambda text: text.update(shots=[{"masks": ["first"]}] * 2), "share a mask"),
+        (lambda text: text.update(shots=[{"masks": ["first", "second"]}]), "one in each shot"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused_by_name(edited, tmp_path, change, named):
+    out = tmp_path / "out.yaml"
+    with pytest.raises(AppError, match=named):
+        train_aperture(ApertureTraining(out, str(edited(change))), Silent())
+    assert not out.exists()
+
+
+def test_a_name_that_is_no_camera_file_and_two_cameras_are_refused(run):
+    assert run("train", "--aperture", "--out", "a.h5")[0] == 1
+    twice = ("--camera", "learned-aperture", "--camera", "rgbw-mono")
+    assert run("train", "--aperture", *twice, "--out", "a.yaml")[0] == 2
+    assert run("train", "--camera", "rgbw-mono", "--out", "d.h5")[0] == 2
+    assert run("train", "--aperture", "--steps", 3, "--out", "a.yaml")[0] == 2
+
+
+def test_the_shipped_aperture_is_better_than_a_random_one_by_the_moments_of_other_worlds(moments):
+    aperture = aperture_of(find_camera("learned-aperture"))
+    random = aperture.error(np.random.default_rng(5).uniform(0, 1, 2 * VIEWS), moments)
+    gained_db = 10 * math.log10(random / aperture.error(aperture.cells(), moments))
+    assert gained_db > 1
