@@ -51,6 +51,15 @@ def test_a_result_in_memory_is_offered_no_command_without_a_path():
     assert not any("emmc-rig" in line for line in head.next)
 
 
+@pytest.mark.parametrize(("found_db", "tone"), [(20.0, "watch"), (22.0, "good")])
+def test_a_trusted_result_below_its_copied_view_is_not_shown_as_good(found_db, tone):
+    verdict = {"level": "trust", "reasons": []}
+    head = light_field_head({"verdict": verdict, "psnr_db": found_db, "replicate_psnr_db": 21.5})
+    assert head.tone == tone
+    assert ("1.5 dB more than by the copied centre view" in head.why) == (tone == "watch")
+    assert "frames, Psi and light field agree" in head.why
+
+
 def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert typed(tmp_path / "one/two") == "one/two"

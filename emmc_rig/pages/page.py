@@ -75,13 +75,29 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
         return Head("no verdict", why, _uses(source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
     why = [reason["what"] for reason in reasons]
+    agree = "frames, Psi and light field agree"
+    lost_db = _below_copied_db(metrics)
+    if lost_db > 0:
+        why.append(
+            f"{'' if why else agree + ', '}but the truth, which frames do not show, is missed by "
+            f"{lost_db:.1f} dB more than by the copied centre view"
+        )
     remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
     return Head(
         level,
-        "; ".join(why) or "frames, Psi and light field agree",
+        "; ".join(why) or agree,
         [one for one in remedies if one] or _uses(source, viewer),
-        {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad"),
+        {"trust": "watch" if lost_db > 0 else "good", "cannot tell": "watch", "doubt": "watch"}.get(
+            level, "bad"
+        ),
     )
+
+
+def _below_copied_db(metrics: Mapping[str, object]) -> float:
+    """Return by how much a result with a truth falls short of the copied view; 0: it does not."""
+    found, copied = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
+    known = isinstance(found, int | float) and isinstance(copied, int | float)
+    return max(float(copied) - float(found), 0.0) if known else 0.0
 
 
 def _uses(source: str, viewer: bool) -> list[str]:
