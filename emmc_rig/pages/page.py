@@ -96,8 +96,9 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
 def _below_copied_db(metrics: Mapping[str, object]) -> float:
     """Return by how much a result with a truth falls short of the copied view; 0: it does not."""
     found, copied = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
-    known = isinstance(found, int | float) and isinstance(copied, int | float)
-    return max(float(copied) - float(found), 0.0) if known else 0.0
+    if isinstance(found, int | float) and isinstance(copied, int | float):
+        return max(float(copied - found), 0.0)
+    return 0.0
 
 
 def _uses(source: str, viewer: bool) -> list[str]:
