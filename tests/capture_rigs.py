@@ -56,23 +56,23 @@ def frame_bytes(name, exposure_s, size=SIZE):
 
 
 class QuietAttendant:
-    """Does what it is told, and keeps it."""
+    """Does what it is asked, and keeps it."""
 
     def __init__(self):
-        self.told = []
+        self.reported = []
 
     def set_lamp(self, colour):
-        self.told.append(("lamp", colour))
+        self.reported.append(("lamp", colour))
 
     def place(self, target, turn_deg=0.0):
-        self.told.append(("place", target))
+        self.reported.append(("place", target))
 
     def fit_masks(self, shot, fitted=True):
-        self.told.append(("masks", shot, fitted))
+        self.reported.append(("masks", shot, fitted))
 
     @property
     def lamp(self):
-        return [told[1] for told in self.told if told[0] == "lamp"][-1]
+        return [reported[1] for reported in self.reported if reported[0] == "lamp"][-1]
 
 
 def still_rig(size=SIZE) -> Any:

@@ -62,7 +62,7 @@ def pytest_collection_modifyitems(config, items):
 
 def pytest_terminal_summary(terminalreporter):
     """Name the checks that ran on real light fields, or say why none of those chosen did."""
-    told = {
+    reported = {
         outcome: [
             report.nodeid
             for report in terminalreporter.stats.get(outcome, [])
@@ -70,8 +70,8 @@ def pytest_terminal_summary(terminalreporter):
         ]
         for outcome in ("passed", "failed", "error", "skipped")
     }
-    skipped = told.pop("skipped")
-    ran = [f"{outcome}: {name}" for outcome, names in told.items() for name in names]
+    skipped = reported.pop("skipped")
+    ran = [f"{outcome}: {name}" for outcome, names in reported.items() for name in names]
     if ran or skipped:
         terminalreporter.section("real light fields")
         why = "" if ran else f": {NO_LIGHT_FIELDS}"

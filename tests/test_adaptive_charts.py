@@ -102,12 +102,12 @@ def test_what_choosing_saves_is_read_off_the_rows():
     assert (easy.stopped.count, easy.reached, easy.fixed) == (1, True, 1)
     assert (middle.stopped.count, middle.reached, middle.fixed) == (2, True, 2)
     assert (hard.stopped.count, hard.reached, hard.fixed) == (3, False, None)
-    told = list(next_shot.total_savings([easy, middle, hard]))
-    assert told[0] == (
+    reported = list(next_shot.total_savings([easy, middle, hard]))
+    assert reported[0] == (
         "20 dB: 1 shots for 1 scene(s), 1 of which meet it in truth; 1 with the fixed number that "
         "serves them all, 1"
     )
-    assert told[2] == "40 dB: no scene reaches it with the shots there are"
+    assert reported[2] == "40 dB: no scene reaches it with the shots there are"
 
 
 def test_a_plan_to_choose_from_moves_the_mask_and_can_be_calibrated():
@@ -126,9 +126,9 @@ def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     few.write_text(whole.model_copy(update={"views": (3, 3)}).model_dump_json())
     camera = find_camera(str(few))
     folder = open_folder(tmp_path / "out", next_shot.ROWS, "chart --next-shot")
-    told = []
+    reported = []
     watcher = Silent()
-    monkeypatch.setattr(watcher, "step", told.append)
+    monkeypatch.setattr(watcher, "step", reported.append)
 
     def measured():
         return next_shot.next_shots(
@@ -141,6 +141,6 @@ def test_sessions_are_captured_judged_and_kept(tmp_path, monkeypatch):
     assert scene.chosen[0] == scene.in_order[0]
     (session,) = (folder / next_shot.SESSIONS).iterdir()
     assert Session(session).is_complete
-    before = len(told)
+    before = len(reported)
     assert measured() == [scene]
-    assert len(told) == before
+    assert len(reported) == before

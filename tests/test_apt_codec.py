@@ -76,8 +76,12 @@ def test_hardware_information_is_read():
 
 def test_a_complaint_is_read_with_and_without_words():
     data = struct.pack("<HH64s", Id.MOT_MOVE_ABSOLUTE, 8, b"out of range\0junk")
-    told = codec.decode_complaint(Message(Id.HW_RICHRESPONSE, 0, 0, 1, 0x50, data))
-    assert (told.message_id, told.code, told.notes) == (Id.MOT_MOVE_ABSOLUTE, 8, "out of range")
+    reported = codec.decode_complaint(Message(Id.HW_RICHRESPONSE, 0, 0, 1, 0x50, data))
+    assert (reported.message_id, reported.code, reported.notes) == (
+        Id.MOT_MOVE_ABSOLUTE,
+        8,
+        "out of range",
+    )
     bare = codec.decode_complaint(Message(Id.HW_RESPONSE, 7, 0, 1, 0x50))
     assert bare.code == 7
 

@@ -38,12 +38,12 @@ class Bench:
 
     def ask(self, question, answer, param1=1):
         """Send a message as another program would; return the answer."""
-        told = self.device.feed(codec.encode(question, codec.USB_UNIT, param1))
+        reported = self.device.feed(codec.encode(question, codec.USB_UNIT, param1))
         messages = []
-        while told:
-            length = codec.HEADER_SIZE + codec.data_length(told[: codec.HEADER_SIZE])
-            messages.append(codec.decode(told[:length]))
-            told = told[length:]
+        while reported:
+            length = codec.HEADER_SIZE + codec.data_length(reported[: codec.HEADER_SIZE])
+            messages.append(codec.decode(reported[:length]))
+            reported = reported[length:]
         return next(message for message in messages if message.id == answer)
 
 
@@ -162,8 +162,8 @@ def test_the_controllers_own_backlash_correction_is_off(bench):
         codec.encode(Id.MOT_SET_GENMOVEPARAMS, codec.USB_UNIT, data=codec.encode_position(1, 3000))
     )
     bench.stage()
-    told = bench.ask(Id.MOT_REQ_GENMOVEPARAMS, Id.MOT_GET_GENMOVEPARAMS)
-    assert told.data == codec.encode_position(1, 0)
+    reported = bench.ask(Id.MOT_REQ_GENMOVEPARAMS, Id.MOT_GET_GENMOVEPARAMS)
+    assert reported.data == codec.encode_position(1, 0)
 
 
 def test_updates_that_nobody_asked_this_driver_for_do_no_harm(bench):
@@ -186,8 +186,8 @@ def test_automatic_updates_end_when_nobody_acknowledges_them():
 def test_a_speed_reaches_the_controller_in_its_own_units(bench):
     stage = bench.stage()
     stage.set_speed_um_s("x", 1000.0)
-    told = codec.decode_velocity(bench.ask(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS))
-    assert told.maximum == 767_367
+    reported = codec.decode_velocity(bench.ask(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS))
+    assert reported.maximum == 767_367
     assert stage.speed_um_s("x") == pytest.approx(1000.0, rel=1e-5)
 
 
@@ -220,8 +220,8 @@ def test_a_stop_at_once_and_a_profiled_one_both_report(bench):
     for mode in (1, codec.STOP_PROFILED):
         bench.device.feed(codec.encode(Id.MOT_MOVE_ABSOLUTE, codec.USB_UNIT, data=move))
         bench.clock.sleep(1.0)
-        told = bench.device.feed(codec.encode(Id.MOT_MOVE_STOP, codec.USB_UNIT, 1, mode))
+        reported = bench.device.feed(codec.encode(Id.MOT_MOVE_STOP, codec.USB_UNIT, 1, mode))
         bench.clock.sleep(2.0)
-        told += bench.device.due()
-        assert told[:2] == Id.MOT_MOVE_STOPPED.to_bytes(2, "little")
+        reported += bench.device.due()
+        assert reported[:2] == Id.MOT_MOVE_STOPPED.to_bytes(2, "little")
     assert 0 < bench.device.position_um() < 19_000.0

@@ -263,9 +263,9 @@ def test_that_the_mask_has_moved_is_reported_and_psi_mended(calibrated, tmp_path
     frames = frames_of(tmp_path / "frames", camera, moved)
     out = tmp_path / "mended"
     out.mkdir()
-    told = run_drift(known, frames, out, QUICK)
-    assert told["drifted"]
-    assert "Psi no longer fits" in told["words"]
+    reported = run_drift(known, frames, out, QUICK)
+    assert reported["drifted"]
+    assert "Psi no longer fits" in reported["words"]
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["values"]["shift_x_um"] == pytest.approx(9.0, abs=1.0)
     assert metrics["values"]["shift_y_um"] == pytest.approx(-8.0, abs=1.0)
@@ -285,9 +285,9 @@ def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_writ
     moved = moved_truth(truth, (40.0, -8.0, 0.0, 0.0, 0.0))
     out = tmp_path / "mended"
     out.mkdir()
-    told = run_drift(known, frames_of(tmp_path / "frames", camera, moved), out, QUICK)
-    assert told["drifted"]
-    assert told["values"]["shift_x_um"] == pytest.approx(40.0, abs=1.0)
+    reported = run_drift(known, frames_of(tmp_path / "frames", camera, moved), out, QUICK)
+    assert reported["drifted"]
+    assert reported["values"]["shift_x_um"] == pytest.approx(40.0, abs=1.0)
     before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
     true = WhiteboardBench(camera, (48, 64), moved).true_psi()
     good = np.ones((48, 64), dtype=bool)

@@ -49,8 +49,8 @@ def test_the_plan_written_is_one_that_captures(captured):
 def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
     out = captured / "calibration"
     assert exit_code("calibrate", captured / "session", "--out", out) == 0
-    told = capsys.readouterr().out
-    assert "of the noise's variance" in told
+    reported = capsys.readouterr().out
+    assert "of the noise's variance" in reported
     metrics = json.loads((out / "metrics.json").read_text())
     judged = metrics["held_out"][metrics["chosen"]]
     assert judged["relative_error"] < 0.01
@@ -85,9 +85,9 @@ def test_the_free_route_takes_the_same_session(captured):
 def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured, capsys):
     out = captured / "sensor"
     assert exit_code("calibrate", captured / "session", "--sensor", "--out", out) == 0
-    told = capsys.readouterr().out
+    reported = capsys.readouterr().out
     # The series ends below saturation: what follows from it is no more than a bound.
-    assert "Saturation capacity, at least" in told
+    assert "Saturation capacity, at least" in reported
     figures = json.loads((out / "sensor.json").read_text())
     noise = find_camera("rgbw-bayer-1shot").sensor.noise
     gain, read = (figures[name] for name in ("Overall system gain K", "Temporal dark noise"))
@@ -151,10 +151,10 @@ def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, c
     taken = ("capture", plan / "plan.yaml", *RIG, "--flaws", EFFECTS, "--out", session)
     assert exit_code(*taken) == 0
     assert exit_code("calibrate", session, "--out", out) == 0
-    told = capsys.readouterr().out
+    reported = capsys.readouterr().out
     for named in ("lamp drifted", "response loses", "colour filters", "white board is uneven"):
-        assert f"found: the {named}" in told.replace("the sensor's", "the")
-    assert "not measured" not in told
+        assert f"found: the {named}" in reported.replace("the sensor's", "the")
+    assert "not measured" not in reported
     flaws = flawed(NO_FLAWS, EFFECTS.split(","))
     truth = BenchTruth(flaws.mounting, flaws.optics, flaws.sensor, flaws.board, flaws.lamp, 1024)
     true = WhiteboardBench(find_camera("rgbw-bayer-1shot"), SIZE, truth).true_psi()

@@ -253,11 +253,11 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
 
 
 def test_ctrl_c_stops_after_the_frame_and_the_second_one_now():
-    control, told = Control(), []
-    with interruptible(control, told.append):
+    control, reported = Control(), []
+    with interruptible(control, reported.append):
         signal.raise_signal(signal.SIGINT)
         assert control.stopping
-        assert "stopping after this frame" in told[0]
+        assert "stopping after this frame" in reported[0]
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
@@ -466,9 +466,9 @@ def test_a_full_disk_is_reported_in_one_line_with_what_is_safe():
     rig = still_rig()
     session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
     line = "disk is full; make room, then run the same"
-    with pytest.raises(AppError, match=line) as told, disk_faults_named(session):
+    with pytest.raises(AppError, match=line) as reported, disk_faults_named(session):
         Sequencer(session, plan, rig).run()
-    assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(told.value)
+    assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(reported.value)
     assert rig.attendant.lamp == "off"
     assert rig.stage.stops == 1
 
@@ -482,9 +482,9 @@ def test_a_read_only_disk_is_reported_in_one_line():
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     disk.before = refuse
-    with pytest.raises(AppError, match="disk is read-only") as told, disk_faults_named(session):
+    with pytest.raises(AppError, match="disk is read-only") as reported, disk_faults_named(session):
         Sequencer(session, plan, rig).run()
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(reported.value)
     assert rig.stage.moves == 0
 
 

@@ -1,7 +1,7 @@
 """Every error that a capture can end in: its advice, carried out, ends in a complete session.
 
 The texts are taken from the source: one without a walk here fails the test, as does a walk without
-its text. A walk brings the fault about, yields what the program said, and does as it is told.
+its text. A walk brings the fault about, yields what the program said, and does as it says.
 """
 
 import ast

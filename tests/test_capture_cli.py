@@ -458,8 +458,8 @@ def test_sessions_are_found_by_camera_date_verdict_and_psnr_below_a_folder(captu
     shutil.copytree(folder / "plan-session", tmp_path / "b/two")
     results = tmp_path / "a/one/reconstruction"
     results.mkdir()
-    told = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
-    (results / "metrics.json").write_text(json.dumps(told))
+    reported = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
+    (results / "metrics.json").write_text(json.dumps(reported))
 
     def listed(*wanted):
         code, out, err = run("session", "list", tmp_path, "--json", *wanted)
@@ -498,10 +498,10 @@ def test_a_wrong_search_exits_with_2(run, arguments, said):
 
 
 @pytest.mark.parametrize(
-    ("axis", "told"),
+    ("axis", "reported"),
     [("lens", "the stage has no such axis, only mask_x"), ("mask_x", "give its zero_um instead")],
 )
-def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, axis, told):
+def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, axis, reported):
     (tmp_path / "rig.yaml").write_text(
         f"kind: simulated\nfocus_um: 9000\nstands_um: {{{axis}: 100}}\n"
     )
@@ -509,5 +509,5 @@ def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, ax
     rig = ("--rig", tmp_path / "rig.yaml", "--size", "24x32")
     code, _, err = run("capture", tmp_path / "plan.yaml", *rig)
     assert code == 1
-    assert told in one_line(err)
+    assert reported in one_line(err)
     assert not (tmp_path / "plan-session").exists()

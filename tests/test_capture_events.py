@@ -187,9 +187,9 @@ def test_the_estimate_knows_metered_exposures_from_the_last_session_of_the_same_
     by_earlier = pace.estimate(frames, known_exposures(Exposures(planned, earlier), {}, []))
     entries = first.journal.entries
     metered = known_exposures(Exposures(planned), first_meterings(first), entries)
-    for told in (by_earlier, pace.estimate(frames, metered)):
-        assert told.guessed == 0
-        assert told.exposing_s == pytest.approx(truly_s, rel=0.02)
+    for reported in (by_earlier, pace.estimate(frames, metered)):
+        assert reported.guessed == 0
+        assert reported.exposing_s == pytest.approx(truly_s, rel=0.02)
     assert unknown.exposing_s < truly_s / 2
 
 
@@ -198,8 +198,8 @@ def test_what_a_frame_costs_beside_its_exposure_is_learnt():
     for _ in range(100):
         pace.learn(2.5, exposure_s=2.0, moving_s=0.1)
     frames = begun(Path("/disk"), SimulatedDisk(), still_rig())[0].frames
-    told = pace.estimate(frames, lambda frame: 0.0)
-    assert told.downloading_s == pytest.approx(0.4 * len(frames), rel=0.01)
+    reported = pace.estimate(frames, lambda frame: 0.0)
+    assert reported.downloading_s == pytest.approx(0.4 * len(frames), rel=0.01)
 
 
 def test_a_callback_may_look_at_errors_of_devices(plan):

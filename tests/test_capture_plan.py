@@ -142,13 +142,13 @@ def test_an_estimate_counts_exposures_moves_and_bytes():
     bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0)]
     frames = [PlannedFrame(f"f{i}", "shot", one, 2.0) for i, one in enumerate(bench)]
     pace = Pace({"mask_x": 1000.0}, settle_s=1.0, frame_bytes=1_000_000)
-    told = pace.estimate(frames, lambda frame: frame.exposure_s)
-    assert told.exposing_s == 4.0
-    assert told.guessed == 0
+    reported = pace.estimate(frames, lambda frame: frame.exposure_s)
+    assert reported.exposing_s == 4.0
+    assert reported.guessed == 0
     # Two moves settle for 1 s each and the second goes 4 mm at 1 mm/s.
-    assert 6.0 <= told.moving_s <= 7.0
-    assert 2e6 <= told.bytes <= 2.1e6
-    assert told.by_hand == 0
+    assert 6.0 <= reported.moving_s <= 7.0
+    assert 2e6 <= reported.bytes <= 2.1e6
+    assert reported.by_hand == 0
 
 
 @pytest.mark.parametrize(
@@ -180,10 +180,10 @@ def test_sizes_are_shown_for_people():
     ],
 )
 def test_a_bad_plan_gives_one_line_that_names_what_is_wrong(tmp_path, changes, line):
-    with pytest.raises(AppError) as told:
+    with pytest.raises(AppError) as reported:
         load_plan(plan_file(tmp_path, **changes))
-    assert line in str(told.value)
-    assert "\n" not in str(told.value)
+    assert line in str(reported.value)
+    assert "\n" not in str(reported.value)
 
 
 def test_a_view_that_the_camera_has_not_is_reported():

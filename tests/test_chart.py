@@ -130,7 +130,7 @@ def test_growth_is_fitted_and_compared_with_what_the_method_counts():
     growth, of_shots = growths([pixels, shots], results)
     assert growth.exponent == pytest.approx(1.3)
     assert growth.expected == pytest.approx(1)
-    # 1 byte in a thousand, so that the smallest picture adds too little to be told from noise.
+    # 1 byte in a thousand, so that the smallest picture adds too little to differ from noise.
     assert growth.at[0] * 1e-3 < 8 < growth.at[1] * 1e-3
     assert growth.memory_exponent == pytest.approx(1)
     assert growth.expected_memory == pytest.approx(1)
@@ -140,19 +140,19 @@ def test_growth_is_fitted_and_compared_with_what_the_method_counts():
 
 
 def test_the_lock_lets_one_in_and_names_who_holds_it(tmp_path):
-    path, told = tmp_path / "lock", []
+    path, reported = tmp_path / "lock", []
 
     def give_up(_):
         raise TimeoutError
 
     with timing_lock("the first", path):  # noqa: SIM117
-        with pytest.raises(TimeoutError), timing_lock("the second", path, told.append, give_up):
+        with pytest.raises(TimeoutError), timing_lock("the second", path, reported.append, give_up):
             pytest.fail("two at once")
-    assert len(told) == 1
-    assert told[0].endswith("the first")
-    with timing_lock("the third", path, told.append, give_up):
+    assert len(reported) == 1
+    assert reported[0].endswith("the first")
+    with timing_lock("the third", path, reported.append, give_up):
         pass
-    assert len(told) == 1
+    assert len(reported) == 1
 
 
 def test_a_child_keeps_the_lock_when_its_parent_is_gone(tmp_path):
@@ -174,8 +174,10 @@ def test_a_child_keeps_the_lock_when_its_parent_is_gone(tmp_path):
 def test_the_peak_of_memory_is_not_the_parents():
     held = np.ones(200 * 2**17)
     code = "from emmc_rig.files.memory import peak_memory_mib; print(peak_memory_mib())"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 0 < float(told.stdout) < 150 < peak_memory_mib()
+    reported = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert 0 < float(reported.stdout) < 150 < peak_memory_mib()
     assert held.nbytes == 200 * 2**20
 
 

@@ -185,9 +185,9 @@ def test_a_worker_outlives_what_fails_and_tells_each_jobs_peak(job, tmp_path):
     ):
         first = worker.measure(job)
         process = worker._process
-        told = worker.measure(wrong)
-        assert "none.h5" in told["failed"]
-        assert not told["keep"]
+        reported = worker.measure(wrong)
+        assert "none.h5" in reported["failed"]
+        assert not reported["keep"]
         wide, again = worker.measure(later), worker.measure(job)
         assert (worker._process is process) == worker.lasting
     assert first["cores"] == 1
@@ -236,7 +236,7 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told", "expected"),
+    ("arguments", "reported", "expected"),
     [
         (["--method", "tv-dic"], "did you mean 'tv-dict'", 1),
         (["--scene", "nowhere"], "no scene 'nowhere'", 1),
@@ -247,12 +247,12 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
         (["--out", "mine"], "something else than an earlier `emmc-rig chart`", 1),
     ],
 )
-def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, told, expected):
+def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, reported, expected):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     code, _, err = command("chart", "--fast", "--method", "tv", *arguments)
     assert code == expected
-    assert told in err
+    assert reported in err
     assert "Traceback" not in err
 
 

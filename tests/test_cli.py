@@ -126,7 +126,7 @@ def test_faults_of_scenes_are_one_line(run, tmp_path):
     (tmp_path / "broken/view_1_0.png").write_text("no picture")
     views_in(tmp_path / "single", 1, 2)
     (tmp_path / "empty").mkdir()
-    for scene, told in {
+    for scene, reported in {
         "gap": "view_0_1",
         "mixed": "view_1_1",
         "broken": "view_1_0",
@@ -136,13 +136,13 @@ def test_faults_of_scenes_are_one_line(run, tmp_path):
     }.items():
         code, _, err = run("demo", "--scene", scene, "--out", "r")
         assert code == 1
-        assert told in one_line(err)
+        assert reported in one_line(err)
     assert not (tmp_path / "r").exists()
     assert not leftovers(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"viewss": [2, 2]}, "did you mean 'views'"),
         ({"sensor": {"cfa": "rggg"}}, "unknown CFA 'rggg'"),
@@ -176,12 +176,12 @@ def test_faults_of_scenes_are_one_line(run, tmp_path):
         ),
     ],
 )
-def test_faults_of_cameras_are_one_line(run, tmp_path, changes, told):
+def test_faults_of_cameras_are_one_line(run, tmp_path, changes, reported):
     camera_file(tmp_path / "c.yaml", **changes)
     for command in ("demo", "simulate"):
         code, _, err = run(command, *SMALL, "--camera", "c.yaml", "--out", "r")
         assert code == 1
-        assert told in one_line(err)
+        assert reported in one_line(err)
     assert not (tmp_path / "r").exists()
 
 
@@ -277,14 +277,14 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
 
 def test_an_export_says_what_is_missing_of_what_it_was_given(run, tmp_path):
     assert run("simulate", "--size", "32x32", "--out", "taken")[0] == 0
-    for given, told in {
+    for given, reported in {
         "taken": "holds frames, no light field; run: emmc-rig reconstruct taken",
         "near-plana": "did you mean 'near-planar'?",
         "nothing": "no folder or file 'nothing', and no built-in scene: known are",
     }.items():
         code, _, err = run("export", given, "--out", "r")
         assert code == 1
-        assert told in one_line(err)
+        assert reported in one_line(err)
     assert not (tmp_path / "r").exists()
 
 

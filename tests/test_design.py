@@ -120,7 +120,7 @@ def test_a_mask_shows_the_disparity_that_an_open_camera_cannot():
         camera = Candidate("random_binary", share, 36.0, 0.12).camera(SMALL)
         return bounds(camera, printed_psi(camera, SIZE, PLAIN), (-1, 1)).disparity_px
 
-    # Blur grows to both sides of focus alike: its sign is not told.
+    # Blur grows to both sides of focus alike: its sign does not show.
     assert bound_px(1.0) > 4 * bound_px(0.5)
 
 

@@ -111,8 +111,8 @@ def test_the_command_judges_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
         *["--camera", "rgbw-bayer-1shot", "--fault", "mask-shift", "--size", "32x40"],
         *["--out", str(tmp_path / "out")],
     ]
-    told = CliRunner().invoke(app, arguments)
-    assert told.exit_code == 0, told.output
+    reported = CliRunner().invoke(app, arguments)
+    assert reported.exit_code == 0, reported.output
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["results"] == 4
     assert metrics["tallies"]["all, all"]["broken_flagged"] >= 1

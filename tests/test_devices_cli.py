@@ -141,19 +141,19 @@ def test_the_rigs_own_chain_gets_the_rigs_own_names():
 
 
 @pytest.mark.parametrize(
-    ("protocol", "firmware", "told"),
+    ("protocol", "firmware", "reported"),
     [
         ("zaber", ZaberChain, "axes 2"),
         ("grbl", GrblController, "version 1.1h"),
         ("apt", AptController, "KDC101, serial number 27000001"),
     ],
 )
-def test_probing_names_what_answers(run, protocol, firmware, told):
+def test_probing_names_what_answers(run, protocol, firmware, reported):
     with PtyServer(firmware(SYSTEM_CLOCK)) as server:
         code, out, _ = run("probe", server.port)
     assert code == 0
     assert f"{server.port}: {protocol}: " in out
-    assert told in out
+    assert reported in out
 
 
 def test_probing_asks_a_known_adapter_in_its_own_protocol_only(monkeypatch):
@@ -198,7 +198,7 @@ def test_what_a_command_costs_is_measured(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["info", "--stage", "zaber:/dev/no-such-port"], "does not exist"),
         (["info", "--stage", "teapot:/dev/ttyUSB0"], "one of zaber, grbl, apt"),
@@ -213,10 +213,10 @@ def test_what_a_command_costs_is_measured(run, tmp_path):
         (["serve", "teapot"], "no simulated stage"),
     ],
 )
-def test_faults_are_one_line_that_says_what_to_do(run, arguments, told):
+def test_faults_are_one_line_that_says_what_to_do(run, arguments, reported):
     code, _, err = run(*arguments)
     assert code == 1
-    assert told in one_line(err)
+    assert reported in one_line(err)
 
 
 @pytest.mark.parametrize("arguments", [["info"], ["info", "--rig", "real"], ["jog", "x"]])
@@ -225,7 +225,7 @@ def test_wrong_usage_is_exit_code_2(run, arguments):
 
 
 @pytest.mark.parametrize(
-    ("wiring", "told"),
+    ("wiring", "reported"),
     [
         ({"protocol": "zaber", "port": "p", "axis": {}}, "did you mean 'axes'"),
         ({"protocol": "zaber", "port": "p", "microstep_um": -1}, "greater than 0"),
@@ -235,10 +235,10 @@ def test_wrong_usage_is_exit_code_2(run, arguments):
         ({"port": "p"}, "protocol must be one of"),
     ],
 )
-def test_faults_of_a_stage_file_are_one_line(tmp_path, wiring, told):
+def test_faults_of_a_stage_file_are_one_line(tmp_path, wiring, reported):
     path = tmp_path / "rig.yaml"
     path.write_text(yaml.safe_dump(wiring))
-    with pytest.raises(AppError, match=told):
+    with pytest.raises(AppError, match=reported):
         parse_stage(str(path))
 
 
@@ -359,17 +359,17 @@ def test_list_and_probe_know_the_simulated_rig(run):
     assert "ptp:S1" in listed
     assert "simulated:grbl" in listed
     for protocol, answer in (("zaber", "zaber: device 1"), ("grbl", "grbl: "), ("apt", "KDC101")):
-        code, probed, told = run("probe", "--rig", f"simulated:{protocol}")
+        code, probed, reported = run("probe", "--rig", f"simulated:{protocol}")
         assert code == 0
         assert answer in probed
-        assert told == ""
+        assert reported == ""
     assert run("probe", "--rig", "mine")[0] == 2
 
 
 def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
-    code, told, _ = run("snap", "--rig", "simulated", "--out", tmp_path / "snaps")
+    code, reported, _ = run("snap", "--rig", "simulated", "--out", tmp_path / "snaps")
     assert code == 0
-    assert "frame-0001.dng: 240x320 rggb" in told.replace("\n", "")
+    assert "frame-0001.dng: 240x320 rggb" in reported.replace("\n", "")
     assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320
 
 

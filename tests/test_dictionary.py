@@ -48,7 +48,7 @@ def test_normalising_keeps_directions():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (lambda a: 2 * a, "atom 0 has norm 2"),
         (lambda a: a[0], "(atom, v, u, y, x, c)"),
@@ -59,10 +59,10 @@ def test_normalising_keeps_directions():
         (lambda a: np.where(np.arange(6).reshape(6, 1, 1, 1, 1, 1) == 2, 0, a), "atom 2"),
     ],
 )
-def test_what_is_no_set_of_unit_atoms_is_refused(some, change, told):
+def test_what_is_no_set_of_unit_atoms_is_refused(some, change, reported):
     with pytest.raises(DictionaryError) as fault:
         Dictionary(change(some.atoms), "ksvd")
-    assert told in str(fault.value)
+    assert reported in str(fault.value)
 
 
 def test_zero_atoms_cannot_be_normalised(some):
@@ -83,17 +83,17 @@ def test_a_fitting_dictionary_is_passed_on(some):
 
 
 @pytest.mark.parametrize(
-    ("views", "patch", "colours", "told"),
+    ("views", "patch", "colours", "reported"),
     [
         ((2, 3), PATCH, 3, "3x2 views, not 2x3"),
         (VIEWS, (5, 5), 3, "4x5 pixels, not 5x5"),
         (VIEWS, PATCH, 1, "3 colour(s), not 1"),
     ],
 )
-def test_a_dictionary_of_other_patches_names_what_differs(some, views, patch, colours, told):
+def test_a_dictionary_of_other_patches_names_what_differs(some, views, patch, colours, reported):
     with pytest.raises(ReconstructionError) as fault:
         some.checked(views, patch, colours)
-    assert told in str(fault.value)
+    assert reported in str(fault.value)
     assert str(fault.value).count("not") == 1
     assert "train" in str(fault.value)
 
@@ -204,7 +204,7 @@ def test_more_cosines_than_samples_are_an_overcomplete_set():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (((0, 5), (9, 9)), "0x5 views"),
         (((5, 5), (9, 0)), "9x0 pixels"),
@@ -212,8 +212,8 @@ def test_more_cosines_than_samples_are_an_overcomplete_set():
         (((5, 5), (9, 9), (1, 1, 1, 0)), "4 numbers"),
     ],
 )
-def test_cosines_of_nothing_are_refused(arguments, told):
-    with pytest.raises(DictionaryError, match=told):
+def test_cosines_of_nothing_are_refused(arguments, reported):
+    with pytest.raises(DictionaryError, match=reported):
         dct_dictionary(*arguments)
 
 

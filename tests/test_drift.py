@@ -1,4 +1,4 @@
-"""Blind drift: what has moved since the calibration, told and mended from scene captures alone."""
+"""Blind drift: what has moved since calibration, found and mended from scene captures alone."""
 
 from dataclasses import replace
 from functools import cache

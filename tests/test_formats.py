@@ -223,9 +223,9 @@ def test_the_command_writes_what_it_lists(tmp_path, monkeypatch):
     code, listed, _ = program("export", "--list")
     assert code == 0
     assert [line.split()[0] for line in listed.splitlines()] == [VIEWER.name, *FORMATS]
-    code, told, err = program("export", "near-planar", "--format", "lftoolbox", "--out", "mat")
+    code, reported, err = program("export", "near-planar", "--format", "lftoolbox", "--out", "mat")
     assert code == 0, err
-    assert "light_field.mat" in told
+    assert "light_field.mat" in reported
     assert json.loads((tmp_path / "mat/metrics.json").read_text())["shape"] == [5, 5, 192, 256, 3]
     assert program("export", "mat/light_field.mat", "--format", "no-such")[0] == 2
     assert program("export", "--format", "tiff")[0] == 2

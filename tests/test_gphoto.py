@@ -41,12 +41,12 @@ from simulators.ptp_canon import EosCameraSimulator
 from simulators.ptpip import PtpIpServer
 
 mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
-told = json.loads(sys.argv[1])
-make = EosCameraSimulator if told["eos"] else PtpCameraSimulator
-if told["hidden"] is not None:
-    make.hidden = tuple(told["hidden"])
-settings = {"old": True} if told["eos"] == "old" else {}
-camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=told["quality"], **settings)
+given = json.loads(sys.argv[1])
+make = EosCameraSimulator if given["eos"] else PtpCameraSimulator
+if given["hidden"] is not None:
+    make.hidden = tuple(given["hidden"])
+settings = {"old": True} if given["eos"] == "old" else {}
+camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=given["quality"], **settings)
 asked, respond = [], camera.respond
 
 def noted(request, data):
@@ -54,7 +54,7 @@ def noted(request, data):
     return respond(request, data)
 
 camera.respond = noted
-for fault in told["faults"]:
+for fault in given["faults"]:
     camera.faults.inject(fault)
 with PtpIpServer(camera) as server:
     print(server.port, flush=True)
@@ -70,9 +70,9 @@ def served(quality="raw", faults=(), eos="", hidden=None):
     of it when it ended: the number of files left on its card, and all that it was asked. hidden:
     properties that it does not have, instead of those that such a camera usually has not.
     """
-    told = json.dumps({"quality": quality, "faults": faults, "eos": eos, "hidden": hidden})
+    reported = json.dumps({"quality": quality, "faults": faults, "eos": eos, "hidden": hidden})
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVER, told],
+        [sys.executable, "-c", SERVER, reported],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -69,9 +69,9 @@ def test_a_second_question_before_the_answer_is_not_answered_and_none_while_homi
     bench.say(b"$H\n")
     assert bench.say(b"??") == ""
     bench.clock.sleep(60.0)
-    told = bench.say(b"")
-    assert told.count("<") == 1
-    assert told.startswith("ok\r\n<Idle|")
+    reported = bench.say(b"")
+    assert reported.count("<") == 1
+    assert reported.startswith("ok\r\n<Idle|")
 
 
 def test_moves_are_jogs_in_machine_coordinates_that_leave_the_modes_alone(bench):

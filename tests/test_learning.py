@@ -137,12 +137,12 @@ def test_a_doubled_atom_is_taken_once():
 
 
 @pytest.mark.parametrize(
-    ("samples", "sparsity", "told"),
+    ("samples", "sparsity", "reported"),
     [(SAMPLES + 1, 3, "atoms have 48"), (SAMPLES, 0, "sparsity"), (SAMPLES, 61, "1 to 60")],
 )
-def test_pursuits_that_cannot_be_are_refused(samples, sparsity, told):
+def test_pursuits_that_cannot_be_are_refused(samples, sparsity, reported):
     truth, _ = planted(1)
-    with pytest.raises(DictionaryError, match=told):
+    with pytest.raises(DictionaryError, match=reported):
         batch_omp(truth, np.zeros((4, samples), np.float32), sparsity)
 
 
@@ -341,7 +341,7 @@ def test_every_step_is_seen_and_steps_do_not_change_their_input():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (lambda p: p[:, :-1], "needs (patch, 48)"),
         (lambda p: p[:20], "20 patches for 60 atoms"),
@@ -350,12 +350,12 @@ def test_every_step_is_seen_and_steps_do_not_change_their_input():
         (lambda p: np.zeros_like(p), "too few to start"),
     ],
 )
-def test_patches_that_teach_nothing_are_refused(change, told):
+def test_patches_that_teach_nothing_are_refused(change, reported):
     _, patches = planted(100)
     for learn in (learn_ksvd, learn_online):
         with pytest.raises(DictionaryError) as fault:
             learn(change(patches), SHAPE, settings_of())
-        assert told in str(fault.value)
+        assert reported in str(fault.value)
 
 
 def test_settings_that_fit_no_patches_are_refused():
@@ -445,12 +445,12 @@ def test_separable_bases_stay_orthonormal():
 def test_separable_training_refuses_what_teaches_nothing():
     _, patches = planted(100)
     settings = SeparableSettings(pairs=4)
-    for wrong, told in (
+    for wrong, reported in (
         (patches[:, 1:], "needs"),
         (patches[:3], "3 patches for 4 pairs"),
         (patches * np.nan, "not finite"),
     ):
-        with pytest.raises(DictionaryError, match=told):
+        with pytest.raises(DictionaryError, match=reported):
             learn_separable(wrong, SHAPE, settings)
 
 
@@ -549,12 +549,12 @@ def test_scenes_that_give_no_patches_are_refused():
     settings = PatchSettings(rows=9, columns=9, count=8)
     broken = ramp_scene()
     broken[1, 1, 3, 3] = np.nan
-    for scenes, told in (
+    for scenes, reported in (
         ([], "no scenes"),
         ([lambda: ramp_scene(size=(8, 20))], "8x20 pixels, less than a patch of 9x9"),
         ([ramp_scene, lambda: ramp_scene(views=(2, 3))], "2x3 views of 3 colours, the first 3x3"),
         ([ramp_scene, lambda: ramp_scene(colours=1)], "of 1 colours"),
         ([lambda: broken], "not finite"),
     ):
-        with pytest.raises(DictionaryError, match=told):
+        with pytest.raises(DictionaryError, match=reported):
             training_patches(scenes, settings)

@@ -214,8 +214,8 @@ def centred_um(rig):
 def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
     with watching(rig.camera, rig.stage, rig.attendant.place, ("scene",), centred_um(rig)) as watch:
         watch.jog("mask_x", 100.0)
-        told = until(watch, lambda state: state["trouble"]["stage"])
-        assert "home" in told["trouble"]["stage"]
+        reported = until(watch, lambda state: state["trouble"]["stage"])
+        assert "home" in reported["trouble"]["stage"]
         watch.centre()
         lit = until(
             watch, lambda state: state["axes"]["mask_x"]["position_um"] and not state["busy"]
@@ -361,8 +361,8 @@ def test_a_stop_that_the_stage_refuses_is_trouble():
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
         watch.stop()
-        told = until(watch, lambda state: state["trouble"]["stage"])
-        assert told["trouble"]["stage"].startswith("not stopped")
+        reported = until(watch, lambda state: state["trouble"]["stage"])
+        assert reported["trouble"]["stage"].startswith("not stopped")
         stage.stopped.set()
 
 
@@ -379,9 +379,9 @@ def test_a_dark_picture_with_the_mask_away_offers_to_centre_it():
     camera.light = 0.0
     stage = SlowStage()
     with watching(camera, stage, None, (), {"mask_x": 100.0}) as watch:
-        told = until(watch, lambda state: state["hint"] and state["axes"])
-        assert told["hint"]["action"] == "centre"
-        assert "mask_x" in told["hint"]["text"]
+        reported = until(watch, lambda state: state["hint"] and state["axes"])
+        assert reported["hint"]["action"] == "centre"
+        assert "mask_x" in reported["hint"]["text"]
         stage.place_um = 100.0
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
@@ -412,8 +412,8 @@ def test_an_exposure_beyond_the_camera_is_said_to_be():
     with watching(camera) as watch:
         until(watch, lambda state: state["figures"])
         watch.auto_expose()
-        told = until(watch, lambda state: state["trouble"]["setting"])
-        assert "no better exposure" in told["trouble"]["setting"]
+        reported = until(watch, lambda state: state["trouble"]["setting"])
+        assert "no better exposure" in reported["trouble"]["setting"]
 
 
 @contextmanager
@@ -487,10 +487,10 @@ def test_values_that_make_no_sense_are_refused_in_one_line():
             ("centre", "{}"),
             ("look", '{"target": "moon"}'),
         ):
-            status, _, told = ask("POST", f"/{TOKEN}/do/{path}", body)
+            status, _, reported = ask("POST", f"/{TOKEN}/do/{path}", body)
             assert status == 400, (path, body)
-            assert told.endswith(b"\n")
-            assert told.count(b"\n") == 1
+            assert reported.endswith(b"\n")
+            assert reported.count(b"\n") == 1
         assert ask("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
         assert ask("POST", f"/{TOKEN}/do/exposure", " " * 200_000)[0] == 413
         assert ask("GET", f"/{TOKEN}/picture.jpg?part=x")[0] == 400
@@ -502,9 +502,9 @@ def test_read_only_shows_and_does_nothing():
     camera = FakeCamera()
     with watching(camera) as watch, served(watch, read_only=True) as ask:
         until(watch, lambda state: state["frame"])
-        status, _, told = ask("POST", f"/{TOKEN}/do/exposure", '{"seconds": 0.05}')
+        status, _, reported = ask("POST", f"/{TOKEN}/do/exposure", '{"seconds": 0.05}')
         assert status == 403
-        assert b"read-only" in told
+        assert b"read-only" in reported
         assert json.loads(ask("GET", f"/{TOKEN}/state")[2])["read_only"]
         assert ask("GET", f"/{TOKEN}/picture.jpg")[0] == 200
     assert camera.exposure_s == 0.01
@@ -582,7 +582,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "reported"),
     [
         (("--camera", "nonsense:"), 1, "no such kind of camera"),
         (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
@@ -592,10 +592,10 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         (("--rig", "simulated", "--size", "32x48", "--psi", "nowhere"), 1, "no Psi"),
     ],
 )
-def test_bad_arguments_are_reported_in_one_line(arguments, code, told, capsys):
+def test_bad_arguments_are_reported_in_one_line(arguments, code, reported, capsys):
     assert exit_code("live", *arguments) == code
     shown = capsys.readouterr().err
-    assert told in shown.replace("\n", " ")
+    assert reported in shown.replace("\n", " ")
     assert "Traceback" not in shown
 
 

@@ -175,6 +175,6 @@ def test_what_was_seen_may_be_forgotten_while_the_best_of_it_is_looked_for(monke
     monkeypatch.setattr(focus, "sharpness", lambda *_: Forgetful())
     frame = noisy(1.0, 0)
     meter._before = frame
-    told = meter.add(frame, 1.0)
-    assert told is not None
-    assert told["share"] == 1.0
+    reported = meter.add(frame, 1.0)
+    assert reported is not None
+    assert reported["share"] == 1.0

@@ -163,10 +163,10 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
     live.update(second)
 
     def finished():
-        told = live.update(second)
-        return told if told["verdict"] else None
+        reported = live.update(second)
+        return reported if reported["verdict"] else None
 
-    told = until(finished)
+    reported = until(finished)
     refined = live.refined()
     assert refined is not None
     noise = camera.sensor.noise
@@ -178,8 +178,8 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
         noise_sigma=refined[0].parameters["noise_sigma"],
     )
     assert np.abs(refined[0].light_field - expected.light_field).max() < 1e-5
-    assert told["verdict"]["level"] == expected.verdict.level
-    assert "as emmc-rig reconstruct" in told["stage"]
+    assert reported["verdict"]["level"] == expected.verdict.level
+    assert "as emmc-rig reconstruct" in reported["stage"]
     shown = live.pictures()
     assert shown is not None
     assert shown.export.light_field is refined[0].light_field
@@ -221,8 +221,8 @@ def test_noise_is_no_change_and_a_changed_scene_ends_the_reconstruction(one_shot
     frames = [live_frames(camera, psi, scene, seed)[0] for seed in range(4)]
     for number, frame in enumerate(frames):
         clock.now = float(number)
-        told = live.update(frame)
-    assert "at work" in told["stage"]
+        reported = live.update(frame)
+    assert "at work" in reported["stage"]
     assert live.update(live_frames(camera, psi, other, 9)[0])["stage"] == "preview"
     until(lambda: given_up)
     live.close()

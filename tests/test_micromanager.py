@@ -79,8 +79,8 @@ def demo_stage(axes=None, **setup):
 
 def places_in(frame):
     """Where the SequenceTester's devices were while its camera exposed the frame."""
-    told = decode_image(frame.mosaic.astype(np.uint8))
-    return {(one.device, one.property): one.value for one in told.current_state}
+    reported = decode_image(frame.mosaic.astype(np.uint8))
+    return {(one.device, one.property): one.value for one in reported.current_state}
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def seen(viewer):
         QApplication.processEvents()
     return viewer.screenshot(canvas_only=True, flash=False)[..., :3]
 
-told = []
+reported = []
 for number, path in enumerate(paths):
     viewer = napari.Viewer(show=True)
     viewer.open(path, plugin="emmc-rig")
@@ -70,9 +70,9 @@ for number, path in enumerate(paths):
         pictures["focused"] = seen(viewer)
         shown["focused"] = viewer.layers[1].metadata["disparities_px"][20]
     np.savez(f"{folder}/{number}.npz", **pictures)
-    told.append(shown)
+    reported.append(shown)
     viewer.close()
-print(json.dumps(told))
+print(json.dumps(reported))
 """
 
 
@@ -215,8 +215,8 @@ def test_naparis_window_shows_views_refocus_psi_and_session_by_sliders(result, s
     if "no Qt platform plugin could be initialized" in done.stderr:
         pytest.skip("Qt cannot open a window here: its xcb plug-in lacks libraries")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert [one["sliders"] for one in told] == [
+    reported = json.loads(done.stdout.splitlines()[-1])
+    assert [one["sliders"] for one in reported] == [
         ["focus", "v", "u"], ["shot", "v", "u"], ["frame"],
     ]  # fmt: skip
     drawn = [dict(np.load(tmp_path / f"{number}.npz")) for number in range(3)]
@@ -224,7 +224,7 @@ def test_naparis_window_shows_views_refocus_psi_and_session_by_sliders(result, s
     assert np.abs(view).mean() < 3
     other = pictured(drawn[0]["opened"], SIZE) - 255 * srgb_of(scene.light_field[4, 0])
     assert np.abs(other).mean() > 10
-    focused = srgb_of(refocus(scene.light_field, told[0]["focused"]))
+    focused = srgb_of(refocus(scene.light_field, reported[0]["focused"]))
     assert np.abs(pictured(drawn[0]["focused"], SIZE) - 255 * focused).mean() < 3
     for one in drawn[1:]:
         assert one["opened"].std() > 10

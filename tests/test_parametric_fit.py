@@ -1,4 +1,4 @@
-"""The parametric and mixed routes on a bench that is wrong in every way they are not told of."""
+"""The parametric and mixed routes on a bench that is wrong in every way they do not know."""
 
 from dataclasses import replace
 
@@ -143,13 +143,13 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
     stated = np.mean([np.diag(fit.covariance) for fit in fits], axis=0)
     bound = np.mean([np.diag(fit.bound) for fit in fits], axis=0)
     names = labels(VIEWS)
-    told = [i for i, name in enumerate(names) if name not in fits[0].undecided][:11]
-    ratio = np.mean(errors[:, told] ** 2 / bound[told])
+    reported = [i for i, name in enumerate(names) if name not in fits[0].undecided][:11]
+    ratio = np.mean(errors[:, reported] ** 2 / bound[reported])
     # 8 x 11 nearly independent squares: their mean is known to 0.16.
     assert ratio == pytest.approx(1.05, abs=0.5)
-    assert np.all(stated[told] >= 0.99 * bound[told])
+    assert np.all(stated[reported] >= 0.99 * bound[reported])
     # What is beyond is for displacements of single views, which so few pixels do not rule out.
-    assert np.all(stated[told] < 2 * bound[told])
+    assert np.all(stated[reported] < 2 * bound[reported])
 
 
 def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(design):

@@ -98,9 +98,9 @@ def test_a_grey_plane_is_modelled_as_one_and_reported(bayer):
     noise = np.random.default_rng(0).normal(0, 0.003, bayer.frames_shape)
     frames = (bayer.forward(grey) + noise).astype(np.float32)
     lean = reconstruct_adaptive(bayer, frames, 0.003, AdaptiveSettings(free=False))
-    told = " ".join(lean.left_out)
-    assert "one plane for the whole scene" in told
-    assert "colour: one for all" in told
+    reported = " ".join(lean.left_out)
+    assert "one plane for the whole scene" in reported
+    assert "colour: one for all" in reported
     assert (lean.light_field == lean.light_field[..., :1]).all()
     rich = reconstruct_adaptive(bayer, frames, 0.003, AdaptiveSettings(free=False, parsimony=False))
     assert rich.left_out == ()

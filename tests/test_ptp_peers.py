@@ -181,7 +181,7 @@ ports = gp.PortInfoList()
 ports.load()
 camera.set_port_info(ports[ports.lookup_path(sys.argv[1])])
 camera.init()
-told = {"summary": str(camera.get_summary()), "pictures": []}
+reported = {"summary": str(camera.get_summary()), "pictures": []}
 for choice in sys.argv[2:]:
     config = camera.get_config()
     config.get_child_by_name("shutterspeed").set_value(choice)
@@ -189,9 +189,9 @@ for choice in sys.argv[2:]:
     path = camera.capture(gp.GP_CAPTURE_IMAGE)
     file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
     data = memoryview(file.get_data_and_size())
-    told["pictures"].append([path.name, len(data), hashlib.sha256(data).hexdigest()])
+    reported["pictures"].append([path.name, len(data), hashlib.sha256(data).hexdigest()])
 camera.exit()
-print(json.dumps(told))
+print(json.dumps(reported))
 """
 
 
@@ -236,10 +236,10 @@ def test_libgphoto2_captures_and_downloads_from_our_camera_session_after_session
     pictures = []
     with PtpIpServer(camera) as server:
         for shutters in sessions:
-            told = initiator(server, tmp_path, *shutters)
-            assert "EMMC simulated camera" in told["summary"]
-            assert len(told["pictures"]) == len(shutters)
-            pictures += told["pictures"]
+            reported = initiator(server, tmp_path, *shutters)
+            assert "EMMC simulated camera" in reported["summary"]
+            assert len(reported["pictures"]) == len(shutters)
+            pictures += reported["pictures"]
     stored = [
         [info.name, len(data), hashlib.sha256(data).hexdigest()]
         for info, data in camera.objects.values()

@@ -158,13 +158,15 @@ def test_exiftool_reads_the_same_levels_area_and_orientation(tmp_path, orientati
     answer = subprocess.run(
         ["exiftool", "-n", "-j", str(path)], capture_output=True, text=True, check=True
     )
-    (told,) = json.loads(answer.stdout)
+    (reported,) = json.loads(answer.stdout)
     frame = decode_raw(path.read_bytes())
-    assert told["Orientation"] == orientation  # pixels stay as the sensor has them
+    assert reported["Orientation"] == orientation  # pixels stay as the sensor has them
     top, left, bottom, right = area or (0, 0, 40, 48)
     if area is not None:
-        assert told["ActiveArea"].split() == [str(n) for n in area]
+        assert reported["ActiveArea"].split() == [str(n) for n in area]
     np.testing.assert_array_equal(frame.mosaic, noise()[top:bottom, left:right])
-    assert [float(n) for n in told["BlackLevel"].split()] == frame.black_level_dn.ravel().tolist()
-    assert told["WhiteLevel"] == frame.white_level_dn
-    assert told["ExposureTime"] == pytest.approx(frame.exposure_s, abs=1e-6)
+    assert [
+        float(n) for n in reported["BlackLevel"].split()
+    ] == frame.black_level_dn.ravel().tolist()
+    assert reported["WhiteLevel"] == frame.white_level_dn
+    assert reported["ExposureTime"] == pytest.approx(frame.exposure_s, abs=1e-6)

@@ -104,8 +104,8 @@ def test_flicker_is_measured_and_evened(percent):
 @pytest.mark.parametrize("percent", [3, 10])
 def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
     described = find_camera(camera)
-    one, told = (made(name, percent, described) for name in ("bad-pixels", "masked-pixels"))
-    bad = ~told.usable[0]
+    one, reported = (made(name, percent, described) for name in ("bad-pixels", "masked-pixels"))
+    bad = ~reported.usable[0]
     # A dead pixel in the shade, or one that hardly glows, does no harm.
     harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
     found = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
@@ -115,10 +115,10 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
 
 
 def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
-    told = made("masked-pixels", 10)
-    found = bad_pixels(flat_psi(told.psi), told.readings, told.usable)
-    assert not found[~told.usable[0]].any()
-    assert found[told.usable[0]].mean() < 0.01
+    reported = made("masked-pixels", 10)
+    found = bad_pixels(flat_psi(reported.psi), reported.readings, reported.usable)
+    assert not found[~reported.usable[0]].any()
+    assert found[reported.usable[0]].mean() < 0.01
 
 
 @pytest.mark.parametrize(
@@ -132,15 +132,15 @@ def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
 )
 def test_screening_mends_what_would_break_a_method(name, strength, least_db):
     one = made(name, strength)
-    told, levels = [], []
+    reported, levels = [], []
     for screening in (True, False):
         settings = MethodSettings(screening=screening)
         result = reconstruct("tv", one.psi, one.readings, one.noise_sigma, None, settings)
         levels.append(psnr_db(result.light_field, one.truth))
-        told.append(result.screening)
+        reported.append(result.screening)
     assert levels[0] > levels[1] + least_db
-    assert told[0]
-    assert told[1] == ()
+    assert reported[0]
+    assert reported[1] == ()
 
 
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])

@@ -179,10 +179,10 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
         capture_session(path, rig((32, 40)), None, None, page, nobody, control=page.control)
     finally:
         page.close()
-    told = page.state()["light_field"]
-    assert told["shots"] == [2, 2]
-    assert "states" in told["stage"]
-    assert told["pictures"]["views"] == [5, 5]
+    reported = page.state()["light_field"]
+    assert reported["shots"] == [2, 2]
+    assert "states" in reported["stage"]
+    assert reported["pictures"]["views"] == [5, 5]
     wanted = page.pictures["light-field.json"]({})
     assert wanted is not None
     given = json.loads(wanted.make())

@@ -37,13 +37,13 @@ def test_writing_counts_as_hidden_only_while_the_bench_works():
         entry("a", move=(0, 1), expose=(1, 2), write=(2, 5)),
         entry("b", move=(2.5, 4), expose=(4, 4.5), write=(5, 6)),
     ]
-    told = overlap(entries)
-    assert told.seconds == 6
-    assert told.moving_s == 2.5
-    assert told.exposing_s == 1.5
-    assert told.writing_s == 4
-    assert told.hidden_s == 2
-    assert told.hidden_share == 0.5
+    reported = overlap(entries)
+    assert reported.seconds == 6
+    assert reported.moving_s == 2.5
+    assert reported.exposing_s == 1.5
+    assert reported.writing_s == 4
+    assert reported.hidden_s == 2
+    assert reported.hidden_share == 0.5
 
 
 def test_runs_are_kept_apart_and_other_lines_passed_over():
@@ -96,8 +96,8 @@ def test_the_timeline_comes_first_and_most_pictures_of_a_kind_are_folded(capture
 def test_the_report_of_a_reconstructed_session_has_its_verdict(captured):
     assert "Light field" not in sheet(captured)
     (captured.folder / "reconstruction").mkdir()
-    told = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
-    (captured.folder / "reconstruction/metrics.json").write_text(json.dumps(told))
+    reported = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
+    (captured.folder / "reconstruction/metrics.json").write_text(json.dumps(reported))
     page = sheet(captured)
     assert page.index("doubt") < page.index("27.5 dB stated") < page.index("<img ")
 

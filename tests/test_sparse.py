@@ -155,10 +155,12 @@ def test_a_step_limit_is_reported_with_advice(random_psi, scene):
 def test_progress_counts_the_patches(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
-    told = []
-    reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, settings(), on_step=told.append)
-    assert told[-1].step == told[-1].total == 20
-    assert [p.step for p in told] == sorted(p.step for p in told)
+    reported = []
+    reconstruct_sparse(
+        psi, psi.forward(truth), 0.0, dictionary, settings(), on_step=reported.append
+    )
+    assert reported[-1].step == reported[-1].total == 20
+    assert [p.step for p in reported] == sorted(p.step for p in reported)
 
 
 def test_what_does_not_fit_is_refused(random_psi, scene):

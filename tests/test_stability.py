@@ -248,8 +248,8 @@ def command(monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(sys, "argv", ["emmc-rig", "stability", *map(str, arguments)])
         with pytest.raises(SystemExit) as stop:
             cli.main()
-        told = capsys.readouterr()
-        return stop.value.code, told.out, " ".join(told.err.split())
+        reported = capsys.readouterr()
+        return stop.value.code, reported.out, " ".join(reported.err.split())
 
     return call
 

@@ -126,10 +126,10 @@ def test_so_many_readings_saturate(percent):
 
 
 def test_bad_pixels_are_bad_in_every_shot_and_known_only_when_masked(clean):
-    silent, told = made("bad-pixels", 20), made("masked-pixels", 20)
+    silent, reported = made("bad-pixels", 20), made("masked-pixels", 20)
     assert silent.usable.all()
-    bad = ~told.usable[0]
-    assert (told.usable == told.usable[0]).all()
+    bad = ~reported.usable[0]
+    assert (reported.usable == reported.usable[0]).all()
     assert bad.mean() == pytest.approx(0.2, abs=0.03)
     off = np.abs(silent.readings - clean.readings).mean(axis=0)
     assert np.median(off[bad]) > 20 * np.median(off[~bad])

@@ -193,6 +193,8 @@ def test_a_part_that_does_not_apply_is_left_out_in_words(tmp_path):
 def test_the_command_has_a_switch_for_each_part():
     from emmc_rig.cli import app
 
-    told = CliRunner().invoke(app, ["stability", "--help"], env={"COLUMNS": "200", "TERM": "dumb"})
+    reported = CliRunner().invoke(
+        app, ["stability", "--help"], env={"COLUMNS": "200", "TERM": "dumb"}
+    )
     for part in sweeping.PARTS:
-        assert f"--{part}" in told.output
+        assert f"--{part}" in reported.output

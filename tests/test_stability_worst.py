@@ -135,8 +135,8 @@ def test_every_method_is_measured_but_one_not_installed_which_is_named_once(
     command = ("stability", "--worst", "--fast", "--method", "all", "--size", "24x32")
     code, out, err = run(*command, "--out", "out")
     assert code == 0, err
-    told = " ".join((out + err).split())
-    assert told.count("unrolled needs no_such_module, which is not installed") == 1
+    reported = " ".join((out + err).split())
+    assert reported.count("unrolled needs no_such_module, which is not installed") == 1
     with open(tmp_path / "out" / "worst.csv", newline="") as rows:
         assert {row["method"] for row in csv.DictReader(rows)} == {"tv"}
 

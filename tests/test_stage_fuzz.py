@@ -144,9 +144,9 @@ def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
             return
         accepted.append(message)
         if isinstance(message, grbl_codec.Status):
-            told = [float(word) for word in re.findall(rb"-?\d+(?:\.\d+)?", line)]
+            reported = [float(word) for word in re.findall(rb"-?\d+(?:\.\d+)?", line)]
             for position in (message.machine, message.work, message.offset):
-                assert all(number in told for number in position or ())
+                assert all(number in reported for number in position or ())
 
     assert any(isinstance(message, grbl_codec.Status) for message in accepted)
 
@@ -323,7 +323,7 @@ def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_r
     protocol, cases
 ):
     make, positions_um = DRIVERS[protocol]
-    told = []
+    reported = []
 
     @run(part_of(cases), st.integers(0, 2**32), MOODS, PLANS)
     def _(seed, moods, plan):
@@ -350,11 +350,11 @@ def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_r
                 check_one_line(error)
                 continue
             if name in ("position", "move", "jog"):
-                told.append(answer)
+                reported.append(answer)
                 read_um = positions_um(liar.heard)
                 assert any(abs(answer - um) < 1e-6 for um in read_um), (answer, read_um)
 
-    assert len(told) > part_of(cases) / 20
+    assert len(reported) > part_of(cases) / 20
 
 
 @pytest.mark.parametrize("protocol", DRIVERS)

@@ -74,8 +74,8 @@ def test_the_map_says_where_a_position_really_is():
     found = mapped()
     sent, sides, real = visited(30, seed=5)
     up = [i for i in range(30) if (sides[i] == 1).all()]
-    told = np.array([found.real_um((sent[i, 0], sent[i, 1])) for i in up])
-    assert np.abs(told - real[up]).max() < 5 * REPEATABILITY
+    reported = np.array([found.real_um((sent[i, 0], sent[i, 1])) for i in up])
+    assert np.abs(reported - real[up]).max() < 5 * REPEATABILITY
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.37, -0.81), (6.0, 9.0), (-14.0, 3.0)])

@@ -283,13 +283,13 @@ def test_grbl_streamer_homes_streams_and_is_alarmed():
     device = GrblController(
         SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={24: 6000, 25: 12_000}
     )
-    told = []
+    reported = []
     with PtyServer(device) as server:
-        peer = streamer.GrblStreamer(lambda *event: told.append(event))
+        peer = streamer.GrblStreamer(lambda *event: reported.append(event))
         peer.poll_interval = 0.01
         peer.cnect(server.port)
         try:
-            wait_until(lambda: ("on_boot",) in told)
+            wait_until(lambda: ("on_boot",) in reported)
             peer.poll_start()
             wait_until(lambda: peer.cmode == "Alarm")
             peer.homing()
@@ -298,12 +298,12 @@ def test_grbl_streamer_homes_streams_and_is_alarmed():
             peer.incremental_streaming = True
             peer.write("G21 G90\nG53 G0 X-5 Y-3\nG1 F3000 X-6.5\nG91 G1 X1")
             peer.job_run()
-            wait_until(lambda: ("on_job_completed",) in told)
+            wait_until(lambda: ("on_job_completed",) in reported)
             wait_until(lambda: peer.cmpos == (-5.5, -3.0, -1.0))
             assert device.position_um("X") == pytest.approx(25_400 - 5_500, abs=3.5)
-            assert not any(event[0] == "on_error" for event in told)
+            assert not any(event[0] == "on_error" for event in reported)
             peer.send_immediately("G90 G0 X50")
-            wait_until(lambda: ("on_alarm", "ALARM:2") in told)
+            wait_until(lambda: ("on_alarm", "ALARM:2") in reported)
             peer.softreset()
             peer.killalarm()
             wait_until(lambda: peer.cmode == "Idle")
@@ -320,19 +320,19 @@ def test_grbl_streamer_streams_again_in_a_second_session():
     device = GrblController(SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={22: 0, 20: 0})
     with PtyServer(device) as server:
         for place in ("1.000", "0.500"):
-            told = []
-            peer = streamer.GrblStreamer(lambda *event, told=told: told.append(event))
+            reported = []
+            peer = streamer.GrblStreamer(lambda *event, reported=reported: reported.append(event))
             peer.poll_interval = 0.01
             peer.cnect(server.port)
             try:
-                wait_until(lambda told=told: ("on_boot",) in told)
+                wait_until(lambda reported=reported: ("on_boot",) in reported)
                 peer.poll_start()
                 wait_until(lambda peer=peer: peer.cmode == "Idle")
                 peer.incremental_streaming = True
                 peer.write(f"G21 G90\nG53 G1 F3000 X-{place}")
                 peer.job_run()
-                wait_until(lambda told=told: ("on_job_completed",) in told)
+                wait_until(lambda reported=reported: ("on_job_completed",) in reported)
                 wait_until(lambda peer=peer, at=-float(place): peer.cmpos[0] == at)
-                assert not any(event[0] in ("on_error", "on_alarm") for event in told)
+                assert not any(event[0] in ("on_error", "on_alarm") for event in reported)
             finally:
                 peer.disconnect()

@@ -154,7 +154,7 @@ def test_an_apt_axis_without_an_actuator_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("spec", "told"),
+    ("spec", "reported"),
     [
         ("zaber:/dev/ttyUSB0,microstep_um", "write NAME=VALUE"),
         ("zaber:/dev/ttyUSB0,microstep=1", "did you mean 'microstep_um'"),
@@ -162,8 +162,8 @@ def test_an_apt_axis_without_an_actuator_is_refused():
         ("apt:/dev/ttyUSB0,actuator=z9", "use one of z806"),
     ],
 )
-def test_faults_of_settings_behind_a_port_are_one_line(spec, told):
-    with pytest.raises(AppError, match=told):
+def test_faults_of_settings_behind_a_port_are_one_line(spec, reported):
+    with pytest.raises(AppError, match=reported):
         parse_stage(spec)
 
 
@@ -218,7 +218,7 @@ def test_the_shadow_of_the_mask_measures_the_step_in_the_cameras_frames():
 
 
 @pytest.mark.parametrize(
-    ("steps", "readings", "told"),
+    ("steps", "readings", "reported"),
     [
         ([0, 100], [0, 1], "read at least 3"),
         ([5, 5, 5], [0, 1, 2], "do not differ"),
@@ -226,8 +226,8 @@ def test_the_shadow_of_the_mask_measures_the_step_in_the_cameras_frames():
         ([0, 100, 200, 300], [3, 0, 2, 1], "do not follow the axis"),
     ],
 )
-def test_readings_that_measure_nothing_are_refused(steps, readings, told):
-    with pytest.raises(CalibrationError, match=told):
+def test_readings_that_measure_nothing_are_refused(steps, readings, reported):
+    with pytest.raises(CalibrationError, match=reported):
         fit_step_length(steps, readings)
 
 
@@ -260,7 +260,7 @@ def test_the_command_asks_then_measures_and_writes_a_file_that_opens_the_stage(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "reported"),
     [
         (["1.1", 5], 1, "too few"),
         (["1.1", 10**9, "--yes"], 1, "counts of travel"),
@@ -268,7 +268,7 @@ def test_the_command_asks_then_measures_and_writes_a_file_that_opens_the_stage(
         (["1.1", 500, "--camera", "simulated"], 2, "belong together"),
     ],
 )
-def test_a_wrong_call_of_scale_is_one_line(run, quick_port, arguments, code, told):
+def test_a_wrong_call_of_scale_is_one_line(run, quick_port, arguments, code, reported):
     result = run("devices", "scale", *arguments, "--stage", f"zaber:{quick_port}")
     assert result[0] == code
-    assert told in result[2]
+    assert reported in result[2]

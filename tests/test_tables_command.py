@@ -156,11 +156,11 @@ def test_the_metrics_tell_the_findings(whole):
     folder, outcome = whole
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["cells"] == 86
-    told = {finding["name"]: finding for finding in metrics["findings"]}
+    reported = {finding["name"]: finding for finding in metrics["findings"]}
     for finding in outcome.findings:
-        assert told[finding.claim.name]["verdict"] == finding.verdict
+        assert reported[finding.claim.name]["verdict"] == finding.verdict
         assert finding.verdict != "not measured"
-    assert told["cfa-noise"]["paper_db"] == pytest.approx(1.2725)
+    assert reported["cfa-noise"]["paper_db"] == pytest.approx(1.2725)
 
 
 def test_grids_hold_means_and_the_papers_numbers(whole):
@@ -213,7 +213,7 @@ def test_a_part_alone_is_done_from_the_command_line(run, scenes):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--only", "figure11"], "did you mean 'figure1"),
         (["--scenes", "nowhere"], "no such folder"),
@@ -224,12 +224,12 @@ def test_a_part_alone_is_done_from_the_command_line(run, scenes):
         (["--out", "/proc/tables"], "cannot be written"),
     ],
 )
-def test_faults_are_one_line(run, tmp_path, arguments, told):
+def test_faults_are_one_line(run, tmp_path, arguments, reported):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "cat.jpg").write_text("meow")
     code, _, err = run(*arguments)
     assert code == 1
-    assert told in one_line(err)
+    assert reported in one_line(err)
     assert (tmp_path / "taken" / "cat.jpg").read_text() == "meow"
 
 

@@ -67,12 +67,13 @@ def test_parts_are_chosen_by_name_in_the_papers_order():
 
 
 @pytest.mark.parametrize(
-    ("only", "told"), [("tabel3", "did you mean 'table3'"), ("xyz", "known are table2"), (",", "")]
+    ("only", "reported"),
+    [("tabel3", "did you mean 'table3'"), ("xyz", "known are table2"), (",", "")],
 )
-def test_an_unknown_part_is_reported_with_the_nearest(only, told):
+def test_an_unknown_part_is_reported_with_the_nearest(only, reported):
     with pytest.raises(AppError, match="--only") as fault:
         chosen_parts(only)
-    assert told in str(fault.value)
+    assert reported in str(fault.value)
 
 
 @pytest.mark.parametrize("capture", [c for part in PARTS.values() for c in part.captures])

@@ -284,19 +284,21 @@ def a_dictionary(kind="ksvd", provenance="", patch=(9, 9)):
     return Dictionary.normalised(atoms, kind, provenance)
 
 
-@pytest.mark.parametrize("told", [["shed"], [{"name": "shed"}], ["/data/SHED.h5"], {"shed": "1f"}])
-def test_a_dictionary_that_saw_a_scored_scene_is_refused(tmp_path, told):
+@pytest.mark.parametrize(
+    "reported", [["shed"], [{"name": "shed"}], ["/data/SHED.h5"], {"shed": "1f"}]
+)
+def test_a_dictionary_that_saw_a_scored_scene_is_refused(tmp_path, reported):
     path = tmp_path / "d.h5"
-    a_dictionary(provenance=json.dumps({"scenes": told})).save(path)
+    a_dictionary(provenance=json.dumps({"scenes": reported})).save(path)
     with pytest.raises(AppError, match="was trained on 'shed'"):
         Given.opened([str(path)], [1], NAMES)
     assert Given.opened([str(path)], [1], ["attic"]).label("attic", 1).startswith("d.h5")
 
 
 def test_the_papers_name_of_a_scene_is_recognised():
-    told = a_dictionary(provenance=json.dumps({"scenes": ["Dragon"]}))
+    reported = a_dictionary(provenance=json.dumps({"scenes": ["Dragon"]}))
     with pytest.raises(AppError, match="'dragons'"):
-        check_not_trained_on(told, "d.h5", ["fish", "dragons"])
+        check_not_trained_on(reported, "d.h5", ["fish", "dragons"])
 
 
 @pytest.mark.parametrize("provenance", ["", "{}", "no json", '{"scenes": 3}', '{"scenes": []}'])

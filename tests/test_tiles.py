@@ -163,9 +163,11 @@ def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
 
 def test_progress_is_reported_block_by_block(random_psi):
     psi, frames, _ = scene(random_psi)
-    told = []
-    in_blocks("tv", psi, frames, SMALL, on_step=lambda step: told.append((step.step, step.total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    reported = []
+    in_blocks(
+        "tv", psi, frames, SMALL, on_step=lambda step: reported.append((step.step, step.total))
+    )
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_a_block_without_usable_pixels_is_dark_and_the_others_are_judged(random_psi):

@@ -58,13 +58,13 @@ def test_training_writes_a_dictionary_with_its_history_and_a_picture(run, scenes
     made = Dictionary.load(tmp_path / "made/d.h5")
     assert made.kind == kind
     assert made.checked((2, 2), (4, 4), 3).size == 24
-    told = json.loads(made.provenance)
-    assert told["scenes"] == ["cat", "dog", "emu"]
-    assert [done["step"] for done in told["history"]] == [1, 2, 3]
-    assert told["history"][-1]["coded_rmse"] < told["history"][0]["coded_rmse"]
-    assert told["settings"]["seed"] == told["patches"]["seed"] == 0
-    assert min(told["learning_seconds"], told["peak_memory_gib"]) > 0
-    assert "numpy" in told["versions"]
+    reported = json.loads(made.provenance)
+    assert reported["scenes"] == ["cat", "dog", "emu"]
+    assert [done["step"] for done in reported["history"]] == [1, 2, 3]
+    assert reported["history"][-1]["coded_rmse"] < reported["history"][0]["coded_rmse"]
+    assert reported["settings"]["seed"] == reported["patches"]["seed"] == 0
+    assert min(reported["learning_seconds"], reported["peak_memory_gib"]) > 0
+    assert "numpy" in reported["versions"]
     assert sorted(p.name for p in (tmp_path / "made").iterdir()) == ["d.h5", "d.png"]
     picture = cv2.imread(str(tmp_path / "made/d.png"))
     assert picture is not None
@@ -83,8 +83,8 @@ def test_a_scene_left_out_is_not_read(run, scenes, tmp_path):
     (scenes / "dog.h5").write_text("this would fail if it were read")
     code, *_ = run("--scenes", scenes, "--leave-out", "dog", "--out", "d.h5", *SMALL)
     assert code == 0
-    told = json.loads(Dictionary.load(tmp_path / "d.h5").provenance)
-    assert (told["scenes"], told["left_out"]) == (["cat", "emu"], ["dog"])
+    reported = json.loads(Dictionary.load(tmp_path / "d.h5").provenance)
+    assert (reported["scenes"], reported["left_out"]) == (["cat", "emu"], ["dog"])
 
 
 def test_without_scenes_the_built_in_ones_are_used_with_several_seeds():
@@ -97,8 +97,8 @@ def test_without_scenes_the_built_in_ones_are_used_with_several_seeds():
 def test_a_built_in_scene_is_trained_on(run, tmp_path, monkeypatch):
     monkeypatch.setattr(train, "BUILT_IN_SEEDS", 1)
     assert run("--scenes", "dark", "--out", "d.h5", *SMALL)[0] == 0
-    told = json.loads(Dictionary.load(tmp_path / "d.h5").provenance)
-    assert told["sources"] == ["dark, seed 0"]
+    reported = json.loads(Dictionary.load(tmp_path / "d.h5").provenance)
+    assert reported["sources"] == ["dark, seed 0"]
 
 
 def test_the_middle_views_can_be_asked_for(run, tmp_path):
@@ -115,20 +115,20 @@ def test_folders_scenes_and_names_mix(scenes):
 
 
 @pytest.mark.parametrize(
-    ("leave_out", "told"),
+    ("leave_out", "reported"),
     [
         (["dogs"], "did you mean 'dog'"),
         (["xyzzy"], "there are cat, dog, emu"),
         (["cat", "dog", "emu"], "no scene to train on"),
     ],
 )
-def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, told):
-    with pytest.raises(AppError, match=told):
+def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, reported):
+    with pytest.raises(AppError, match=reported):
         find_sources((str(scenes),), leave_out)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--patch", "9"], "9x9"),
         (["--views", "5"], "5x5"),
@@ -148,14 +148,14 @@ def test_names_to_leave_out_must_exist_and_leave_something(scenes, leave_out, to
         (["--resume"], "no checkpoint"),
     ],
 )
-def test_faults_are_one_line_and_leave_nothing(run, scenes, tmp_path, arguments, told):
+def test_faults_are_one_line_and_leave_nothing(run, scenes, tmp_path, arguments, reported):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
     (tmp_path / "other.h5").write_text("precious")
     before = sorted(p.name for p in tmp_path.iterdir())
     code, _, err = run("--scenes", scenes, "--out", "d.h5", *SMALL, *arguments)
-    assert code == (2 if told in ("9x9", "5x5") else 1)  # an example of how to write the option
-    assert told in one_line(err)
+    assert code == (2 if reported in ("9x9", "5x5") else 1)  # an example of how to write the option
+    assert reported in one_line(err)
     assert sorted(p.name for p in tmp_path.iterdir()) == before
     assert (tmp_path / "other.h5").read_text() == "precious"
 

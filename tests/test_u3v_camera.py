@@ -198,8 +198,8 @@ def test_frames_begun_before_a_change_do_not_claim_the_new_exposure(bench):
     stream = camera.stream()
     assert next(stream).exposure_s == pytest.approx(0.01)
     camera.set_exposure_s(0.02)
-    told = [next(stream).exposure_s for _ in range(5)]
-    assert told == [None, None, None, pytest.approx(0.02), pytest.approx(0.02)]
+    reported = [next(stream).exposure_s for _ in range(5)]
+    assert reported == [None, None, None, pytest.approx(0.02), pytest.approx(0.02)]
 
 
 def test_two_acquisitions_at_once_are_refused(bench):
@@ -708,9 +708,9 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
                     for frame in itertools.islice(frames, 2):
                         assert frame.mosaic.shape == opened.shape
         except DriverError as error:
-            told = str(error)
-            if "\n" in told:
-                raise AssertionError(told) from error
+            reported = str(error)
+            if "\n" in reported:
+                raise AssertionError(reported) from error
             revive()
         assert clock.now_s() - before_s < 3600
 

@@ -128,8 +128,8 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
     code, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "12 wanted; no more, the target is reached" in out
-    told = summary(enough)
-    assert (told.state, told.stored) == ("complete", told.planned)
+    reported = summary(enough)
+    assert (reported.state, reported.stored) == ("complete", reported.planned)
     verdict = verify(Session(enough))
     assert (verdict.is_complete, verdict.missing, verdict.spared) == (True, (), 2)
 
@@ -315,11 +315,11 @@ def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):
     shots = {f.bench.shot for f in session.frames if f.kind == "shot"}
     assert shots == {0, 1}
     assert session.target_db is None
-    told = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
+    reported = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
     session.note("until", target_db=30.0)
-    session.note("decided", next=1, spared=[], **told)
+    session.note("decided", next=1, spared=[], **reported)
     assert session.needed == session.frames
-    session.note("decided", next=None, spared=[1], **told)
+    session.note("decided", next=None, spared=[1], **reported)
     assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
     session.note("until", target_db=33.0)
     assert session.needed == session.frames

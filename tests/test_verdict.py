@@ -1,4 +1,4 @@
-"""Verdicts: their figures against theory, and that faults are told with reason and remedy."""
+"""Verdicts: their figures against theory, and that faults are named with reason and remedy."""
 
 import dataclasses
 import json
@@ -221,9 +221,9 @@ def judged_trial(
 def test_a_fault_is_reported_with_its_reason_and_a_remedy(fault, strength, reason):
     verdict = judged_trial(fault, strength, screening=fault not in SCREENED)
     assert verdict.level != "trust"
-    told = [one for one in verdict.reasons if reason in one.what]
-    assert told, verdict.words
-    assert told[0].remedy
+    reported = [one for one in verdict.reasons if reason in one.what]
+    assert reported, verdict.words
+    assert reported[0].remedy
 
 
 def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
@@ -384,7 +384,7 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     results = {}
     for name, folder in (("right", right), ("wrong", wrong)):
         out = tmp_path / name
-        told = CliRunner().invoke(
+        reported = CliRunner().invoke(
             app,
             [
                 "reconstruct",
@@ -399,7 +399,11 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
             ],
         )
         metrics = json.loads((out / "metrics.json").read_text())
-        results[name] = told.exit_code, told.stdout.strip().splitlines()[-1], metrics["verdict"]
+        results[name] = (
+            reported.exit_code,
+            reported.stdout.strip().splitlines()[-1],
+            metrics["verdict"],
+        )
         assert (out / "light_field.h5").is_file()
     code, last, verdict = results["right"]
     assert code == 0

@@ -154,7 +154,7 @@ def _verdicts(out: Path, *wanted: Any) -> None:
             (
                 *names,
                 *(f"{flagged} of {there}" for flagged, there in tally.pairs()),
-                str(tally.untold),
+                str(tally.undecided),
             )
             for names, tally in detector.tables(results).items()
         ],

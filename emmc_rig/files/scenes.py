@@ -82,8 +82,8 @@ def open_scene(
         spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
             `light_field`, a built-in name, or what another of `emmc_rig.files.formats` that can
             be read holds.
-        size: rows and columns of pixels: what a built-in scene is rendered at (192x256 unless
-            told), the middle that is cut from a measured one (all of it by default).
+        size: rows and columns of pixels: what a built-in scene is rendered at (192x256 by
+            default), the middle that is cut from a measured one (all of it by default).
         views: rows and columns of views, likewise (5x5 by default).
         seed: of a built-in scene; measured ones have none.
 

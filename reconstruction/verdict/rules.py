@@ -200,7 +200,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
 
 
 def _strength(e: Evidence) -> tuple[float, float] | None:
-    """Return the masks' weakest strength among the shots, and its deviation; None if untold."""
+    """Return the masks' weakest strength among the shots, and its deviation; None if unknown."""
     known = [
         (one, error)
         for one, error in zip(e.strengths, e.strength_errors, strict=True)

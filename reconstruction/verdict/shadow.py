@@ -188,7 +188,7 @@ def cross_strength(found: Relief) -> NDArray[np.float64]:
 
 
 def _slope(masks: Array, seen: Array, weight: Array) -> tuple[float, float]:
-    """Return the weighted regression of seen on masks and its deviation; NaN if untold."""
+    """Return the weighted regression of seen on masks and its deviation; NaN if unknown."""
     square = float((weight * np.square(masks, dtype=np.float64)).sum())
     if square <= LEAST_RELIEF**2 * float(weight.sum(dtype=np.float64)):
         return np.nan, np.nan

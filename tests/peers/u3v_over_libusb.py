@@ -76,7 +76,7 @@ def with_aravis():
 
 
 def acquired(camera, stream):
-    """Start an acquisition, take frames, stop; return what is told of each frame."""
+    """Start an acquisition, take frames, stop; return what each frame came with."""
     camera.start_acquisition()
     frames = []
     for _ in range(FRAMES):

@@ -205,7 +205,7 @@ def case_results(rows: Mapping[Point, dict]) -> list[CaseResult]:
 class Tally:
     """How many results were of each kind, and how many of those were flagged.
 
-    untold: of all kinds, how many got the verdict *cannot tell*.
+    undecided: of all kinds, how many got the verdict *cannot tell*.
     """
 
     broken: int = 0
@@ -216,7 +216,7 @@ class Tally:
     good_flagged: int = 0
     poor: int = 0
     poor_flagged: int = 0
-    untold: int = 0
+    undecided: int = 0
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return, of broken, good, between and poor, how many were flagged, and how many are."""
@@ -236,7 +236,7 @@ def tallied(results: Iterable[CaseResult]) -> Tally:
     for one in results:
         counts[one.kind] += 1
         counts[f"{one.kind}_flagged"] += one.flagged
-        counts["untold"] += one.verdict.level == "cannot tell"
+        counts["undecided"] += one.verdict.level == "cannot tell"
     return Tally(**counts)
 
 

@@ -50,7 +50,7 @@ LEAST_DB = 0.2
 class Mismatch:
     """One method under one error, PSNRs in dB; NaN where it refused.
 
-    told: whether a drift was detected. psi_error, psi_left: relative error of Psi before and
+    detected: whether the drift was. psi_error, psi_left: relative error of Psi before and
     after blind correction (Frobenius norm).
     """
 
@@ -61,7 +61,7 @@ class Mismatch:
     mismatched: float
     oracle: float
     blind: float
-    told: bool
+    detected: bool
     psi_error: float
     psi_left: float
 
@@ -115,7 +115,7 @@ class MismatchSweep(Sweep[Point]):
 
     journal = "mismatch.jsonl"
     stage = "mismatch of Psi"
-    revision = 2
+    revision = 3
 
     def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
@@ -138,7 +138,7 @@ class MismatchSweep(Sweep[Point]):
                 "mismatched": mismatched,
                 "oracle": _psnr(moved, moved.true_psi, point.method),
                 "blind": _psnr(moved, blind, point.method) if detected else mismatched,
-                "told": detected,
+                "detected": detected,
                 "psi_error": moved.psi.relative_difference(moved.true_psi),
                 "psi_left": blind.relative_difference(moved.true_psi),
             }
@@ -183,7 +183,7 @@ def _mismatch(point: Point, result: dict, ideal: dict) -> Mismatch:
         point.condition,
         point.method,
         **{kind: math.nan if db is None else db for kind, db in dbs.items()},
-        told=result["told"],
+        detected=result["detected"],
         psi_error=result["psi_error"],
         psi_left=result["psi_left"],
     )

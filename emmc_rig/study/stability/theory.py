@@ -173,9 +173,9 @@ def predicted(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
 
     bound_db: PSNR of the posterior mean, disparities known. found_db: with an error of disparity by
     the Cramer-Rao bound on top. oracle_db: the posterior mean's own, measured. crb_px: root mean
-    of the Cramer-Rao bounds; gain, told: means, see `theory.patch.Expected`.
+    of the Cramer-Rao bounds; gain, degrees: means, see `theory.patch.Expected`.
     """
-    sums = dict.fromkeys(("bound", "found", "oracle", "crb", "gain", "told"), 0.0)
+    sums = dict.fromkeys(("bound", "found", "oracle", "crb", "gain", "degrees"), 0.0)
     truth = seen.trial.truth
     views = truth.shape[0], truth.shape[1]
     widest = max(float(np.ptp(seen.disparity_px)) / 12**0.5, 1e-3)
@@ -189,7 +189,7 @@ def predicted(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
         sums["found"] += min(expected.error + lost, 2 * expected.prior)
         sums["crb"] += crb
         sums["gain"] += expected.noise_gain
-        sums["told"] += expected.degrees_of_freedom
+        sums["degrees"] += expected.degrees_of_freedom
         part = (slice(None), slice(None), *(slice(at, at + SIDE) for at in place.corner))
         flat = np.broadcast_to(place.mean, truth[part].shape).reshape(-1, 3) @ OPPONENT.T
         plain = np.einsum("omr,ro->m", patch.opponent, flat)
@@ -204,7 +204,7 @@ def predicted(seen: Seen, places: Sequence[Place]) -> dict[str, float]:
         "oracle_db": psnr_of(mean["oracle"], peak),
         "crb_px": mean["crb"] ** 0.5,
         "gain": mean["gain"],
-        "told": mean["told"],
+        "degrees": mean["degrees"],
     }
 
 
@@ -266,7 +266,7 @@ class TheorySweep(Sweep[Point]):
     methods: Sequence[str]
     journal = "theory.jsonl"
     stage = "theory beside the sweeps"
-    revision = 2
+    revision = 3
 
     @property
     def patches(self) -> tuple[int, int]:

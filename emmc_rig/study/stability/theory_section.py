@@ -33,7 +33,7 @@ FIGURES = {
     "unexplained": ("share of one disparity that another does not explain", True),
     "least_squares_gain": ("noise gain, least squares", False),
     "gain": ("noise gain, posterior", False),
-    "told": ("degrees of freedom told", True),
+    "degrees": ("degrees of freedom that frames determine", True),
     "crb_px": ("Cramer-Rao bound of disparity, px", False),
     "zzb_px": ("Ziv-Zakai bound of disparity, px", False),
     FOUND: ("bound of PSNR, disparity to be found", True),
@@ -275,7 +275,7 @@ def _ranks_table(some: Sequence[Compared]) -> Table:
 
 def _figures_table(some: Sequence[Compared]) -> Table:
     names = [
-        "told", "gain", "least_squares_gain", "condition", "condition_of_two", "unexplained",
+        "degrees", "gain", "least_squares_gain", "condition", "condition_of_two", "unexplained",
         "spot_coherence", "ray_coherence", "crb_px", "zzb_px",
     ]  # fmt: skip
     heads = ["Fault", "Strength", *(FIGURES[name][0] for name in names)]
