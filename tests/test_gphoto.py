@@ -46,7 +46,8 @@ make = EosCameraSimulator if given["eos"] else PtpCameraSimulator
 if given["hidden"] is not None:
     make.hidden = tuple(given["hidden"])
 settings = {"old": True} if given["eos"] == "old" else {}
-camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=given["quality"], **settings)
+settings["quality"] = given["quality"]
+camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", **settings)
 asked, respond = [], camera.respond
 
 def noted(request, data):
