@@ -59,20 +59,20 @@ class QuietAttendant:
     """Does what it is asked, and keeps it."""
 
     def __init__(self):
-        self.reported = []
+        self.asked = []
 
     def set_lamp(self, colour):
-        self.reported.append(("lamp", colour))
+        self.asked.append(("lamp", colour))
 
     def place(self, target, turn_deg=0.0):
-        self.reported.append(("place", target))
+        self.asked.append(("place", target))
 
     def fit_masks(self, shot, fitted=True):
-        self.reported.append(("masks", shot, fitted))
+        self.asked.append(("masks", shot, fitted))
 
     @property
     def lamp(self):
-        return [reported[1] for reported in self.reported if reported[0] == "lamp"][-1]
+        return [one[1] for one in self.asked if one[0] == "lamp"][-1]
 
 
 def still_rig(size=SIZE) -> Any:
