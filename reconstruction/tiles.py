@@ -553,21 +553,26 @@ def summed_up(
 
 
 def in_few_words(said: Sequence[Sequence[str]], blocks: int) -> list[str]:
-    """Return lines that blocks have in common, each once, with the range of its numbers.
+    """Return what blocks have in common once, with the range of its numbers.
 
-    said: the lines of each block; blocks: how many there are in all.
+    said: the lines of each block; blocks: how many there are in all. Lines are taken apart at
+    semicolons; parts that the same blocks have stay together.
     """
-    alike: dict[tuple[str, ...], list[str]] = {}
-    for line in (line for lines in said for line in lines):
-        alike.setdefault(tuple(NUMBER.split(line)), []).append(line)
-    merged = []
-    for parts, lines in alike.items():
-        numbers = zip(*(NUMBER.findall(line) for line in lines), strict=True)
+    alike: dict[tuple[str, ...], dict[int, str]] = {}
+    for block, lines in enumerate(said):
+        for part in (part for line in lines for part in line.split("; ")):
+            alike.setdefault(tuple(NUMBER.split(part)), {})[block] = part
+    together: dict[frozenset[int], list[str]] = {}
+    for words, by_block in alike.items():
+        numbers = zip(*(NUMBER.findall(part) for part in by_block.values()), strict=True)
         spans = [sorted(set(each), key=float) for each in numbers]
         ends = [f"{span[0]} to {span[-1]}" if len(span) > 1 else span[0] for span in spans]
-        whole = "".join(part for pair in zip(parts, [*ends, ""], strict=True) for part in pair)
-        merged.append(f"{whole}, in {len(lines)} of {blocks} blocks")
-    return merged
+        whole = "".join(word for pair in zip(words, [*ends, ""], strict=True) for word in pair)
+        together.setdefault(frozenset(by_block), []).append(whole)
+    return [
+        f"{'; '.join(parts)}, in {len(where)} of {blocks} blocks"
+        for where, parts in together.items()
+    ]
 
 
 def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:

@@ -257,3 +257,11 @@ def test_what_many_blocks_say_is_one_line_with_the_range_of_its_numbers():
         "grey, in 1 of 5 blocks",
     ]
     assert in_few_words([], 5) == []
+
+
+def test_what_two_reasons_share_is_said_once_and_a_remedy_stays_with_its_reason():
+    said = [["flat: 82%; more shots; far: 24 px"], ["far: 24 px"], ["flat: 90%; more shots"]]
+    assert in_few_words(said, 3) == [
+        "flat: 82 to 90%; more shots, in 2 of 3 blocks",
+        "far: 24 px, in 2 of 3 blocks",
+    ]
