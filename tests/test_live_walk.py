@@ -118,7 +118,9 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
             assert complaints(driver) == []
         finally:
             running.send_signal(signal.SIGINT)
-    assert running.wait(PATIENCE_S) == 0
+            # Before its output is closed, to which it writes a last line.
+            ended = running.wait(PATIENCE_S)
+    assert ended == 0
     found = yaml.safe_load(plan.read_text())["shots"][0]["exposure_s"]
     assert 1e-4 < found < 10
     assert plan.read_text() == before.replace("  - exposure_s: auto", f"  - exposure_s: {found}")
