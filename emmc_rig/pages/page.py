@@ -83,13 +83,12 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
             f"{lost_db:.1f} dB more than by the copied centre view"
         )
     remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
+    tone = {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad")
     return Head(
         level,
         "; ".join(why) or agree,
         [one for one in remedies if one] or _uses(source, viewer),
-        {"trust": "watch" if lost_db > 0 else "good", "cannot tell": "watch", "doubt": "watch"}.get(
-            level, "bad"
-        ),
+        "watch" if tone == "good" and lost_db > 0 else tone,
     )
 
 

@@ -21,13 +21,14 @@ from scipy.optimize import minimize
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import camera_file
-from emmc_rig.files.folders import new_file, refuse_inside_session, refuse_new_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line
 from emmc_rig.model.camera import Camera, load_camera, pixel_light
 from emmc_rig.model.masks import Parameters
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruct.network_training import DARKEST, world
+from emmc_rig.reconstruct.training import check_new_file
 from reconstruction.training_patches import cut_patches
 
 Array = NDArray[np.float64]
@@ -63,13 +64,14 @@ class Aperture:
     """A camera whose masks lie in the plane of the lens, as a linear function of their cells.
 
     masks: of each shot. shapes: rows and columns of each mask's cells. basis: (shot, cell, view),
-    cells of all masks in one row.
+    cells of all masks in one row. light: of a pixel, see `pixel_light`.
     """
 
     camera: Camera
     masks: tuple[str, ...]
     shapes: tuple[tuple[int, int], ...]
     basis: Array
+    light: float
 
     def cells(self) -> Array:
         """Return the transmittances as the camera has them, (cell,)."""
@@ -85,8 +87,7 @@ class Aperture:
         """Return the mean squared error of the best linear decoder at the middle of a patch."""
         weights = np.einsum("c,scv->sv", cells, self.basis)
         exposures_s = self.camera.exposures_s()
-        light = float(pixel_light(self.camera, (PATCH_PX, PATCH_PX)).flat[0])
-        noise = self.camera.sensor.noise.variance(weights @ moments.mean, exposures_s, light)
+        noise = self.camera.sensor.noise.variance(weights @ moments.mean, exposures_s, self.light)
         covariance, middle = moments.covariance, moments.covariance.shape[1] // 2
         count = len(weights) * covariance.shape[1]
         seen = np.einsum("sv,vpwq,tw->sptq", weights, covariance, weights, optimize=True)
@@ -131,7 +132,7 @@ def aperture_of(camera: Camera) -> Aperture:
 
         def passing(cells: Array, shot: int = shot, name: str = name) -> Array:
             """Return the weights (view, pixel) that one shot has with these cells."""
-            psi = _with_cells(camera, {name: cells.tolist()}).psi((PATCH_PX, PATCH_PX))
+            psi = camera.with_pattern(name, cells=cells.tolist()).psi((PATCH_PX, PATCH_PX))
             return psi.weights[shot].astype(np.float64).sum(axis=3).reshape(-1, PATCH_PX**2)
 
         whole = passing(np.ones(shape))
@@ -145,19 +146,8 @@ def aperture_of(camera: Camera) -> Aperture:
                     f"in the plane of the lens, `distance_mm: {camera.lens.distance_mm:g}`"
                 )
             basis[shot, ends[shot] + at] = by_cell.mean(axis=1)
-    return Aperture(camera, masks, tuple(shapes), basis)
-
-
-def _with_cells(camera: Camera, cells: dict[str, Any]) -> Camera:
-    masks = {
-        name: mask.model_copy(
-            update={"pattern": mask.pattern.model_copy(update={"cells": cells[name]})}
-        )
-        if name in cells
-        else mask
-        for name, mask in camera.masks.items()
-    }
-    return camera.model_copy(update={"masks": masks})
+    light = float(pixel_light(camera, (PATCH_PX, PATCH_PX)).flat[0])
+    return Aperture(camera, masks, tuple(shapes), basis, light)
 
 
 def patch_moments(training: ApertureTraining, views: tuple[int, int], watcher: Watcher) -> Moments:
@@ -208,10 +198,7 @@ def train_aperture(training: ApertureTraining, watcher: Watcher) -> dict[str, An
 
     Raises AppError for cameras of which nothing can be learned and files in the way, CameraError.
     """
-    if training.out.suffix.lower() not in (".yaml", ".yml"):
-        raise AppError(f"--out {training.out}: a camera's file ends in .yaml")
-    refuse_inside_session(training.out)
-    refuse_new_file(training.out)
+    check_new_file(training.out, "a camera's", (".yaml", ".yml"))
     path = camera_file(training.camera)
     camera = load_camera(path)
     aperture = aperture_of(camera)

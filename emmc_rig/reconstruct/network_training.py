@@ -74,15 +74,10 @@ def world(seed: int, number: int, views: tuple[int, int]) -> NDArray[np.float32]
 
 def drawn_masks(camera: Camera, rng: np.random.Generator) -> Camera:
     """Return a camera with other random patterns of the same kinds; made ones stay as they are."""
-    masks = {
-        name: mask.model_copy(
-            update={"pattern": mask.pattern.model_copy(update={"seed": int(rng.integers(2**31))})}
-        )
-        if hasattr(mask.pattern, "seed")
-        else mask
-        for name, mask in camera.masks.items()
-    }
-    return camera.model_copy(update={"masks": masks})
+    for name, mask in camera.masks.items():
+        if hasattr(mask.pattern, "seed"):
+            camera = camera.with_pattern(name, seed=int(rng.integers(2**31)))
+    return camera
 
 
 def _detail(picture: NDArray[np.float32]) -> float:

@@ -294,10 +294,10 @@ def draw_atoms(dictionary: Dictionary) -> NDArray[np.uint8]:
     return np.rint(sheet * 255).astype(np.uint8)
 
 
-def check_new_file(out: Path, whose: str) -> None:
+def check_new_file(out: Path, whose: str, endings: Sequence[str] = (".h5", ".hdf5")) -> None:
     """Raise AppError when a file could not be written there, before hours of training."""
-    if out.suffix.lower() not in (".h5", ".hdf5"):
-        raise AppError(f"--out {out}: {whose} file ends in .h5")
+    if out.suffix.lower() not in endings:
+        raise AppError(f"--out {out}: {whose} file ends in {endings[0]}")
     refuse_inside_session(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
