@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated, NoReturn, cast
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any, NoReturn, cast
 
 import typer
 
@@ -26,6 +29,7 @@ from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
 from emmc_rig.commands.train import train
 from emmc_rig.errors import ERRORS, StoppedError, WrongUsageError
+from emmc_rig.model.view_order import ViewOrderWarning
 from emmc_rig.version import __version__
 
 INTERRUPTED = 130
@@ -63,7 +67,8 @@ def root(
 def main() -> None:
     """Run the program; never shows a traceback for a fault that the user can mend."""
     try:
-        code = app(standalone_mode=False) or 0
+        with _warnings_as_notes():
+            code = app(standalone_mode=False) or 0
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         sys.exit(code)
@@ -80,6 +85,23 @@ def main() -> None:
     except UsageError as fault:
         fault.show()
         sys.exit(fault.exit_code)
+
+
+@contextmanager
+def _warnings_as_notes() -> Iterator[None]:
+    """Show the program's own warnings as a line, once each, and all others as before."""
+    with warnings.catch_warnings():
+        otherwise = warnings.showwarning
+
+        def shown(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if issubclass(category, ViewOrderWarning):
+                say("note", message)
+            else:
+                otherwise(message, category, *where)
+
+        warnings.showwarning = shown
+        warnings.simplefilter("default", ViewOrderWarning)
+        yield
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive.edges import SIDES, dark_edges
 from reconstruction.adaptive.parsimony import may_be_grey
 from reconstruction.adaptive.settings import AdaptiveSettings
@@ -289,12 +290,13 @@ class SampleDisparity:
     """What `adaptive-fast` estimates in a sample window.
 
     largest_px: the largest disparity it is sure of. corners: (y, x, px) of the one plane that it
-    is, else none. silent: no patch preferred any disparity.
+    is, else none. silent: no patch preferred any disparity. order: of the views.
     """
 
     largest_px: float
     corners: tuple[tuple[float, float, float], ...]
     silent: bool
+    order: ViewOrder
 
 
 def _sample_disparity(
@@ -308,6 +310,7 @@ def _sample_disparity(
     """Return what a window at a place says; its corners are (y, x, px), in pixels of the whole."""
     found = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable)
     maps, silent = found.maps, not found.parameters.get("decided")
+    order = list(ViewOrder)[round(found.parameters["view_order"])]
     disparity, k = maps["disparity"].astype(np.float64), psi.binning
     sure = maps["disparity_sigma"] < SURE_PX
     largest = float(np.percentile(np.abs(disparity[sure]), COVERED)) if sure.any() else 0.0
@@ -315,11 +318,11 @@ def _sample_disparity(
     system = np.stack([np.ones_like(y), y, x], axis=-1)
     plane, *_ = np.linalg.lstsq(system, disparity.ravel(), rcond=None)
     if np.abs(system @ plane - disparity.ravel()).max() > PLANAR_PX:
-        return SampleDisparity(largest, (), silent)
+        return SampleDisparity(largest, (), silent, order)
     ends = product((0, psi.size[0] / k), (0, psi.size[1] / k))
     top, left = (part.start / k for part in place)
     corners = tuple((top + y, left + x, float(plane @ (1, y, x))) for y, x in ends)
-    return SampleDisparity(largest, corners, silent)
+    return SampleDisparity(largest, corners, silent, order)
 
 
 def _joint_plane(
@@ -336,6 +339,12 @@ def _joint_plane(
     if np.abs(system @ plane - disparity).max() > ALIKE_PX:
         return None
     return tuple(0.0 if not disparity.any() else float(value) for value in plane)  # type: ignore[return-value]
+
+
+def _joint_order(found: Sequence[SampleDisparity]) -> ViewOrder:
+    """Return the order of views that most windows say."""
+    orders = [one.order for one in found]
+    return max(ViewOrder, key=orders.count)
 
 
 def _dark_sides(psi: PsiSource, frames: Array, usable: NDArray[np.bool_]) -> tuple[str, ...]:
@@ -414,6 +423,7 @@ def surveyed(
                 or contrast_of(flat, read, picture, noise, use),
                 "parsimony": plane is not None or grey,
                 "plane": plane,
+                "views": settings.adaptive.views or _joint_order(disparities),
                 "edges": _dark_sides(psi, frames, usable),
             }
         )

@@ -4,6 +4,7 @@ A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
 import difflib
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
+from emmc_rig.model.view_order import ViewOrder, ViewOrderWarning, order_of
 from simulators.raycaster import World
 from simulators.scenes import SCENES, render
 
@@ -236,7 +238,12 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
             f"built in are {', '.join(SCENES)}"
         )
     n_v, n_u, height, width, _ = light_field.shape
-    return light_field, f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels"
+    order, said = order_of(light_field), ""
+    if order != ViewOrder.AS_NAMED:
+        said = f": {order.words}, says their parallax; put right"
+        warnings.warn(f"{spec}{said}", ViewOrderWarning, stacklevel=3)
+    described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels{said}"
+    return order.arranged(light_field), described
 
 
 def _middle(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import Scene, solve
 from reconstruction.adaptive.rest import UNEXPLAINED, misfit_of, rest
@@ -17,6 +18,9 @@ from reconstruction.adaptive.sweep import swept
 from reconstruction.adaptive.uncertainty import Deviation, apart, deviation
 
 Array = NDArray[np.floating]
+Patches = Callable[[NDArray[np.bool_], ViewOrder], Array]
+"""Returns a light field (v, u, y, x, c) of sparse patches to average with in place of total
+variation's, given which readings to fit and the order in which its views lie."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +42,13 @@ def fitted_models(
     survey: Survey,
     settings: AdaptiveSettings,
     on_step: Callable[[int], None],
-    patches: Callable[[NDArray[np.bool_]], Array] | None = None,
+    patches: Patches | None = None,
 ) -> Fits:
     """Return a fit for each of `settings.misfits`, and of patches, or of total variation.
 
     All fits but the last search the disparity again with their texture (`sweep`); where that leads
     astray the last one, which keeps what the patches agreed on, predicts held-out readings better.
-    on_step: called with the number of steps done. patches: returns their light field, given which
-    readings to fit.
+    on_step: called with the number of steps done.
     """
     given, bright, held, model = survey.given, survey.bright, survey.held, survey.model
     scale = np.float32(survey.scale)
@@ -88,7 +91,7 @@ def fitted_models(
         light_fields.append(np.broadcast_to(seen, given.psi.light_field_shape))
     assert scene is not None
     if patches is not None:
-        light_fields.append(patches(given.usable & ~held))
+        light_fields.append(patches(given.usable & ~held, survey.order))
     elif settings.free:
         light_fields.append(survey.plain)
     for light_field in light_fields[len(settings.misfits) :]:

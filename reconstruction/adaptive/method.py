@@ -29,10 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive import search
 from reconstruction.adaptive.edges import dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.fits import Fits, Mean, averaged, fitted_models, with_rest
+from reconstruction.adaptive.fits import Fits, Mean, Patches, averaged, fitted_models, with_rest
 from reconstruction.adaptive.given import checked, checked_disparity
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
 from reconstruction.adaptive.rest import Misfit, misfit_of
@@ -68,14 +69,13 @@ def reconstruct_adaptive(
     on_step: Callable[[Progress], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     disparity: Array | None = None,
-    patches: Callable[[NDArray[np.bool_]], Array] | None = None,
+    patches: Patches | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
-    it is known, in place of the one searched. patches: returns a light field (v, u, y, x, c) of
-    sparse patches to average with in place of total variation's, given which readings to fit.
+    it is known, in place of the one searched. patches: see `Patches`.
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -96,6 +96,7 @@ def reconstruct_adaptive(
     if edges is not None:
         given = replace(given, usable=given.usable & ~edges.within)
     survey = surveyed(given, settings, known, report)
+    given = survey.given
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches)
     mean = averaged(survey, fits)
     light_field = (
@@ -105,6 +106,7 @@ def reconstruct_adaptive(
     misfit = misfit_of(residual, given.noise, given.usable & ~survey.held)
     if edges is not None:
         light_field = faded(edges, given.psi, light_field, whole.frames, whole.usable)
+    light_field = survey.order.named(light_field)
     maps = _maps(survey, fits, mean, settings)
     warnings = _warnings(survey, fits, mean, misfit, settings)
     report(total)
@@ -126,6 +128,7 @@ def reconstruct_adaptive(
             "search_seconds": searched_s,
             "held_readings": int(survey.held.sum()),
             "at_end": survey.volume.at_end,
+            "view_order": float(list(ViewOrder).index(survey.order)),
             "misfit": misfit.times,
             "misfit_row": float(misfit.row),
             "misfit_column": float(misfit.column),
@@ -156,7 +159,9 @@ def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) ->
         "hidden": fits.scene.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
         "model": models,
     }
-    return maps if mean.sure is None else {**maps, "sigma": mean.sure.sigma}
+    if mean.sure is None:
+        return maps
+    return {**maps, "sigma": survey.order.named(mean.sure.sigma)}
 
 
 def _free(mean: Mean) -> NDArray[np.bool_]:
@@ -193,6 +198,11 @@ def _warnings(
     """Return what the user should know before trusting the result."""
     given, volume, decided = survey.given, survey.volume, _decided(survey.volume)
     warnings = []
+    if survey.order != ViewOrder.AS_NAMED:
+        warnings.append(
+            f"{survey.order.words}, says the parallax in the readings: see whether Psi names them "
+            "right"
+        )
     if decided is not None and decided < UNDECIDED:
         warnings.append(
             f"the evidence is flat: {1 - decided:.0%} of the textured patches prefer no "

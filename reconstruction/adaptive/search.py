@@ -20,7 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
+from reconstruction.adaptive.evidence import (
+    EvidencePatches,
+    PatchEvidence,
+    TexturePrior,
+    patch_evidence,
+)
 from reconstruction.adaptive.labels import RARE_PX, compatibility, posteriors
 
 Array = NDArray[np.floating]
@@ -100,12 +105,19 @@ def _evaluated(
     """Return evidence (row, column, disparity), kinds (row, column), and the corners' grid."""
     rows, columns = patches.grid(data.psi.frames_shape[1:])
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
-    found = _evidence(data, patches, corners, disparities, prior)
+    found = evidence_at(data, patches, corners, disparities, prior)
     shape = len(rows), len(columns)
     return found.log_likelihood.reshape(*shape, -1), found.kind.reshape(shape), (rows, columns)
 
 
-def _evidence(data: Data, patches: EvidencePatches, corners, disparities: Array, prior):
+def evidence_at(
+    data: Data,
+    patches: EvidencePatches,
+    corners: NDArray[np.int64],
+    disparities: Array,
+    prior: TexturePrior,
+) -> PatchEvidence:
+    """Return the evidence of the patches at corners (patch, 2), in pixels."""
     half = ((patches.side - 1) * patches.spacing) // 2
     bright = data.brightness[corners[:, 0] + half, corners[:, 1] + half]
     return patch_evidence(
@@ -253,7 +265,7 @@ def _on_grid(
             spans = [(at[0], at[-1] + side) for at in some]
             chosen = _candidates(rough, spans[0], spans[1], labels)
             corners = np.stack(np.meshgrid(*some, indexing="ij"), axis=-1).reshape(-1, 2)
-            found = _evidence(data, patches, corners, labels[chosen], prior)
+            found = evidence_at(data, patches, corners, labels[chosen], prior)
             shape = len(some[0]), len(some[1])
             values = found.log_likelihood.reshape(*shape, -1)
             part = np.full((*shape, len(labels)), -np.inf, dtype=np.float32)

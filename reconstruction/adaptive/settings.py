@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
+from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive.joint import TextureSettings
 
 Length = Annotated[float, Field(gt=0)]
@@ -65,6 +66,9 @@ class AdaptiveSettings(Settings):
     )
     rest: bool = Field(
         default=True, description="add a light field of the residual, where held-out readings agree"
+    )
+    views: ViewOrder | None = Field(
+        default=None, description="how the views of Psi lie; None: as the frames say"
     )
     edges: tuple[Literal["top", "bottom", "left", "right"], ...] = Field(
         default=("top", "bottom", "left", "right"),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.given import Given
@@ -29,6 +30,7 @@ from reconstruction.adaptive.parsimony import (
 )
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
+from reconstruction.adaptive.views import in_order, order_by_evidence
 from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import FlatPsi, flat_psi
@@ -61,14 +63,15 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """given: as it was. scale: of the scene's contrast; bright: `given` over it. held: readings
-    kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
+    """given: as it was, but its views as they lie, in `order`. scale: of the scene's contrast;
+    bright: `given` over it. held: readings kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
     disparities. unseen: variance by colours that frames do not show, (y, x). mu: weight of total
     variation, plain: its light field. model: what is fitted, left_out: in words, what the scene
     does not need.
     """
 
     given: Given
+    order: ViewOrder
     scale: float
     bright: Given
     held: NDArray[np.bool_]
@@ -92,8 +95,7 @@ def surveyed(
     disparity: of the centre view (y, x) where it is known. on_searched: called with 1 and 2 after
     the coarse and the fine search.
     """
-    psi, k = given.psi, given.psi.binning
-    flat = flat_psi(psi)
+    k, flat = given.psi.binning, flat_psi(given.psi)
     picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
     unseen = unseen_colour(flat, given.frames, given.usable, picture)
     own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
@@ -102,13 +104,20 @@ def surveyed(
     picture = picture / np.float32(scale)
     grey = picture.mean(axis=-1)
     data = search.Data(
-        psi,
+        given.psi,
         (bright.frames - flat.forward(picture)).astype(np.float32),
         bright.variance(settings.misfit),
         given.usable,
         grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3)),
     )
-    volume = _searched(data, settings, on_searched)
+    coarse, fine = (
+        TexturePrior(length, tuple(finer), freedom=settings.freedom)
+        for length, *finer in (COARSE_PX, settings.lengths_px)
+    )
+    order = settings.views or order_by_evidence(data, fine)
+    psi = in_order(given.psi, order)
+    given, bright, data = replace(given, psi=psi), replace(bright, psi=psi), replace(data, psi=psi)
+    volume = _searched(data, coarse, fine, settings, on_searched)
     centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     held = held_out(given.usable)
     fitted = given.usable & ~held
@@ -123,8 +132,9 @@ def surveyed(
     if settings.parsimony:
         model, left_out = _needed(model, volume, bright, held, settings)
     return Survey(
-        given, scale, bright, held, data.readings, volume, unseen, mu, plain, model, tuple(left_out)
-    )
+        given, order, scale, bright, held, data.readings, volume, unseen, mu, plain, model,
+        tuple(left_out),
+    )  # fmt: skip
 
 
 def contrast_of(
@@ -142,13 +152,13 @@ def contrast_of(
 
 
 def _searched(
-    data: search.Data, settings: AdaptiveSettings, on_searched: Callable[[int], None]
+    data: search.Data,
+    coarse: TexturePrior,
+    fine: TexturePrior,
+    settings: AdaptiveSettings,
+    on_searched: Callable[[int], None],
 ) -> search.Volume:
     """Return the disparities that patches and their neighbours agree on, coarse to fine."""
-    coarse, fine = (
-        TexturePrior(length, tuple(finer), freedom=settings.freedom)
-        for length, *finer in (COARSE_PX, settings.lengths_px)
-    )
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)

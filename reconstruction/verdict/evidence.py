@@ -74,7 +74,8 @@ class Evidence:
         return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
-TOLD = ("decided", "at_end", "share_free", "over_plain", "misfit", "misfit_row", "misfit_column")
+TOLD = ("decided", "at_end", "share_free", "over_plain", "misfit", "misfit_row", "misfit_column",
+        "view_order")  # fmt: skip
 """Parameters of a result that bear on whether it can be trusted."""
 
 

@@ -1,0 +1,128 @@
+"""Views stored or calibrated in another order than their names say are told, and put right."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from programs import program
+
+import emmc_rig as emmc
+from emmc_rig.model.lightfield import load_views, psnr_db, save_views
+from emmc_rig.model.view_order import ViewOrder, ViewOrderWarning, order_of
+
+WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]
+SIZE = (128, 160)
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    return emmc.scene("deep-occlusions", size=SIZE, seed=3).light_field
+
+
+@pytest.mark.parametrize("order", WRONG)
+def test_named_undoes_arranged(order: ViewOrder) -> None:
+    array = np.random.default_rng(0).random((2, 3, 3, 4, 5))
+    assert np.array_equal(order.named(order.arranged(array)), array)
+    assert np.array_equal(order.arranged(order.named(array, axis=1), axis=1), array)
+    assert not np.array_equal(order.arranged(array, axis=1), array)
+
+
+@pytest.mark.parametrize("order", ViewOrder)
+@pytest.mark.parametrize("name", ["deep-occlusions", "non-lambertian", "dark", "wide-disparity"])
+def test_parallax_tells_the_order(name: str, order: ViewOrder) -> None:
+    scene = emmc.scene(name, size=(96, 128), seed=1).light_field
+    assert order_of(order.named(scene)) == order
+
+
+@pytest.mark.parametrize("views", [(5, 3), (3, 5), (3, 3)])
+def test_other_grids(views: tuple[int, int]) -> None:
+    scene = emmc.scene("deep-occlusions", size=(96, 128), views=views).light_field
+    assert order_of(scene) == ViewOrder.AS_NAMED
+    assert order_of(np.ascontiguousarray(scene[:, ::-1])) == ViewOrder.MIRRORED
+
+
+def test_two_views_a_side_are_not_turned() -> None:
+    scene = emmc.scene("deep-occlusions", size=(96, 128), views=(2, 2)).light_field
+    assert order_of(scene) == ViewOrder.AS_NAMED
+
+
+def test_without_parallax_names_are_believed(truth: np.ndarray) -> None:
+    flat = np.broadcast_to(truth[2, 2], truth.shape)
+    noise = np.random.default_rng(1).random(truth.shape, dtype=np.float32)
+    dark = np.zeros_like(truth)
+    for light_field in (flat, noise, dark, truth[:, :, :6, :7]):
+        assert order_of(light_field) == ViewOrder.AS_NAMED
+
+
+@pytest.mark.parametrize("order", WRONG)
+def test_a_folder_in_another_order_is_put_right(
+    tmp_path: Path, truth: np.ndarray, order: ViewOrder
+) -> None:
+    stored = order.named(truth)
+    save_views(tmp_path / "views", stored)
+    with pytest.warns(ViewOrderWarning, match=order.words):
+        scene = emmc.scene(str(tmp_path / "views"))
+    assert order.words in scene.provenance
+    assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(load_views(tmp_path / "views") - stored).max() <= 0.5 / 255 + 1e-6
+
+
+def test_a_file_in_order_is_left_alone(tmp_path: Path, truth: np.ndarray) -> None:
+    with h5py.File(tmp_path / "scene.h5", "w") as file:
+        file["light_field"] = truth
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(emmc.scene(str(tmp_path / "scene.h5")).light_field, truth)
+
+
+def test_commands_say_it_in_a_line(tmp_path: Path, truth: np.ndarray) -> None:
+    save_views(tmp_path / "views", ViewOrder.TRANSPOSED.named(truth))
+    scene, out = tmp_path / "views", tmp_path / "frames"
+    code, _, errors = program("simulate", "--scene", scene, "--out", out)
+    assert code == 0
+    said = [line for line in errors.splitlines() if ViewOrder.TRANSPOSED.words in line]
+    assert len(said) == 1
+    assert said[0].startswith("note:")
+
+
+def _found(light_field: np.ndarray, method: str, shots: int) -> emmc.Result:
+    camera = emmc.camera(f"rgbw-bayer-{shots}shot" + "s" * (shots > 1))
+    psi = camera.psi(light_field.shape[2:4])
+    return emmc.reconstruct(psi, camera.expose(light_field, 0, psi), method)
+
+
+@pytest.fixture(scope="module")
+def right(truth: np.ndarray) -> emmc.Result:
+    return _found(truth, "adaptive-fast", 1)
+
+
+@pytest.mark.parametrize("order", WRONG)
+def test_frames_tell_the_order_that_psi_does_not(
+    truth: np.ndarray, right: emmc.Result, order: ViewOrder
+) -> None:
+    named = order.named(truth)
+    wrong = _found(named, "adaptive-fast", 1)
+    assert psnr_db(wrong.light_field, named) > psnr_db(right.light_field, truth) - 0.2
+    assert wrong.verdict.level == "doubt"
+    assert order.words in wrong.verdict.words
+    assert not any(one.words in right.verdict.words for one in WRONG)
+    sigma = wrong.sigma
+    assert sigma is not None
+    square = np.square(wrong.light_field - named).mean(axis=-1)
+    seen, other = (
+        np.corrcoef(np.log(s.ravel() + 1e-9), np.log(square.ravel() + 1e-9))[0, 1]
+        for s in (sigma, order.named(sigma))
+    )
+    assert seen > other
+
+
+def test_sparse_patches_lie_in_the_same_order(truth: np.ndarray) -> None:
+    lying = truth[:, :, 32:96, 32:112]
+    named = ViewOrder.TRANSPOSED.named(lying)
+    right, wrong = _found(lying, "adaptive", 2), _found(named, "adaptive", 2)
+    assert ViewOrder.TRANSPOSED.words in wrong.verdict.words
+    assert psnr_db(wrong.light_field, named) > psnr_db(right.light_field, lying) - 0.2
