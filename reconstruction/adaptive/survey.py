@@ -64,10 +64,10 @@ class Model:
 @dataclass(frozen=True, eq=False)
 class Survey:
     """given: as it was, but its views as they lie, in `order`. scale: of the scene's contrast;
-    bright: `given` over it. held: readings kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
-    disparities. unseen: variance by colours that frames do not show, (y, x). mu: weight of total
-    variation, plain: its light field. model: what is fitted, left_out: in words, what the scene
-    does not need.
+    bright: `given` over it. held: readings kept from every fit. unexplained: residual of the smooth
+    picture. volume: beliefs about disparities. unseen: variance by colours that frames do not show,
+    (y, x). mu: weight of total variation, plain: its light field. model: what is fitted, left_out:
+    in words, what the scene does not need.
     """
 
     given: Given
