@@ -27,7 +27,7 @@ from reconstruction.verdict.pixels import judged_pixels
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
-from reconstruction.verdict.shots import compared
+from reconstruction.verdict.shots import Motion, compared
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
@@ -165,19 +165,20 @@ def test_readings_kept_tell_what_is_explained_and_what_is_noise(three):
     clean = three.forward(truth)
     frames = (clean + sigma * rng.normal(size=clean.shape)).astype(np.float32)
     kept = rng.random(clean.shape) < 0.3
-    found = foretold(three, frames, sigma, kept, truth, relief_in(three, frames, sigma))
+    smooth = relief_in(three, frames, sigma)
+    found = foretold(frames, frames - clean, sigma, kept, smooth)
     assert found is not None
     assert found.readings == kept.sum()
     assert found.noise == pytest.approx(1, abs=0.1)
     assert found.explained == pytest.approx(1, abs=0.1)
     assert found.missed == pytest.approx(sigma / frames[kept].mean(), rel=0.05)
-    off = foretold(three, frames, sigma, kept, truth * 0.9, relief_in(three, frames, sigma))
+    off = foretold(frames, frames - 0.9 * clean, sigma, kept, smooth)
     assert off is not None
     expected = sigma**2 / np.mean(np.square(frames - 0.9 * clean)[kept])
     assert off.noise == pytest.approx(expected, rel=0.05)
     few = np.zeros_like(kept)
     few[0, 0, :5] = True
-    assert foretold(three, frames, sigma, few, truth, relief_in(three, frames, sigma)) is None
+    assert foretold(frames, frames - clean, sigma, few, smooth) is None
 
 
 def test_few_readings_are_kept_and_the_same_each_time(three):
@@ -306,14 +307,19 @@ def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_ps
     assert "cannot be tested" in verdict.words
 
 
+MOVED = {"motion_effect": 0.2, "moved_at": (1, 5, 5)}
+
+
 @pytest.mark.parametrize(
     ("found", "by_tv", "by_adaptive"),
     [
         ({"bad": 0.06}, "trust", "doubt"),
         ({"left_out": (1, 2)}, "doubt", "trust"),
         ({"bad": 0.03}, "trust", "trust"),
-        ({"motion_effect": 0.2, "motion_px": 0.3, "moved_at": (1, 5, 5)}, "trust", "trust"),
-        ({"motion_effect": 0.2, "motion_px": 0.5, "moved_at": (1, 5, 5)}, "doubt", "doubt"),
+        ({**MOVED, "motion_px": 0.3, "motion_left": 0.1}, "trust", "trust"),
+        ({**MOVED, "motion_px": 0.5, "motion_left": 0.1}, "doubt", "doubt"),
+        ({**MOVED, "motion_px": 0.5, "motion_left": None}, "doubt", "doubt"),
+        ({**MOVED, "motion_px": 0.5, "motion_left": 0.01}, "doubt", "trust"),
         ({"bad": 0.1}, "doubt", "doubt"),
     ],
 )
@@ -344,6 +350,17 @@ def motion_effect(fault, strength):
 def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
     assert motion_effect("bad-pixels", 3) < 0.02
     assert motion_effect("camera-motion", 1) > 0.2
+
+
+def test_what_a_light_field_leaves_of_a_moved_place_is_beyond_noise():
+    moved = Motion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
+    assert moved.place == (20, 50)
+    residual = np.full((3, 64, 80), 5.0)
+    residual[:, 10:30, 40:60] = np.random.default_rng(0).normal(0, 0.05, (3, 20, 20))
+    usable = np.ones(residual.shape, bool)
+    assert moved.unexplained(residual, 0.03**2, usable) == pytest.approx(0.04, rel=0.1)
+    assert moved.unexplained(residual, 0.06**2, usable) == 0
+    assert moved.unexplained(residual, 0.03**2, ~usable) == 0
 
 
 def test_a_spot_that_one_shot_cannot_see_does_not_pass_for_motion(three):

@@ -89,6 +89,7 @@ def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
     if moved:
         effect, block, one = max(moved, key=lambda each: each[0])
         found |= {"motion_px": one.motion_px, "motion_effect": effect}
+        found |= {"motion_left": one.motion_left}
         if one.moved_at is not None:
             found["moved_at"] = (one.moved_at[0], *_at(block, one.moved_at[1:]))
     return found

@@ -28,6 +28,8 @@ class Evidence:
 
     method: its name; status: its status. left_out: shots that screening left out. bad: share of
     the pixels that screening left out. noise: the readings' deviation over their mean.
+    motion_left: what the light field leaves unexplained where the picture moves most, over the mean
+    reading.
     colour_error: root mean square by colours that frames do not show, over the brightness.
     """
 
@@ -63,6 +65,7 @@ class Evidence:
     beyond: float | None
     parameters: dict[str, float]
     colour_error: float | None = None
+    motion_left: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -107,7 +110,9 @@ def gathered(
     shots = compared(psi, found)
     moved = shots.motion
     pixels = judged_pixels(psi, read.excluded, found, noise_sigma, usable)
-    fits = foretold(psi, frames, noise_sigma, read.kept & usable, result.light_field, found)
+    residual = frames - psi.forward(result.light_field)
+    fits = foretold(frames, residual, noise_sigma, read.kept & usable, found)
+    left = None if moved is None else moved.unexplained(residual, noise_sigma**2, usable)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     return Evidence(
         method=result.method,
@@ -126,6 +131,7 @@ def gathered(
         brightness=_plain(shots.brightness),
         motion_px=None if moved is None else moved.size_px,
         motion_effect=None if moved is None else moved.effect,
+        motion_left=None if left is None else left / mean,
         moved_at=None if moved is None else (moved.shot, *moved.place),
         off=pixels.off,
         bad=read.bad,

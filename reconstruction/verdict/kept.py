@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
@@ -44,22 +43,17 @@ class Kept:
 
 
 def foretold(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    kept: NDArray[np.bool_],
-    light_field: Array,
-    found: Relief,
+    frames: Array, residual: Array, noise_sigma: float, kept: NDArray[np.bool_], found: Relief
 ) -> Kept | None:
     """Return how a light field fitted without some readings foretells them; None with too few.
 
-    frames, kept: (shot, pixel_y, pixel_x).
+    frames, residual (frames less what it predicts), kept: (shot, pixel_y, pixel_x).
     """
     kept = kept & np.isfinite(frames)
     if kept.sum() < FEWEST:
         return None
     read = frames[kept].astype(np.float64)
-    miss = read - psi.forward(light_field)[kept]
+    miss = residual[kept].astype(np.float64)
     smooth = (found.level * (1 + found.masks))[kept]
     plain = read - smooth
     square, before, noise = float(np.mean(miss**2)), float(np.mean(plain**2)), noise_sigma**2

@@ -28,13 +28,29 @@ SAME_VIEWPOINT = 0.1
 class Motion:
     """The worst in any tile between a shot and the first, beyond two deviations.
 
-    size_px: how far. effect: what it changes, over the mean reading. shot; place: (y, x).
+    size_px: how far. effect: what it changes, over the mean reading. shot; tile: rows, columns.
     """
 
     size_px: float = 0.0
     effect: float = 0.0
     shot: int = 0
-    place: tuple[int, int] = (0, 0)
+    tile: tuple[slice, slice] = slice(0, 0), slice(0, 0)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Return the middle of the tile, (y, x)."""
+        y, x = ((part.start + part.stop) // 2 for part in self.tile)
+        return y, x
+
+    def unexplained(self, residual: Array, variance: float, usable: NDArray[np.bool_]) -> float:
+        """Return what a light field leaves of the tile's readings in all shots, beyond noise.
+
+        residual, usable: (shot, pixel_y, pixel_x). variance: of a reading. Root mean square, in
+        units of the readings.
+        """
+        within = usable[:, *self.tile]
+        square = np.square(residual[:, *self.tile][within], dtype=np.float64)
+        return float(np.sqrt(max(square.mean() - variance, 0.0))) if square.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +118,7 @@ def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> Motion:
             for y, x in tiles((rows, columns)):
                 size, steepness = _moved(slope_y[y, x], slope_x[y, x], change[y, x], blur)
                 if size * steepness / mean > worst.effect:
-                    place = ((y.start + y.stop) // 2, (x.start + x.stop) // 2)
-                    worst = Motion(size, size * steepness / mean, shot, place)
+                    worst = Motion(size, size * steepness / mean, shot, (y, x))
     return worst
 
 
