@@ -29,7 +29,7 @@ from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
 from emmc_rig.commands.train import train
 from emmc_rig.errors import ERRORS, StoppedError, WrongUsageError
-from emmc_rig.model.view_order import ViewOrderWarning
+from emmc_rig.model.errors import ViewOrderWarning
 from emmc_rig.version import __version__
 
 INTERRUPTED = 130

@@ -11,8 +11,9 @@ import pytest
 from programs import program
 
 import emmc_rig as emmc
+from emmc_rig.model.errors import ViewOrderWarning
 from emmc_rig.model.lightfield import load_views, psnr_db, save_views
-from emmc_rig.model.view_order import ViewOrder, ViewOrderWarning, order_of
+from emmc_rig.model.view_order import ViewOrder, order_of
 
 WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]
 SIZE = (128, 160)

@@ -15,9 +15,9 @@ import numpy as np
 
 from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
-from emmc_rig.model.errors import SceneError
+from emmc_rig.model.errors import SceneError, ViewOrderWarning
 from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
-from emmc_rig.model.view_order import ViewOrder, ViewOrderWarning, order_of
+from emmc_rig.model.view_order import ViewOrder, order_of
 from simulators.raycaster import World
 from simulators.scenes import SCENES, render
 

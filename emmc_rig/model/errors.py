@@ -25,3 +25,7 @@ class CameraError(ModelError):
 
 class SensingError(ModelError):
     """An imaging matrix, or data given to it, that does not fit."""
+
+
+class ViewOrderWarning(UserWarning):
+    """Views of a light field were stored in another order than their names say, and put right."""

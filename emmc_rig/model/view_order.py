@@ -31,10 +31,6 @@ LEFT = 0.5
 """Share of what the named order leaves unexplained that another may leave."""
 
 
-class ViewOrderWarning(UserWarning):
-    """Views of a light field were stored in another order than their names say, and put right."""
-
-
 class ViewOrder(StrEnum):
     """How the views of an array (v, u, ...) lie; both axes reversed change but disparity's sign."""
 
