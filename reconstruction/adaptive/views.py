@@ -20,7 +20,7 @@ from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior
 
 VIEW_AXIS = 1
 """Of weights (shot, v, u, ...)."""
-COUNTS = 48, 192, 768
+COUNTS = 24, 96, 384, 768
 """Patches looked at: few, and more where they hint at another order."""
 HINT, PROOF = 1.0, 6.0
 """Ratio of sum to root of squares from which more patches are asked, and another order is taken."""
@@ -38,7 +38,11 @@ def in_order(psi: ImagingMatrix, order: ViewOrder) -> ImagingMatrix:
 
 
 def order_by_evidence(data: search.Data, prior: TexturePrior) -> ViewOrder:
-    """Return how the views of `data.psi` lie; as named unless the evidence is plain."""
+    """Return how the views of `data.psi` lie; as named unless the evidence is plain.
+
+    Of the prior's lengths the first alone is asked.
+    """
+    prior = replace(prior, finer_px=())
     side = search.reading_side(data.psi.shots)
     pixels = data.psi.frames_shape[1:]
     if min(pixels) < side:
