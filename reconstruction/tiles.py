@@ -310,7 +310,7 @@ def _sample_disparity(
     """Return what a window at a place says; its corners are (y, x, px), in pixels of the whole."""
     found = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable)
     maps, silent = found.maps, not found.parameters.get("decided")
-    order = list(ViewOrder)[round(found.parameters["view_order"])]
+    order = ViewOrder.numbered(found.parameters["view_order"])
     disparity, k = maps["disparity"].astype(np.float64), psi.binning
     sure = maps["disparity_sigma"] < SURE_PX
     largest = float(np.percentile(np.abs(disparity[sure]), COVERED)) if sure.any() else 0.0

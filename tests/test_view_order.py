@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -70,6 +72,36 @@ def test_a_folder_in_another_order_is_put_right(
     assert order.words in scene.provenance
     assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
     assert np.abs(load_views(tmp_path / "views") - stored).max() <= 0.5 / 255 + 1e-6
+
+
+def test_files_named_column_by_column_are_put_right(tmp_path: Path, truth: np.ndarray) -> None:
+    # Named here, so that no code of the orders has a part in it.
+    for row, column in np.ndindex(5, 5):
+        codes = np.round(255 * truth[row, column, ..., ::-1]).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"view_{column}_{row}.png"), codes)
+    with pytest.warns(ViewOrderWarning, match="interchanged"):
+        scene = emmc.scene(str(tmp_path))
+    assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
+
+
+def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the dense optical flow between two views, (2, y, x), along x and y, in pixels."""
+    codes = [np.round(255 * view.mean(axis=-1)).astype(np.uint8) for view in (first, second)]
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*codes, None)  # type: ignore[attr-defined, call-overload]
+    return np.moveaxis(flow, -1, 0)
+
+
+@pytest.mark.real_data
+@pytest.mark.filterwarnings("ignore::emmc_rig.model.errors.ViewOrderWarning")
+def test_real_views_move_along_their_rows_by_optical_flow() -> None:
+    folders = [one for one in Path(os.environ["EMMC_LIGHTFIELDS"]).iterdir() if one.is_dir()]
+    for folder in folders:
+        lf = emmc.scene(str(folder), views=(5, 5)).light_field
+        along_row, along_column = _flow(lf[2, 2], lf[2, 4]), _flow(lf[2, 2], lf[4, 2])
+        within = np.square(along_row[0]) + np.square(along_column[1])
+        across = np.square(along_row[1]) + np.square(along_column[0])
+        assert within.mean() > 2 * across.mean(), folder.name
+        assert (along_row[0] * along_column[1]).mean() > 0, folder.name
 
 
 def test_a_file_in_order_is_left_alone(tmp_path: Path, truth: np.ndarray) -> None:

@@ -49,19 +49,35 @@ class ViewOrder(StrEnum):
             ViewOrder.TURNED: "views are turned by a quarter",
         }[self]
 
+    @property
+    def number(self) -> float:
+        """Its place among the orders, for figures of a result; see `numbered`."""
+        return float(list(ViewOrder).index(self))
+
+    @classmethod
+    def numbered(cls, number: float) -> ViewOrder:
+        """Return the order of a number."""
+        return list(cls)[round(number)]
+
+    @property
+    def interchanges(self) -> bool:
+        """Whether rows of views are named as columns."""
+        return self in (ViewOrder.TRANSPOSED, ViewOrder.TURNED)
+
+    @property
+    def reverses(self) -> bool:
+        """Whether columns of views, once they are columns, run backwards."""
+        return self in (ViewOrder.MIRRORED, ViewOrder.TURNED)
+
     def arranged(self, named: np.ndarray, axis: int = 0) -> np.ndarray:
         """Return an array as its views lie. axis: that of rows of views, columns come next."""
-        turned = self in (ViewOrder.TRANSPOSED, ViewOrder.TURNED)
-        lying = named.swapaxes(axis, axis + 1) if turned else named
-        mirrored = self in (ViewOrder.MIRRORED, ViewOrder.TURNED)
-        return np.ascontiguousarray(np.flip(lying, axis + 1) if mirrored else lying)
+        lying = named.swapaxes(axis, axis + 1) if self.interchanges else named
+        return np.ascontiguousarray(np.flip(lying, axis + 1) if self.reverses else lying)
 
     def named(self, lying: np.ndarray, axis: int = 0) -> np.ndarray:
         """Return an array by the names of its views, the inverse of `arranged`."""
-        mirrored = self in (ViewOrder.MIRRORED, ViewOrder.TURNED)
-        named = np.flip(lying, axis + 1) if mirrored else lying
-        turned = self in (ViewOrder.TRANSPOSED, ViewOrder.TURNED)
-        return np.ascontiguousarray(named.swapaxes(axis, axis + 1) if turned else named)
+        named = np.flip(lying, axis + 1) if self.reverses else lying
+        return np.ascontiguousarray(named.swapaxes(axis, axis + 1) if self.interchanges else named)
 
 
 def others(views: tuple[int, int]) -> tuple[ViewOrder, ...]:
@@ -106,15 +122,11 @@ def _explained(light_field: np.ndarray) -> dict[ViewOrder, list[float]]:
             break
         for order, of in shares.items():
             # Views as they lie move along (y, x); mirrored ones against x.
-            down, right = changes if order in _UPRIGHT else changes[::-1]
-            right = -right if order in _REVERSED else right
+            down, right = changes[::-1] if order.interchanges else changes
+            right = -right if order.reverses else right
             both = _blurred(down * slope_y + right * slope_x, AROUND * blur)
             of.append(float((np.square(both) / np.maximum(steep, 1e-12)).sum() / moved))
     return shares
-
-
-_UPRIGHT = ViewOrder.AS_NAMED, ViewOrder.MIRRORED
-_REVERSED = ViewOrder.MIRRORED, ViewOrder.TURNED
 
 
 def _blurred(picture: np.ndarray, deviation_px: float) -> np.ndarray:

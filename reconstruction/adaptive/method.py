@@ -128,7 +128,7 @@ def reconstruct_adaptive(
             "search_seconds": searched_s,
             "held_readings": int(survey.held.sum()),
             "at_end": survey.volume.at_end,
-            "view_order": float(list(ViewOrder).index(survey.order)),
+            "view_order": survey.order.number,
             "misfit": misfit.times,
             "misfit_row": float(misfit.row),
             "misfit_column": float(misfit.column),

@@ -9,6 +9,7 @@ their log ratios is compared with the root of the sum of their squares.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,6 @@ from emmc_rig.model.view_order import ViewOrder, others
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior
 
-VIEW_AXIS = 1
-"""Of weights (shot, v, u, ...)."""
 COUNTS = 24, 96, 384, 768
 """Patches looked at: few, and more where they hint at another order."""
 HINT, PROOF = 1.0, 6.0
@@ -34,7 +33,8 @@ def in_order(psi: ImagingMatrix, order: ViewOrder) -> ImagingMatrix:
     """Return a Psi with its views as they lie."""
     if order == ViewOrder.AS_NAMED:
         return psi
-    return replace(psi, weights=order.arranged(psi.weights, VIEW_AXIS))
+    # Weights are (shot, v, u, ...).
+    return replace(psi, weights=order.arranged(psi.weights, axis=1))
 
 
 def order_by_evidence(data: search.Data, prior: TexturePrior) -> ViewOrder:
@@ -48,19 +48,20 @@ def order_by_evidence(data: search.Data, prior: TexturePrior) -> ViewOrder:
     if min(pixels) < side:
         return ViewOrder.AS_NAMED
     patches = EvidencePatches(side, side)
-    candidates, corners = others(data.psi.light_field_shape[:2]), _spread(patches, pixels)
-    for count in COUNTS:
-        own = _evidence(data, patches, corners[:count], prior, ViewOrder.AS_NAMED)
-        gains = {
-            order: _evidence(data, patches, corners[:count], prior, order) - own
-            for order in candidates
-        }
-        best = max(candidates, key=lambda order: gains[order].sum())
+    corners = _spread(patches, pixels)
+    gains = {order: np.empty(0) for order in others(data.psi.light_field_shape[:2])}
+    for first, last in pairwise((0, *COUNTS)):
+        more = corners[first:last]
+        if not gains or not len(more):
+            break
+        own = _evidence(data, patches, more, prior, ViewOrder.AS_NAMED)
+        for order in gains:
+            gain = _evidence(data, patches, more, prior, order) - own
+            gains[order] = np.append(gains[order], gain)
+        best = max(gains, key=lambda order: gains[order].sum())
         if _ratio(gains[best]) > PROOF and gains[best].sum() > LEAST:
             return best
-        candidates = tuple(order for order, gain in gains.items() if _ratio(gain) > HINT)
-        if not candidates or count >= len(corners):
-            break
+        gains = {order: gain for order, gain in gains.items() if _ratio(gain) > HINT}
     return ViewOrder.AS_NAMED
 
 

@@ -385,12 +385,12 @@ def _search(e: Evidence) -> Iterator[Reason]:
             "use a mask that differs from view to view, or more shots",
             UNDECIDED.level(1 - decided),
         )
-    order = list(ViewOrder)[round(e.parameters.get("view_order", 0))]
+    order = ViewOrder.numbered(e.parameters.get("view_order", 0.0))
     if order != ViewOrder.AS_NAMED:
         yield Reason(
             f"{order.words}: so the parallax in the readings says, and so the light field was "
             "found; it names its views as Psi does",
-            float(e.parameters["view_order"]),
+            order.number,
             "compare the order in which calibration opened the aperture with the sensor's rows and "
             "columns, or the names of the scene's views with them",
             "doubt",
