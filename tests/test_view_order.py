@@ -100,8 +100,9 @@ def test_real_views_move_along_their_rows_by_optical_flow() -> None:
         along_row, along_column = _flow(lf[2, 2], lf[2, 4]), _flow(lf[2, 2], lf[4, 2])
         within = np.square(along_row[0]) + np.square(along_column[1])
         across = np.square(along_row[1]) + np.square(along_column[0])
-        assert within.mean() > 2 * across.mean(), folder.name
-        assert (along_row[0] * along_column[1]).mean() > 0, folder.name
+        # Medians: where nothing is to be seen, flow goes astray.
+        assert np.median(within) > 2 * np.median(across), folder.name
+        assert np.median(along_row[0] * along_column[1]) > 0, folder.name
 
 
 def test_a_file_in_order_is_left_alone(tmp_path: Path, truth: np.ndarray) -> None:
