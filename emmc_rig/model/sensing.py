@@ -167,6 +167,11 @@ class ImagingMatrix:
         return int(np.prod(self.frames_shape)), int(np.prod(self.light_field_shape))
 
     @property
+    def is_colour_blind(self) -> bool:
+        """Whether readings are the same whatever the colours: no filter, no coloured mask."""
+        return self.colour is None and not np.ptp(self.weights, axis=4).any()
+
+    @property
     def colour_map(self) -> NDArray[np.uint8]:
         """The colour map as the kernels take it (a dummy when three colours are stored)."""
         return NO_COLOUR_MAP if self.colour is None else self.colour

@@ -108,6 +108,8 @@ def example(training: NetworkTraining, cameras: list[Camera], step: int):
     light = np.exp(rng.uniform(np.log(DARKEST), 0))
     truth = np.ascontiguousarray(light * truth[..., rng.permutation(3)], np.float32)
     psi = drawn_masks(cameras[rng.integers(len(cameras))], rng).psi((side, side))
+    if psi.is_colour_blind:
+        truth = np.broadcast_to(truth.mean(axis=-1, keepdims=True), truth.shape).copy()
     sigma = np.exp(rng.uniform(*np.log(NOISE)))
     frames = psi.forward(truth)
     frames += sigma * rng.standard_normal(frames.shape, dtype=np.float32)
