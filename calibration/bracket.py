@@ -28,8 +28,9 @@ QUANTISATION_DN2 = 1 / 12
 class LinearFrame:
     """A frame in DN per second above the dark, all (y, x).
 
-    variance: of `dn_per_s`, (DN/s)^2; infinite where nothing is usable. usable: at least one
-    exposure was neither saturated nor foretold to be.
+    dn_per_s: where the shortest exposure is saturated, the least that it can be. variance: of
+    `dn_per_s`, (DN/s)^2; infinite where nothing is usable. usable: at least one exposure was
+    neither saturated nor foretold to be.
     """
 
     dn_per_s: NDArray[np.float32]
@@ -72,6 +73,8 @@ def fuse(
     # The dark frame's own noise is common to all exposures.
     lever = np.sum([w / t for w, t in zip(weights, times_s, strict=True)], axis=0) / safe
     variance = 1 / safe + lever**2 * gain.dark_variance_dn2 / dark.count
+    clipped = ~(seen | unclipped[0]) if dead is None else ~(seen | unclipped[0] | dead)
+    rate = np.where(clipped, np.maximum(signals[0], 0) / times_s[0], rate)
     return LinearFrame(
         rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen
     )

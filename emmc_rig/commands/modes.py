@@ -17,6 +17,7 @@ from emmc_rig.errors import ERRORS
 
 TIMED = {"camera", "size", "repeats", "out"}
 STUDIED = {"scene", "camera", "size", "out"}
+LEARNED = {"scenes", "leave_out", "camera", "views", "steps", "minutes", "seed", "resume", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
@@ -59,7 +60,7 @@ MODES: dict[str, dict[str, set[str]]] = {
     },
     "train": {
         "aperture": {"camera", "seed", "out"},
-        "network": {"camera", "views", "steps", "minutes", "seed", "resume", "out"},
+        "network": LEARNED,
     },
 }
 """By command and mode, as its function names them: what else may be given."""

@@ -24,7 +24,7 @@ def train(
         typer.Option(
             "--scenes",
             help="a folder of scenes, a scene, or a built-in name; may repeat "
-            "(default: the built-in scenes)",
+            "(default: the built-in scenes; of --network random worlds alone)",
         ),
     ] = None,
     leave_out: Annotated[
@@ -45,7 +45,10 @@ def train(
         bool, typer.Option("--resume", help="go on where the same training stopped")
     ] = False,
     network: Annotated[
-        bool, typer.Option("--network", help="instead: the network of `unrolled`, on random worlds")
+        bool,
+        typer.Option(
+            "--network", help="instead: the network of `unrolled`, on random worlds, and --scenes"
+        ),
     ] = False,
     camera: Annotated[
         list[str] | None,
@@ -71,7 +74,10 @@ def train(
         _train_aperture(out, camera or ["learned-aperture"], seed)
         return
     if network:
-        _train_network(out, camera or list(NETWORK_CAMERAS), views, steps, minutes, seed, resume)
+        _train_network(
+            out, camera or list(NETWORK_CAMERAS), views, steps, minutes, seed, resume,
+            scenes or [], leave_out or [],
+        )  # fmt: skip
         return
     from emmc_rig.reconstruct.training import picture_path, train_settings
     from emmc_rig.reconstruct.training import train as run
@@ -104,6 +110,8 @@ def _train_network(
     minutes: float | None,
     seed: int,
     resume: bool,
+    scenes: list[str],
+    leave_out: list[str],
 ) -> None:
     from emmc_rig.files.results import parse_size
     from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
@@ -111,15 +119,16 @@ def _train_network(
 
     architecture = Architecture(views=parse_size(views, "--views", "5x5") or (5, 5))
     training = NetworkTraining(
-        out, tuple(cameras), architecture, steps, minutes, seed=seed, resume=resume
-    )
+        out, tuple(cameras), architecture, steps, tuple(scenes), tuple(leave_out), minutes,
+        seed=seed, resume=resume,
+    )  # fmt: skip
     with shown_progress() as bars:
         weights, learner = train_network(training, bars)
     count = sum(array.size for array in weights.arrays.values())
     last = learner.losses_db[-max(1, learner.steps // 20) :]
     tell(
         f"{count} weights after {learner.steps} of {steps} steps: {sum(last) / len(last):.2f} dB "
-        "on the last twentieth of the random worlds"
+        "on the last twentieth of what it saw"
     )
     tell(f"wrote {out}")
     give_result(out, weights=count, steps=learner.steps, psnr_db=sum(last) / len(last))

@@ -218,6 +218,7 @@ class LiveLightField:
             readings[place] = linear.dn_per_s / white
             deviation[place] = np.sqrt(linear.variance / white**2)
             usable[place] = linear.usable & seen & scale.good
+            readings[place] *= seen & scale.good
         return psi, Frames(readings, deviation, usable)
 
     def _draw(self, export: Export, block: int = 1) -> None:

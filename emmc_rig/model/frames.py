@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 class Frames:
     """What a reconstruction is given; all arrays (shot, pixel_y, pixel_x).
 
-    readings: 1 is what the fully open camera reads from a white light field. deviation: the
-    standard deviation of each reading. usable: neither saturated nor a bad pixel.
+    readings: 1 is what the fully open camera reads from a white light field; of a saturated pixel
+    the least that it can be, of any other that is not usable 0. deviation: the standard deviation
+    of each reading. usable: neither saturated nor a bad pixel.
     NumPy takes frames as their readings.
     """
 

@@ -1,10 +1,10 @@
-"""Train an unrolled network: random worlds through random masks, noise, steps, checkpoints."""
+"""Train an unrolled network: random worlds or scenes, random masks, noise, steps, checkpoints."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,7 @@ from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct.training import check_new_file, checkpoint_path
+from emmc_rig.reconstruct.training import Source, check_new_file, checkpoint_path, find_sources
 from reconstruction.methods.unrolled import with_torch
 from reconstruction.training_patches import cut_patches
 from reconstruction.unrolled.weights import Architecture, NetworkWeights
@@ -39,25 +39,43 @@ NOISE = 0.001, 0.02
 """Range from which the readings' deviation is drawn, log-uniformly; white is 1."""
 DARKEST = 0.3
 """Least factor, drawn log-uniformly up to 1, on a world's light."""
+FROM_SCENES = 0.75
+"""Share of the steps that see a scene, where scenes are given; the others see random worlds."""
 _CHECKPOINT_EVERY_S = 60.0
 
 
 @dataclass(frozen=True)
 class NetworkTraining:
-    """What to train, and where to write it. crop: rows and columns of what a step sees."""
+    """What to train, and where to write it.
+
+    scenes, leave_out: see `training.find_sources`; without any, random worlds alone. crop: rows and
+    columns of what a step sees.
+    """
 
     out: Path
     cameras: tuple[str, ...]
     architecture: Architecture
     steps: int
+    scenes: tuple[str, ...] = ()
+    leave_out: tuple[str, ...] = ()
     minutes: float | None = None
     crop: int = 48
     seed: int = 0
     resume: bool = False
 
+    def __post_init__(self) -> None:
+        if self.leave_out and not self.scenes:
+            raise AppError("--leave-out names scenes of --scenes, which is not given")
+
+    def sources(self) -> list[Source]:
+        """Return the scenes to train on; raises AppError as `find_sources` does."""
+        return find_sources(self.scenes, self.leave_out) if self.scenes else []
+
     def purpose(self) -> dict[str, object]:
         """Return what makes two trainings the same, but for their length."""
+        scenes = sorted({source.name for source in self.sources()})
         return {
+            **({"scenes": scenes} if scenes else {}),
             "cameras": list(self.cameras),
             "architecture": self.architecture.model_dump(mode="json"),
             "crop": self.crop,
@@ -87,17 +105,46 @@ def _detail(picture: NDArray[np.float32]) -> float:
     return square**0.5 / max(float(picture.mean()), 1e-3)
 
 
-def example(training: NetworkTraining, cameras: list[Camera], step: int):
-    """Return what the network sees in a step, and the true light field (view, colour, y, x)."""
+def opened_scenes(training: NetworkTraining, watcher: Watcher) -> list[NDArray[np.float32]]:
+    """Return the scenes' light fields (v, u, y, x, c); raises AppError for those too small."""
+    sources = training.sources()
+    watcher.begin("reading scenes", len(sources))
+    found = []
+    for source in sources:
+        light_field = source.open(training.architecture.views)
+        if min(light_field.shape[2:4]) < training.crop:
+            raise AppError(
+                f"{source.spec}: views of {light_field.shape[2]}x{light_field.shape[3]} pixels, "
+                f"training takes crops of {training.crop}x{training.crop}"
+            )
+        found.append(light_field)
+        watcher.step(source.name)
+    return found
+
+
+def example(
+    training: NetworkTraining,
+    cameras: list[Camera],
+    step: int,
+    scenes: Sequence[NDArray[np.float32]] = (),
+):
+    """Return what the network sees in a step, and the true light field (view, colour, y, x).
+
+    scenes: light fields (v, u, y, x, c) to take crops of, in FROM_SCENES of the steps.
+    """
     import torch  # pyright: ignore[reportMissingImports]
 
     from reconstruction.unrolled.network import captured
 
     rng = np.random.default_rng([training.seed, 1, step])
     number = step // STEPS_A_WORLD + int(rng.integers(WORLDS))
-    light_field = world(training.seed, number, training.architecture.views)
+    if scenes and rng.random() < FROM_SCENES:
+        light_field = scenes[rng.integers(len(scenes))]
+    else:
+        light_field = world(training.seed, number, training.architecture.views)
     # Of a few crops the one of most contrast: most of a world is even, which teaches little.
-    corners = rng.integers(np.array(WORLD_SIZE) - training.crop + 1, size=(CROPS, 2))
+    size = np.array(light_field.shape[2:4])
+    corners = rng.integers(size - training.crop + 1, size=(CROPS, 2))
     side = training.crop
     middle = light_field[light_field.shape[0] // 2, light_field.shape[1] // 2]
     corner = max(
@@ -143,16 +190,22 @@ def train_network(
                 f"--camera {name}: {camera.views[0]}x{camera.views[1]} views, the network has "
                 f"{views[0]}x{views[1]}"
             )
-    learner = with_torch("learning").Learner(training.architecture, training.seed)
+    learning = with_torch("learning")
+    scenes = opened_scenes(training, watcher)
+    learner = learning.Learner(training.architecture, training.seed)
     if training.resume:
         learner.load(kept, training.purpose())
+
+    def seen():
+        return example(training, cameras, learner.steps, scenes)
+
     started = saved = clock()
     watcher.begin("learning", training.steps)
     for _ in range(learner.steps):
         watcher.step("resumed")
     try:
         while learner.steps < training.steps:
-            watcher.step(f"{learner.step(*example(training, cameras, learner.steps)):.1f} dB")
+            watcher.step(f"{learner.step(*seen()):.1f} dB")
             if training.minutes is not None and clock() - started > 60 * training.minutes:
                 break
             if clock() - saved > _CHECKPOINT_EVERY_S:

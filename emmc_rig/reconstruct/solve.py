@@ -118,7 +118,12 @@ def _as_frames(
         given = Frames(readings, deviation, everywhere)
     if noise_sigma is not None:
         given = replace(given, deviation=np.full(given.shape, noise_sigma))
-    return given if usable is None else replace(given, usable=usable)
+    if usable is None:
+        return given
+    if usable.shape == given.shape:
+        # Why they are not to be used is not known: not that there was at least so much light.
+        given = replace(given, readings=np.where(usable, given.readings, 0))
+    return replace(given, usable=usable)
 
 
 def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -37,7 +37,7 @@ Array = NDArray[np.floating]
 class SessionReadings:
     """What was captured, normalised as Psi is, all (shot, y, x).
 
-    variance: of the readings; infinite where not usable.
+    readings: see `Frames`. variance: of the readings; infinite where not usable.
     """
 
     psi: ImagingMatrix
@@ -494,6 +494,8 @@ def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> Ses
         readings[place] = linear.dn_per_s / white
         variance[place] = linear.variance / white**2
         usable[place] = linear.usable & seen & scale.good
+        # What a pixel that is not to be used reads says nothing, not even how much at least.
+        readings[place] *= seen & scale.good
     return SessionReadings(psi, readings, variance, usable)
 
 

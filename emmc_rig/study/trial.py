@@ -217,8 +217,11 @@ def trial_of(
     # A Psi measured or fitted may have coefficients a rounding below 0; light has not.
     clean = np.maximum(clean, 0)
     shots = capture.described.read_out(clean, capture.seed)
-    usable = shots.usable if unusable is None else shots.usable & ~unusable
-    return Trial(psi, shots.readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
+    usable, readings = shots.usable, shots.readings
+    if unusable is not None:
+        # What a pixel reads that is known to be bad says nothing, not even how much at least.
+        usable, readings = usable & ~unusable, np.where(unusable, 0, readings)
+    return Trial(psi, readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
 
 
 SEVERAL = 3

@@ -20,6 +20,9 @@ from reconstruction.verdict.shadow import Relief, relief, shadow
 from reconstruction.verdict.shots import compared
 
 Array = NDArray[np.floating]
+CLIPPED = 0.5
+"""Of the largest reading of a shot, from which on one that is not usable is a saturated one: over a
+flat field the white level differs from pixel to pixel."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class Evidence:
     the pixels that screening left out. noise: the readings' deviation over their mean.
     motion_left: what the light field leaves unexplained where the picture moves most, over the mean
     reading.
-    colour_error: root mean square by colours that frames do not show, over the brightness.
+    colour_error: root mean square by colours that frames do not show, over the brightness. short:
+    share of the readings that only say that there was at least so much light, and are needed.
     """
 
     method: str
@@ -66,6 +70,7 @@ class Evidence:
     parameters: dict[str, float]
     colour_error: float | None = None
     motion_left: float | None = None
+    short: float = 0.0
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -88,7 +93,8 @@ class Read:
 
     excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
     that screening left out, for being dark or for repeating others. bad: share of the pixels that
-    it left out, for differing from their neighbours.
+    it left out, for differing from their neighbours. short: share of the readings that are
+    saturated and that a light field fitted without them falls short of.
     """
 
     frames: Array
@@ -97,6 +103,13 @@ class Read:
     excluded: Array
     left_out: tuple[int, ...] = ()
     bad: float = 0.0
+    short: float = 0.0
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """Which readings were not usable and are as large as any that are: saturated ones."""
+        most = np.where(self.usable, self.frames, 0).max(axis=(1, 2), keepdims=True)
+        return (self.excluded > 0) & (self.excluded >= CLIPPED * most)
 
 
 def gathered(
@@ -148,6 +161,7 @@ def gathered(
         beyond=None if fits is None else fits.beyond,
         colour_error=_colour_error(psi, frames, usable, found),
         parameters={key: result.parameters[key] for key in TOLD if key in result.parameters},
+        short=read.short,
     )
 
 

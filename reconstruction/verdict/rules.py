@@ -63,6 +63,8 @@ it is up to 2 %."""
 BAD = Limits(0.02, 0.1)
 """Share of pixels that screening calls bad: where it is large, screening overlooks others."""
 SATURATED = Limits(0.14, 0.35)
+SHORT = Limits(0.02, 0.35)
+"""Share of the readings."""
 UNUSABLE = Limits(0.35, 0.85)
 """Share of the readings. At 40 % one shot loses 1 to 4 dB (group A, 64x80; the fish 0.8)."""
 BLIND = Limits(0.05, 0.25)
@@ -379,6 +381,12 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
         SATURATED.level(e.saturated / shots**0.25),
     )
     yield Reason(
+        f"{e.short:.1%} of the readings are saturated where nothing else shows how bright it was",
+        e.short,
+        "expose less, or bracket",
+        SHORT.level(e.short),
+    )
+    yield Reason(
         f"{e.unusable:.0%} of the readings cannot be used",
         e.unusable,
         "take more shots, or expose less, or have the sensor seen to",
@@ -420,8 +428,8 @@ def _search(e: Evidence) -> Iterator[Reason]:
         )
         if e.noise > NOISY and UNDECIDED.doubt > 1 - decided > LEFT_OPEN:
             yield Reason(
-                f"noise is {e.noise:.0%} of the mean reading, and {1 - decided:.0%} of the textured "
-                "patches fit several disparities",
+                f"noise is {e.noise:.0%} of the mean reading, and {1 - decided:.0%} of the "
+                "textured patches fit several disparities",
                 e.noise,
                 "more light, longer exposure or more shots",
                 "doubt",

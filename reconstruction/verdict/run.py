@@ -1,4 +1,9 @@
-"""A reconstruction with its verdict: some readings are kept from the fit, and asked afterwards."""
+"""A reconstruction with its verdict: some readings are kept from the fit, and asked afterwards.
+
+A saturated reading says that there was at least so much light. The light field is fitted without
+them first; those that it falls short of join the readings, and it is fitted again (an active set,
+of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB).
+"""
 
 from __future__ import annotations
 
@@ -19,6 +24,8 @@ from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import Verdict, verdict_from
 
 Array = NDArray[np.floating]
+FEWEST_SHORT = 1e-3
+"""Share of the readings from which on a second fit is worth its time."""
 
 
 def reconstruct_judged(
@@ -33,21 +40,34 @@ def reconstruct_judged(
 ) -> tuple[Reconstruction, Verdict]:
     """Return what `reconstruct` finds, given the same, and whether to trust it.
 
-    The light field is that of all readings but the few kept, which costs it next to nothing.
+    frames: what a pixel reads that is not usable is the least that it can be, see `Read.clipped`; 0
+    says nothing. The light field is that of all readings but the few kept, which costs it next to
+    nothing.
     """
     settings = settings or MethodSettings()
     typical, _ = checked_noise(psi, noise_sigma, usable)
     read, notes = _as_fitted(psi, frames, typical, usable, settings.screening)
-    result = reconstruct(
-        name,
-        psi,
-        read.frames,
-        noise_sigma,
-        dictionary,
-        settings.model_copy(update={"screening": False}),
-        read.usable & ~read.kept,
-        on_step,
-    )
+    unscreened = settings.model_copy(update={"screening": False})
+
+    def solved(readings: Array, fitted: NDArray[np.bool_]) -> Reconstruction:
+        return reconstruct(
+            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step
+        )
+
+    fitted = read.usable & ~read.kept
+    result = solved(read.frames, fitted)
+    clipped = read.clipped
+    if clipped.mean() > FEWEST_SHORT:
+        short = clipped & (psi.forward(result.light_field) < read.excluded)
+        if short.mean() > FEWEST_SHORT:
+            took = result.seconds
+            result = solved(np.where(short, read.excluded, read.frames), fitted | short)
+            result = dataclasses.replace(result, seconds=result.seconds + took)
+            read = dataclasses.replace(read, short=float(short.mean()))
+            notes = (
+                *notes,
+                f"took {read.short:.1%} of the readings, saturated, for what they read",
+            )
     result = dataclasses.replace(result, screening=notes)
     return result, verdict_from(gathered(psi, read, typical, result))
 
@@ -67,4 +87,5 @@ def _as_fitted(
     seen = screened(psi, fitted, usable)
     left_out = tuple(sorted((*seen.dark, *seen.double)))
     kept, bad = kept_readings(seen.usable), float(seen.bad.mean())
+    excluded = (excluded / seen.gains[:, None, None]).astype(excluded.dtype)
     return Read(seen.frames, seen.usable, kept, excluded, left_out, bad), seen.notes
