@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import emmc_rig as emmc
 from emmc_rig.cli import app
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, trial_of
@@ -328,6 +330,94 @@ def test_what_misleads_one_method_may_leave_another_unharmed(three, found, by_tv
     for method, level in (("tv", by_tv), ("adaptive-fast", by_adaptive)):
         verdict = verdict_from(dataclasses.replace(clean, method=method, **found))
         assert verdict.level == level, verdict.words
+
+
+@pytest.mark.parametrize(
+    ("found", "over_plain", "level"),
+    [
+        ({"strengths": (0.93,)}, 0.8, "doubt"),
+        ({"strengths": (0.93,)}, 0.3, "trust"),
+        ({"strengths": (0.97,)}, 0.8, "trust"),
+        ({"displaced_px": 0.12}, 0.8, "doubt"),
+        ({"displaced_px": 0.12}, 0.3, "trust"),
+        ({"displaced_px": 0.06}, 0.8, "trust"),
+    ],
+)
+def test_a_slight_error_of_psi_counts_where_surfaces_hardly_explain_the_readings(
+    three, found, over_plain, level
+):
+    one_shot = {"strengths": (1.0,), "strength_errors": (0.002,), "brightness": (1.0,)}
+    by_surfaces = {"method": "adaptive", "parameters": {"over_plain": over_plain}}
+    evidence = dataclasses.replace(clean_evidence(three), **{**one_shot, **by_surfaces, **found})
+    verdict = verdict_from(evidence)
+    assert verdict.level == level, verdict.words
+    # Nothing of that is said of a method that has no such figure.
+    without = dataclasses.replace(evidence, method="tv", parameters={})
+    assert verdict_from(without).level == "trust"
+
+
+def test_noise_is_doubted_where_it_leaves_disparities_open(three):
+    clean = dataclasses.replace(clean_evidence(three), method="adaptive")
+    for noise, decided, level in ((0.1, 0.5, "doubt"), (0.1, 0.9, "trust"), (0.03, 0.5, "trust")):
+        one = dataclasses.replace(clean, noise=noise, parameters={"decided": decided})
+        assert verdict_from(one).level == level
+
+
+@pytest.mark.parametrize(("name", "share"), [("unusable", 0.5), ("short", 0.05)])
+def test_too_few_readings_and_light_that_nothing_shows_are_doubted(three, name, share):
+    clean = clean_evidence(three)
+    verdict = verdict_from(dataclasses.replace(clean, **{name: share}))
+    assert verdict.level == "doubt"
+    assert verdict.reasons[0].figure == share
+    assert verdict_from(dataclasses.replace(clean, **{name: share / 10})).level == "trust"
+
+
+@pytest.fixture(scope="module")
+def glare():
+    """Frames of a bright square whose readings are all saturated, at half of what they would be."""
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), SIZE)
+    truth = np.full(psi.light_field_shape, 0.1, np.float32)
+    truth[:, :, 18:30, 24:40] = 0.9
+    clean = psi.forward(truth)
+    white = 0.5 * float(clean.max())
+    usable = clean < white
+    assert 0.01 < 1 - usable.mean() < 0.1
+    return psi, truth, np.minimum(clean, white), usable
+
+
+@pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
+def test_saturated_readings_say_at_least_how_bright_it_was(glare, method):
+    psi, truth, readings, usable = glare
+
+    def judged(frames):
+        return reconstruct_judged(method, psi, frames, 1e-3, settings=QUICK, usable=usable)
+
+    def missed(result):
+        bright = np.s_[:, :, 20:28, 26:38]
+        return float(np.mean(truth[bright] - result.light_field[bright]))
+
+    known, verdict = judged(readings)
+    unknown, without = judged(np.where(usable, readings, 0))
+    assert missed(known) < 0.8 * missed(unknown)
+    assert verdict.evidence.short > 0.01 > without.evidence.short
+    assert "saturated" in known.screening[-1]
+    assert not any("saturated" in note for note in unknown.screening)
+    seen = psi.forward(known.light_field)
+    assert (seen[~usable] > 0.8 * readings[~usable]).all()
+
+
+def test_readings_that_somebody_leaves_out_are_no_bounds(glare):
+    psi, _, readings, usable = glare
+    other = emmc.reconstruct(
+        psi, np.where(usable, readings, 0), "tv", noise_sigma=1e-3, settings=QUICK, usable=usable
+    )
+    left_out = emmc.reconstruct(
+        psi, readings, "tv", noise_sigma=1e-3, settings=QUICK, usable=usable
+    )
+    np.testing.assert_array_equal(left_out.light_field, other.light_field)
+    own = Frames(readings, np.full(readings.shape, 1e-3), usable)
+    bounded = emmc.reconstruct(psi, own, "tv", settings=QUICK)
+    assert bounded.verdict.evidence.short > 0.01
 
 
 def test_bad_pixels_that_screening_finds_are_reported():

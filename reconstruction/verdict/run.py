@@ -56,20 +56,25 @@ def reconstruct_judged(
 
     fitted = read.usable & ~read.kept
     result = solved(read.frames, fitted)
-    clipped = read.clipped
-    if clipped.mean() > FEWEST_SHORT:
-        short = clipped & (psi.forward(result.light_field) < read.excluded)
-        if short.mean() > FEWEST_SHORT:
-            took = result.seconds
-            result = solved(np.where(short, read.excluded, read.frames), fitted | short)
-            result = dataclasses.replace(result, seconds=result.seconds + took)
-            read = dataclasses.replace(read, short=float(short.mean()))
-            notes = (
-                *notes,
-                f"took {read.short:.1%} of the readings, saturated, for what they read",
-            )
+    short = _short(psi, read, result)
+    if short is not None:
+        took = result.seconds
+        del result
+        result = solved(np.where(short, read.excluded, read.frames), fitted | short)
+        result = dataclasses.replace(result, seconds=result.seconds + took)
+        read = dataclasses.replace(read, short=float(short.mean()))
+        notes = (*notes, f"saturated: {read.short:.1%} of the readings, as bright as they read")
     result = dataclasses.replace(result, screening=notes)
     return result, verdict_from(gathered(psi, read, typical, result))
+
+
+def _short(psi: ImagingMatrix, read: Read, result: Reconstruction) -> NDArray[np.bool_] | None:
+    """Return which saturated readings a light field falls short of; None where hardly any."""
+    clipped = read.clipped
+    if clipped.mean() <= FEWEST_SHORT:
+        return None
+    short = clipped & (psi.forward(result.light_field) < read.excluded)
+    return short if short.mean() > FEWEST_SHORT else None
 
 
 def _as_fitted(
