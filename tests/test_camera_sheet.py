@@ -104,7 +104,7 @@ def test_repeated_shots_make_the_blocks_singular() -> None:
 
 def test_the_listing_counts_shots_and_measurements() -> None:
     rows = {row.name: row for row in camera_rows()}
-    assert len(rows) == 17
+    assert len(rows) == 18
     assert rows["conventional"].light_percent == pytest.approx(100)
     assert rows["conventional"].sensor == "rggb"
     assert rows["dual-mask-sinusoids"].masks == 2

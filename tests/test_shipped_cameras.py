@@ -30,6 +30,7 @@ NAMES = (
     "rgbw-bayer-2shots",
     "rgbw-bayer-3shots",
     "rgbw-mono",
+    "rgbw-mono-3shots",
     "scenario-i-rgb",
     "scenario-ii-cfa",
     "scenario-iii-mono",

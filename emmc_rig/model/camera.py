@@ -254,11 +254,12 @@ class Camera(Settings):
 def shipped_camera_files() -> dict[str, Path]:
     """Return the files of the cameras that come with the program, by name."""
     folder = resources.files("emmc_rig") / "cameras"
-    files = sorted(
-        (item for item in folder.iterdir() if item.name.endswith(".yaml")),
-        key=lambda item: item.name,
-    )
-    return {item.name.removesuffix(".yaml"): Path(str(item)) for item in files}
+    files = {
+        item.name.removesuffix(".yaml"): Path(str(item))
+        for item in folder.iterdir()
+        if item.name.endswith(".yaml")
+    }
+    return dict(sorted(files.items()))
 
 
 def shipped_cameras() -> dict[str, Camera]:
