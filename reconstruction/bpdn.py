@@ -24,7 +24,10 @@ from reconstruction.patches import padded
 Array32 = NDArray[np.float32]
 Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
 MINIMISERS = ("admm", "lars", "ista", "fista")
-SL0_RIDGE = 1e-5
+SL0_RIDGE = 0.03
+"""Of A A^T, relative to its largest block: what readings hold beyond noise and atoms is not forced
+into directions that they hardly see. On 48x64 middles of four scenes of group A, three shots, 1e-5
+loses 2.5 to 17.6 dB, and is 0.3 to 15 dB worse than one shot; 0.01 0.6 and 0.1 0.1 dB in the mean."""
 LARS_GAP = 0.05
 """A path that ends further from the minimiser went wrong by rounding: status not converged."""
 
