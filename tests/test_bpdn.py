@@ -157,6 +157,15 @@ def test_a_planted_sparse_code_is_found(method):
     np.testing.assert_allclose(found, planted, atol=0.02)
 
 
+def test_smoothed_l0_forces_nothing_into_what_the_readings_hardly_see():
+    atoms, data, planted = problem(300, 80, sparsity=5)
+    atoms[:, -1] *= 1e-3
+    data = planted @ atoms
+    data[-1] = 0.5 * np.linalg.norm(data)  # no atoms of any likely size make that
+    found = solve_bpdn(atoms, data, settings=BPDNSettings(method="sl0")).weights
+    assert np.linalg.norm(found - planted) < 0.3 * np.linalg.norm(planted)
+
+
 def test_matching_pursuit_rests_at_the_noise():
     atoms, data, _ = problem(300, 80, sparsity=5, noise=0.05)
     code = solve_bpdn(atoms, data, 0.05, BPDNSettings(method="omp", atoms=60))

@@ -1,12 +1,14 @@
 """The unrolled network: its data step, its file, its training, and how it is refused."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.errors import ModelError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.progress import Silent
 from reconstruction.errors import ReconstructionError
@@ -191,6 +193,75 @@ def test_the_same_seed_trains_the_same_weights_also_when_it_was_stopped(training
     for name, array in whole.arrays.items():
         np.testing.assert_array_equal(array, parts.arrays[name])
     assert any((array != other.arrays[name]).any() for name, array in whole.arrays.items())
+
+
+@pytest.fixture
+def two_scenes(tmp_path):
+    """Files of two light fields, one bright and one dark."""
+    import h5py
+
+    for name, level in (("bright", 0.8), ("dark", 0.1)):
+        truth = level * np.random.default_rng(0).random((5, 5, 24, 32, 3), dtype=np.float32)
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file["light_field"] = truth
+    return tuple(str(tmp_path / f"{name}.h5") for name in ("bright", "dark"))
+
+
+def test_a_network_learns_from_scenes_and_says_from_which(training, two_scenes):
+    worlds = training("worlds.h5", 3)
+    both = training("both.h5", 3, scenes=two_scenes)
+    one = training("one.h5", 3, scenes=two_scenes, leave_out=("bright",))
+    assert '"bright"' in both.provenance
+    assert '"bright"' not in one.provenance
+    assert '"scenes"' not in worlds.provenance
+    for first, second in ((worlds, both), (both, one)):
+        assert any((first.arrays[name] != second.arrays[name]).any() for name in first.arrays)
+
+
+def test_a_crop_of_a_scene_is_what_the_network_sees(torch, two_scenes):
+    from emmc_rig.reconstruct import network_training as module
+
+    training = module.NetworkTraining(
+        Path("n.h5"), ("conventional",), Architecture(), 1, scenes=two_scenes[1:], crop=20
+    )
+    scenes = module.opened_scenes(training, Silent())
+    seen = []
+    for step in range(12):
+        _, truth = module.example(training, [find_camera("conventional")], step, scenes)
+        seen.append(float(truth.max()))
+    # The dark scene holds at most 0.1, random worlds more.
+    assert 4 <= sum(one <= 0.1 for one in seen) < 12
+
+
+def test_a_colour_blind_camera_learns_grey(torch):
+    from emmc_rig.reconstruct import network_training as module
+
+    for name, grey in (("coded-aperture-random", True), ("rgbw-mono", False)):
+        training = module.NetworkTraining(Path("n.h5"), (name,), Architecture(), 1, crop=20)
+        _, truth = module.example(training, [find_camera(name)], 0)
+        assert bool((truth == truth[:, :1]).all()) is grey
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"leave_out": ("dark",)}, "which is not given"),
+        ({"scenes": ("nowhere.h5",)}, "nowhere.h5"),
+    ],
+)
+def test_scenes_that_cannot_be_learned_from_are_refused(training, changed, says):
+    with pytest.raises((AppError, ModelError), match=says):
+        training("a.h5", 1, **changed)
+
+
+def test_a_scene_smaller_than_a_crop_is_refused(torch, two_scenes, tmp_path):
+    from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
+
+    large = NetworkTraining(
+        tmp_path / "n.h5", ("rgbw-mono",), Architecture(), 1, scenes=two_scenes, crop=48
+    )
+    with pytest.raises(AppError, match="crops of 48x48"):
+        train_network(large, Silent())
 
 
 def test_what_would_spoil_a_training_is_refused_before_it_begins(training, tmp_path):
