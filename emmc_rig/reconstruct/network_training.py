@@ -139,7 +139,7 @@ def example(
     rng = np.random.default_rng([training.seed, 1, step])
     number = step // STEPS_A_WORLD + int(rng.integers(WORLDS))
     if scenes and rng.random() < FROM_SCENES:
-        light_field = scenes[rng.integers(len(scenes))]
+        light_field = scenes[int(rng.integers(len(scenes)))]
     else:
         light_field = world(training.seed, number, training.architecture.views)
     # Of a few crops the one of most contrast: most of a world is even, which teaches little.
