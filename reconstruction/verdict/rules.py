@@ -386,11 +386,12 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
         "expose less, or bracket",
         SHORT.level(e.short),
     )
+    listed = e.unusable - e.saturated
     yield Reason(
-        f"{e.unusable:.0%} of the readings cannot be used",
-        e.unusable,
-        "take more shots, or expose less, or have the sensor seen to",
-        UNUSABLE.level(e.unusable / shots**0.25),
+        f"{listed:.0%} of the readings are of pixels that cannot be used",
+        listed,
+        "take more shots, or have the sensor seen to",
+        UNUSABLE.level(listed / shots**0.25),
     )
     yield Reason(
         f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "

@@ -63,7 +63,10 @@ def reconstruct_judged(
         result = solved(np.where(short, read.excluded, read.frames), fitted | short)
         result = dataclasses.replace(result, seconds=result.seconds + took)
         read = dataclasses.replace(read, short=float(short.mean()))
-        notes = (*notes, f"saturated: {read.short:.1%} of the readings, as bright as they read")
+        notes = (
+            *notes,
+            f"{read.short:.1%} of the readings are saturated and count as what they read at least",
+        )
     result = dataclasses.replace(result, screening=notes)
     return result, verdict_from(gathered(psi, read, typical, result))
 
