@@ -73,7 +73,9 @@ def fuse(
     # The dark frame's own noise is common to all exposures.
     lever = np.sum([w / t for w, t in zip(weights, times_s, strict=True)], axis=0) / safe
     variance = 1 / safe + lever**2 * gain.dark_variance_dn2 / dark.count
-    clipped = ~(seen | unclipped[0]) if dead is None else ~(seen | unclipped[0] | dead)
+    clipped = ~(seen | unclipped[0])
+    if dead is not None:
+        clipped &= ~dead
     rate = np.where(clipped, np.maximum(signals[0], 0) / times_s[0], rate)
     return LinearFrame(
         rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen

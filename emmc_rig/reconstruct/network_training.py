@@ -190,35 +190,32 @@ def train_network(
                 f"--camera {name}: {camera.views[0]}x{camera.views[1]} views, the network has "
                 f"{views[0]}x{views[1]}"
             )
-    learning = with_torch("learning")
+    learning, purpose = with_torch("learning"), training.purpose()
     scenes = opened_scenes(training, watcher)
     learner = learning.Learner(training.architecture, training.seed)
     if training.resume:
-        learner.load(kept, training.purpose())
-
-    def seen():
-        return example(training, cameras, learner.steps, scenes)
-
+        learner.load(kept, purpose)
     started = saved = clock()
     watcher.begin("learning", training.steps)
     for _ in range(learner.steps):
         watcher.step("resumed")
     try:
         while learner.steps < training.steps:
-            watcher.step(f"{learner.step(*seen()):.1f} dB")
+            capture, truth = example(training, cameras, learner.steps, scenes)
+            watcher.step(f"{learner.step(capture, truth):.1f} dB")
             if training.minutes is not None and clock() - started > 60 * training.minutes:
                 break
             if clock() - saved > _CHECKPOINT_EVERY_S:
-                learner.save(kept, training.purpose())
+                learner.save(kept, purpose)
                 saved = clock()
     except KeyboardInterrupt:
-        learner.save(kept, training.purpose())
+        learner.save(kept, purpose)
         raise StoppedError(
             f"stopped by Ctrl-C after step {learner.steps} of {training.steps}, which {kept} "
             "keeps; the same command with --resume goes on"
         ) from None
     provenance = {
-        **training.purpose(),
+        **purpose,
         "steps": learner.steps,
         "mean_psnr_db": [
             float(np.mean(part)) for part in np.array_split(learner.losses_db, 20) if len(part)
@@ -231,7 +228,7 @@ def train_network(
     with new_file(out) as written:
         weights.save(written)
     if learner.steps < training.steps:
-        learner.save(kept, training.purpose())
+        learner.save(kept, purpose)
     else:
         kept.unlink(missing_ok=True)
     return weights, learner
