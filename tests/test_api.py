@@ -5,12 +5,14 @@ import subprocess
 import sys
 from importlib import import_module
 from types import FunctionType
+from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
 import yaml
 from matplotlib import pyplot
+from scipy import sparse
 
 import emmc_rig as emmc
 from emmc_rig.files import scenes
@@ -206,3 +208,132 @@ def test_the_examples_in_docstrings_give_what_they_show(module):
     tested = doctest.testmod(import_module(module), extraglobs={})
     assert tested.attempted > 0
     assert tested.failed == 0
+
+
+CAMERA = {"title": "no mask", "sensor": {"cfa": "mono"}}
+api: Any = emmc
+"""The package, for calls that its types forbid."""
+MISTAKES = {
+    "a camera of no name": (lambda t: api.camera(3), "camera: got 3; it takes a shipped camera's"),
+    "a camera without title": (lambda t: api.camera({}), "the camera: title: field required"),
+    "a misspelt key": (lambda t: api.camera({**CAMERA, "lense": {}}), "did you mean 'lens'"),
+    "shots as text": (lambda t: api.camera("rgbw-mono", shots="2"), "shots: got '2'"),
+    "a scene of nothing": (lambda t: api.scene(None), "scene: got None; it takes a name"),
+    "a scene of codes": (lambda t: api.scene(np.zeros((2, 2, 4, 4, 3), np.uint8)), "uint8"),
+    "a size of one side": (lambda t: api.scene("dark", size=24), "size: got 24; it takes rows"),
+    "half a pixel": (lambda t: api.scene("dark", size=(24.5, 32)), "size: got tuple"),
+    "a seed as text": (lambda t: api.scene("dark", size=(24, 32), seed="a"), "seed: got 'a'"),
+    "a picture as a folder": (lambda t: api.open_frames(__file__), "a file; open_frames takes"),
+    "frames of an array": (lambda t: api.open_frames(t[2].readings), "folder: got ndarray"),
+    "a Psi of SciPy": (lambda t: api.reconstruct(t[1].to_scipy(), t[2]), "Psi.from_scipy"),
+    "a Psi's file": (lambda t: api.reconstruct("psi.h5", t[2]), "psi: got 'psi.h5'; it takes"),
+    "Psi and frames swapped": (lambda t: api.reconstruct(t[2], t[1]), "psi: got SimulatedFrames"),
+    "no frames": (lambda t: api.reconstruct(t[1], None), "frames: got None; it takes frames"),
+    "ragged frames": (lambda t: api.reconstruct(t[1], [[1], [1, 2]]), "frames: got list"),
+    "complex frames": (lambda t: api.reconstruct(t[1], t[2].readings * 1j), "frames: got ndarray"),
+    "no method": (lambda t: api.reconstruct(t[1], t[2], None), "method: got None"),
+    "settings of a number": (lambda t: api.reconstruct(t[1], t[2], settings=3), "settings: got 3"),
+    "a misspelt setting": (
+        lambda t: api.reconstruct(t[1], t[2], settings={"tv": {"step": 1}}),
+        "unknown key 'tv.step'",
+    ),
+    "noise below 0": (
+        lambda t: api.reconstruct(t[1], t[2], noise_sigma=-1),
+        "noise_sigma: got -1",
+    ),
+    "noise as text": (lambda t: api.reconstruct(t[1], t[2], noise_sigma="a"), "noise_sigma: got"),
+    "usable as a list": (lambda t: api.reconstruct(t[1], t[2], usable=[True]), "usable: got list"),
+    "a dictionary of a number": (
+        lambda t: api.reconstruct(t[1], t[2], "dict-omp", dictionary=3),
+        "dictionary: got 3",
+    ),
+    "a step that is no function": (
+        lambda t: api.reconstruct(t[1], t[2], on_step=3),
+        "on_step: got 3",
+    ),
+    "a rig of no name": (lambda t: api.rig(None), "rig: got None; it takes"),
+    "a rig of no size": (lambda t: api.rig("simulated", size="x"), "size: input should be"),
+    "a plan of no name": (lambda t: api.capture(None), "plan: got None; it takes"),
+    "a rig of a number": (lambda t: api.capture("plan.yaml", 3), "rig: got 3; it takes"),
+    "a session of nothing": (lambda t: api.calibrate(None), "session: got None; it takes"),
+    "Session of nothing": (lambda t: api.Session(None), "session: got None; it takes"),
+    "weights of a list": (lambda t: api.Psi([[1]], None), "weights: got list; it takes"),
+    "weights of whole numbers": (
+        lambda t: api.Psi(np.ones((1, 1, 1, 4, 3, 6), dtype=int), None),
+        "int64; it takes",
+    ),
+    "a file of no name": (lambda t: api.Psi.load(None), "path: got None; it takes"),
+    "a dense matrix": (lambda t: api.Psi.from_scipy(np.eye(6), (1, 1), (2, 3)), "matrix: got nd"),
+    "a matrix of another size": (
+        lambda t: api.Psi.from_scipy(sparse.eye_array(6), (2, 2), (2, 3)),
+        "need 24 or 72 columns, and 6 rows a shot",
+    ),
+    "a matrix that blurs": (
+        lambda t: api.Psi.from_scipy(sparse.eye_array(6, k=1), (1, 1), (2, 3)),
+        r"5 entries lie off their pixel, the first in row 0, column 1: pixel \(0, 0\)",
+    ),
+    "a light field as text": (lambda t: t[1] @ "scene", "light field: got 'scene'"),
+    "frames as text": (lambda t: t[1].T @ "frames", "frames: got 'frames'"),
+    "Psi of one side": (lambda t: api.camera("rgbw-mono").psi(24), "size: got 24; it takes"),
+    "exposing a name": (lambda t: api.camera("rgbw-mono").expose("dark"), "scene: got 'dark'"),
+    "frames of lists": (lambda t: api.Frames([1], [1], [1]), "readings: got list"),
+    "frames of two shapes": (
+        lambda t: api.Frames(t[2].readings, t[2].deviation[:, 1:], t[2].usable),
+        "need one shape",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_a_public_name_does_not_take_is_refused_in_one_line(taken, mistake):
+    call, words = MISTAKES[mistake]
+    with pytest.raises(emmc.ERRORS, match=words) as refused:
+        call(taken)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_camera_is_also_a_dict_or_a_camera_and_a_scene_also_an_array(taken):
+    scene, _, _ = taken
+    camera = emmc.camera("rgbw-bayer-2shots")
+    assert emmc.camera(camera.model_dump(mode="json")) == emmc.camera(camera) == camera
+    given = emmc.scene(np.asarray(scene), size=(20, 24))
+    np.testing.assert_array_equal(given, np.asarray(emmc.scene(scene, size=(20, 24))))
+    np.testing.assert_array_equal(given, np.asarray(scene)[:, :, 8:28, 10:34])
+
+
+@pytest.mark.parametrize("name", ["rgbw-bayer-2shots", "rgbw-mono"])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_psi_becomes_a_matrix_of_scipy_and_comes_back(name, binning):
+    description = emmc.camera(name).model_dump(mode="json")
+    description["sensor"]["binning"] = binning
+    psi = emmc.camera(description).psi((12, 16))
+    back = emmc.Psi.from_scipy(psi.to_scipy(), (5, 5), (12, 16), binning=binning)
+    assert back.frames_shape == psi.frames_shape
+    np.testing.assert_array_equal(back.to_scipy().toarray(), psi.to_scipy().toarray())
+    assert back.weights.shape == psi.weights.shape
+
+
+def test_a_matrix_without_colours_gets_those_of_the_filters():
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(size=(2, 3, 4, 6))  # (v, u, y, x)
+    views = [np.diag(view.ravel()) for view in weights.reshape(6, 4, 6)]
+    matrix = sparse.csr_array(np.hstack(views))
+    light_field = rng.uniform(size=(2, 3, 4, 6, 3)).astype(np.float32)
+    psi = emmc.Psi.from_scipy(matrix, (2, 3), (4, 6), cfa="rggb")
+    tile = np.array([[0, 1], [1, 2]])  # red, green; green, blue
+    y, x = np.indices((4, 6))
+    seen = light_field[:, :, y, x, tile[y % 2, x % 2]]
+    np.testing.assert_allclose((psi @ light_field)[0], (weights * seen).sum(axis=(0, 1)), rtol=1e-5)
+    mono = emmc.Psi.from_scipy(matrix, (2, 3), (4, 6))
+    grey = light_field.mean(axis=-1)
+    np.testing.assert_allclose(
+        (mono @ light_field)[0], (weights * grey).sum(axis=(0, 1)), rtol=1e-5
+    )
+
+
+def test_a_verdict_is_one_sentence(taken):
+    _, psi, frames = taken
+    verdict = emmc.reconstruct(psi, frames, "tv").verdict
+    assert str(verdict) == verdict.words
+    assert str(verdict).startswith(f"{verdict.level}: ")
+    assert len(repr(verdict)) < 60

@@ -18,6 +18,7 @@ from emmc_rig.calibrate.stored import REPORT, arrays_in, outcome_figures, save_o
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
+from emmc_rig.model.arguments import path_of
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
@@ -177,7 +178,8 @@ def calibrate(
     aperture.
     Raises AppError or CalibrationError.
     """
-    session = session if isinstance(session, Session) else Session(Path(session))
+    if not isinstance(session, Session):
+        session = Session(path_of(session, "session", "a session, or its folder"))
     return _calibrated(session, route, sensor, stage, watcher or Silent(), in_memory)
 
 

@@ -38,6 +38,7 @@ from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.replaced import replace_text
 from emmc_rig.files.results import command_line, shown_bytes, versions
+from emmc_rig.model.arguments import NAMES, path_of, required
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.reading import parse_yaml
@@ -45,6 +46,7 @@ from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
 from emmc_rig.rig.hardware import Rig
 from emmc_rig.rig.rig_config import Ask, RigChoice, opened_rig
+from emmc_rig.rig.rig_config import rig as choose_rig
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -419,7 +421,7 @@ def ask_at_prompt(what: str) -> None:
 
 def capture(
     plan: str | Path,
-    rig: RigChoice | None = None,
+    rig: RigChoice | str | Path | None = None,
     *,
     out: str | Path | None = None,
     until_db: float | None = None,
@@ -432,7 +434,7 @@ def capture(
 
     Args:
         plan: a plan (YAML), or the folder of a session to go on with.
-        rig: what `emmc_rig.rig` returns; a session has its own.
+        rig: what `emmc_rig.rig` returns, or what it takes; a session has its own.
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         watcher: gets what is captured.
@@ -444,15 +446,20 @@ def capture(
     Raises:
         AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
         DriverError: what a device says.
+        ArgumentError: a plan or rig of another type.
     """
+    takes = "a plan's YAML file, or the folder of a session to go on with"
+    plan = path_of(plan, "plan", takes)
+    if isinstance(rig, NAMES):
+        rig = choose_rig(rig)
+    elif rig is not None:
+        required(rig, RigChoice, "rig", 'what emmc_rig.rig returns, or its name, as "simulated"')
     description = None if rig is None else rig.description
-    folder = None if out is None else Path(out)
+    folder = None if out is None else path_of(out, "out", "the folder of the new session")
     watching = watcher or CaptureWatcher()
     if on_event is not None:
         watching = EventWatcher(on_event, watching)
-    captured = capture_session(
-        Path(plan), description, folder, until_db, watching, ask, suspend=suspend
-    )
+    captured = capture_session(plan, description, folder, until_db, watching, ask, suspend=suspend)
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]
 

@@ -4,25 +4,47 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from emmc_rig.model.arguments import NAMES, required
 from emmc_rig.model.camera import Camera, load_camera, shipped_camera_files
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.settings import validated
 
 
-def find_camera(spec: str, shots: int | None = None) -> Camera:
-    """Return a shipped camera by its name, or the camera described by a YAML file.
+def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None = None) -> Camera:
+    """Return a shipped camera by its name, or the camera described by a YAML file or a dict.
 
-    shots: how many (default: the camera's own). Raises CameraError naming the nearest shipped
-    camera when there is none, and for more shots than the camera has a rule for.
+    Args:
+        spec: a shipped camera's name, the path of a YAML file, a dict with the keys of such a
+            file, or a camera.
+        shots: how many (default: the camera's own).
+
+    Raises:
+        CameraError: no such camera (the message names the nearest shipped one), a description that
+            is wrong, more shots than the camera has a rule for.
+        ArgumentError: anything else than a name, path, dict or camera.
 
     >>> import emmc_rig as emmc
     >>> emmc.camera("rgbw-bayer-1shot")
     Camera('RGBW mask, Bayer sensor, one shot', 1 shot, 5x5 views, rggb, 1 mask)
     >>> len(emmc.camera("rgbw-bayer-3shots", shots=2).shots)
     2
+    >>> emmc.camera({"title": "no mask", "sensor": {"cfa": "mono"}})
+    Camera('no mask', 1 shot, 5x5 views, mono, 0 masks)
     """
-    camera = load_camera(camera_file(spec))
+    if isinstance(spec, Camera):
+        camera = spec
+    elif isinstance(spec, Mapping):
+        camera = validated(Camera, dict(spec), "the camera", CameraError)
+    else:
+        takes = "a shipped camera's name, a YAML file's path, a dict as in such a file, or a camera"
+        required(spec, NAMES, "camera", takes)
+        camera = load_camera(camera_file(os.fspath(spec)))
+    if shots is not None:
+        required(shots, int, "shots", "a number of shots, such as 3")
     return camera if shots is None else camera.with_shots(shots)
 
 

@@ -32,6 +32,4 @@ def read_frames(folder: Path) -> Frames:
         arrays = [whole(values, path, AppError, AGAIN) for values in arrays]
     readings, deviation, usable = arrays
     usable = usable.astype(bool)
-    if readings.ndim != 3 or not readings.shape == deviation.shape == usable.shape:
-        raise AppError(f"{path}: readings, deviation and usable differ in shape")
     return Frames(readings, deviation, usable)

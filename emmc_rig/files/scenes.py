@@ -4,6 +4,7 @@ A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
 import difflib
+import os
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,9 +13,11 @@ from functools import reduce
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
+from emmc_rig.model.arguments import NAMES, numbers_of, pair_of, required
 from emmc_rig.model.errors import SceneError, ViewOrderWarning
 from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
 from emmc_rig.model.view_order import ViewOrder, order_of
@@ -73,7 +76,7 @@ class FineScene:
 
 
 def open_scene(
-    spec: str,
+    spec: str | Path | ArrayLike,
     size: tuple[int, int] | None = None,
     views: tuple[int, int] | None = None,
     seed: int = 0,
@@ -83,7 +86,7 @@ def open_scene(
     Args:
         spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
             `light_field`, a built-in name, or what another of `emmc_rig.files.formats` that can
-            be read holds.
+            be read holds; or the light field itself, an array (v, u, y, x, 3) in [0, 1].
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 by
             default), the middle that is cut from a measured one (all of it by default).
         views: rows and columns of views, likewise (5x5 by default).
@@ -92,11 +95,24 @@ def open_scene(
     Raises:
         SceneError: nothing by that name (the message lists the built-in ones), unreadable,
             or smaller than asked for.
+        ArgumentError: a spec that is none of these, a size or seed that is no number.
 
     >>> import emmc_rig as emmc
     >>> emmc.scene("near-planar", size=(24, 32))
     Scene('near-planar', 5x5 views of 24x32)
     """
+    if size is not None:
+        size = pair_of(size, "size", "rows and columns, such as (192, 256)")
+    if views is not None:
+        views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")
+    required(seed, int, "seed", "a whole number")
+    if not isinstance(spec, NAMES):
+        values = numbers_of(
+            spec, "scene", "a name, a folder or file, or an array (v, u, y, x, 3) in [0, 1]"
+        )
+        light_field, cut = _middle(check_light_field(values, "scene"), size, views, "scene")
+        return Scene("array", light_field, None, f"an array{cut}")
+    spec = os.fspath(spec)
     if spec in SCENES:
         shape = _asked_shape(size, views)
         rendered = render(spec, *shape, seed)

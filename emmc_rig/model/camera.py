@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy import sparse
 
+from emmc_rig.model.arguments import numbers_of, pair_of, required
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
@@ -194,8 +195,9 @@ class Camera(Settings):
     def psi(self, size: tuple[int, int]) -> ImagingMatrix:
         """Return the imaging matrix for light fields of `size` (rows, columns) samples.
 
-        Raises CameraError, see `build_imaging_matrix`.
+        Raises CameraError, see `build_imaging_matrix`, and ArgumentError for what is no size.
         """
+        size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
         return build_imaging_matrix(self, size)
 
     def expose(
@@ -208,8 +210,17 @@ class Camera(Settings):
 
         psi: the camera's, where it is at hand; built otherwise. What the same Psi reconstructs
         looks better than a measurement would: a rig, simulated or real, has its own geometry.
+        Raises ArgumentError for another type of scene, seed or Psi.
         """
-        light_field = np.asarray(scene)
+        takes = "a scene, or a light field, a floating array (v, u, y, x, 3) in [0, 1]"
+        light_field = numbers_of(scene, "scene", takes)
+        if light_field.ndim != 5 or light_field.dtype.kind != "f":
+            required(scene, (), "scene", takes)
+        required(
+            seed, (int, np.random.Generator), "seed", "a whole number, or a generator of NumPy"
+        )
+        if psi is not None:
+            required(psi, ImagingMatrix, "psi", "the camera's imaging matrix, camera.psi(size)")
         psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
         return self.read_out(psi.forward(light_field), seed)
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.arguments import required
+from emmc_rig.model.errors import SensingError
+
 
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -21,6 +24,17 @@ class Frames:
     readings: NDArray[np.floating]
     deviation: NDArray[np.floating]
     usable: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        arrays = {"readings": self.readings, "deviation": self.deviation, "usable": self.usable}
+        for name, array in arrays.items():
+            required(array, np.ndarray, name, "an array (shot, pixel_y, pixel_x)")
+        shapes = {array.shape for array in arrays.values()}
+        if len(shapes) > 1 or self.readings.ndim != 3 or self.usable.dtype != bool:
+            raise SensingError(
+                "frames: readings, deviation and usable (boolean) need one shape (shot, pixel_y, "
+                f"pixel_x); got {', '.join(f'{n} {a.shape} {a.dtype}' for n, a in arrays.items())}"
+            )
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -20,11 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from emmc_rig.model import kernels
+from emmc_rig.model.arguments import numbers_of, pair_of, path_of, required
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.reading import stored_arrays
 
 Array = NDArray[np.floating]
+WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
 FORMAT = "emmc-rig imaging matrix 1"
 
@@ -107,6 +110,8 @@ class ImagingMatrix:
     camera_json: str = ""
 
     def __post_init__(self) -> None:
+        if getattr(self.weights, "dtype", np.dtype(object)).kind != "f":
+            required(self.weights, (), "weights", WEIGHTS_TAKE)
         if self.weights.ndim != 6 or self.weights.shape[4] != (1 if self.colour is not None else 3):
             raise SensingError(f"weights of shape {self.weights.shape} do not make a Psi")
         if self.colour is not None and self.colour.shape != (self.shots, *self.size):
@@ -224,7 +229,7 @@ class ImagingMatrix:
         return light_field
 
     def __matmul__(self, light_field: ArrayLike) -> Array:
-        return self.forward(np.asarray(light_field))
+        return self.forward(numbers_of(light_field, "light field", "an array (v, u, y, x, 3)"))
 
     @property
     def T(self) -> TransposedPsi:  # noqa: N802
@@ -303,6 +308,83 @@ class ImagingMatrix:
         )
         return sparse.csr_array(entries, shape=self.shape)
 
+    @classmethod
+    def from_scipy(
+        cls,
+        matrix: sparse.sparray | sparse.spmatrix,
+        views: tuple[int, int],
+        size: tuple[int, int],
+        cfa: str | tuple[str, ...] = "mono",
+        binning: int = 1,
+    ) -> ImagingMatrix:
+        """Return Psi from an explicit sparse matrix, such as another program's.
+
+        Args:
+            matrix: rows are readings (shot, pixel_y, pixel_x), row-major. Columns are samples of
+                the light field, (v, u, y, x, c) as `to_scipy` has them, or (v, u, y, x): light of
+                the colour that the pixel sees, of a monochrome sensor's white light.
+            views: rows and columns of views.
+            size: rows and columns of samples of a view.
+            cfa: the colour filters, where the columns have no colour.
+            binning: k; a pixel sums k x k samples.
+
+        Raises:
+            SensingError: a shape that does not fit, entries that are no finite numbers, a reading
+                of samples that do not lie at its own pixel.
+            ArgumentError: an argument of another type.
+
+        >>> psi = ImagingMatrix.from_scipy(sparse.eye_array(6), views=(1, 1), size=(2, 3))
+        >>> psi, psi.to_scipy().nnz
+        (Psi(1 shot, 1x1 views, 2x3, three colours a pixel, 7.2e-05 MB), 18)
+        """
+        if not sparse.issparse(matrix):
+            required(matrix, (), "matrix", "a sparse matrix of SciPy")
+        views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")
+        size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
+        if not isinstance(binning, int) or binning < 1:
+            required(binning, (), "binning", "the number of samples along a pixel's side")
+        entries = sparse.coo_array(sparse.csr_array(matrix, dtype=np.float32))
+        pixels = size[0] // binning, size[1] // binning
+        readings, samples = int(np.prod(pixels)), int(np.prod((*views, *size)))
+        (rows, columns), row, column = entries.shape, entries.row, entries.col
+        shots, per_sample = rows // max(readings, 1), columns // samples
+        if rows != shots * readings or not shots or columns not in (samples, 3 * samples):
+            raise SensingError(
+                f"a matrix of {rows} x {columns} is no Psi: {views} views of {size} samples need "
+                f"{samples} or {3 * samples} columns, and {readings} rows a shot"
+            )
+        v, u, y, x, c = np.unravel_index(column, (*views, *size, per_sample))
+        shot, pixel_y, pixel_x = np.unravel_index(row, (shots, *pixels))
+        astray = np.flatnonzero((y // binning != pixel_y) | (x // binning != pixel_x))
+        if astray.size:
+            n = astray[0]
+            raise SensingError(
+                f"{astray.size} entries lie off their pixel, the first in row {row[n]}, column "
+                f"{column[n]}: pixel ({pixel_y[n]}, {pixel_x[n]}) would see the sample ({y[n]}, "
+                f"{x[n]}); Psi here is of cameras whose pixels see the views at their own place"
+            )
+        weights = np.zeros((shots, *views, size[0], 3, size[1]), dtype=np.float32)
+        if per_sample == 3:
+            weights[shot, v, u, y, c, x] = entries.data
+            return cls(weights, None, binning)._compact()
+        tile = cfa_tile(cfa)
+        of_pixel = tile[pixel_y % tile.shape[0], pixel_x % tile.shape[1]]
+        shares = of_pixel / of_pixel.sum(axis=-1, keepdims=True)
+        for colour in range(3):
+            weights[shot, v, u, y, colour, x] = entries.data * shares[:, colour]
+        return cls(weights, None, binning)._compact()
+
+    def _compact(self) -> ImagingMatrix:
+        """Return Psi with one stored colour where every sample's pixel sees one at most."""
+        seen = self.weights.any(axis=(1, 2))  # (shot, y, colour, x)
+        if seen.sum(axis=2).max() > 1:
+            return self
+        colour = seen.argmax(axis=2).astype(np.uint8)
+        chosen = colour[:, None, None, :, None, :].astype(np.intp)
+        return ImagingMatrix(
+            np.take_along_axis(self.weights, chosen, axis=4), colour, self.binning, self.camera_json
+        )
+
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
         if self.weights.shape != reference.weights.shape:
@@ -321,8 +403,9 @@ class ImagingMatrix:
             digest.update(np.ascontiguousarray(array).view(np.uint8).data)
         return digest.hexdigest()
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
+        path = path_of(path, "path", "the name of the file to write")
         try:
             with whole_file(path) as partial, h5py.File(partial, "w") as file:
                 file["weights"] = self.weights
@@ -338,8 +421,9 @@ class ImagingMatrix:
             file["colour"] = self.colour
 
     @classmethod
-    def load(cls, path: Path) -> ImagingMatrix:
+    def load(cls, path: str | Path) -> ImagingMatrix:
         """Read a saved Psi; raises SensingError when it is not one, or damaged."""
+        path = path_of(path, "path", "the file of an imaging matrix")
         with stored_arrays(path, SensingError, "measure Psi again") as stored:
             if stored.attributes.get("format") != FORMAT:
                 raise SensingError(f"{path}: not an imaging matrix of this program")
@@ -368,7 +452,7 @@ class TransposedPsi:
         return columns, rows
 
     def __matmul__(self, frames: ArrayLike) -> Array:
-        return self.T.adjoint(np.asarray(frames))
+        return self.T.adjoint(numbers_of(frames, "frames", "an array (shot, pixel_y, pixel_x)"))
 
     def __repr__(self) -> str:
         return f"{self.T!r}.T"

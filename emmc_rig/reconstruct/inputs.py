@@ -10,6 +10,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.frames import PSI, read_frames
 from emmc_rig.files.psi import open_psi, psi_beside
+from emmc_rig.model.arguments import path_of
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix
@@ -32,9 +33,18 @@ def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[Imag
     """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
 
     psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, what
-    its whiteboards measure). Raises AppError, SensingError or CalibrationError.
+    its whiteboards measure). Raises AppError, SensingError, CalibrationError, or ArgumentError for
+    what is no path.
     """
-    folder = Path(folder)
+    takes = "the folder of a session, or one that `emmc-rig simulate` or `demo` wrote"
+    folder = path_of(folder, "folder", takes)
+    if psi is not None:
+        psi = path_of(psi, "psi", "the file of an imaging matrix, psi.h5")
+    if folder.is_file():
+        raise AppError(
+            f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "
+            "`reconstruct` as an array (shot, pixel_y, pixel_x)"
+        )
     if is_session(folder):
         measured, frames = session_frames(folder)
         return measured if psi is None else open_psi(Path(psi)).load(), frames

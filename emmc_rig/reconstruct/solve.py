@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
+from emmc_rig.model.arguments import NAMES, numbers_of, required
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.settings import validated
 from emmc_rig.reconstruct.block_tasks import Capture, fingerprint_of, run_capture
 from emmc_rig.reconstruct.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.reconstruct.inputs import stored_frames
@@ -37,6 +40,8 @@ from reconstruction.tiles import check_frames, reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
+PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_scipy(matrix, ...)"
+FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""
 
@@ -49,7 +54,7 @@ def reconstruct(
     noise_sigma: float | None = None,
     usable: NDArray[np.bool_] | None = None,
     dictionary: Dictionary | str | None = None,
-    settings: MethodSettings | None = None,
+    settings: MethodSettings | Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
 ) -> Result:
     """Return the light field that frames and Psi speak for, with how far to trust it.
@@ -63,12 +68,13 @@ def reconstruct(
             of an array, what the sensor of Psi's camera has at these readings.
         usable: which readings to use (default: those of the frames, all of an array).
         dictionary: for methods that need one: itself, its file, or the name of a built-in one.
-        settings: of the methods.
+        settings: of the methods, or a dict with the keys of a settings file.
         on_step: is called with the progress after each step.
 
     Raises:
         AppError: an array without `noise_sigma`, where Psi does not know its camera.
         ReconstructionError: a method that is not known, frames that do not fit Psi.
+        ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
     >>> scene = emmc.scene("near-planar", size=(24, 32))
@@ -76,11 +82,21 @@ def reconstruct(
     >>> emmc.reconstruct(psi, psi @ scene, "tv").light_field.shape
     (5, 5, 24, 32, 3)
     """
+    required(psi, ImagingMatrix, "psi", PSI_TAKES)
+    required(method, str, "method", "the name of a method, such as 'adaptive'")
     needs_dictionary = find_method(method).needs_dictionary
+    if isinstance(settings, Mapping):
+        settings = validated(MethodSettings, dict(settings), "settings", AppError)
+    elif settings is not None:
+        required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
+    if on_step is not None and not callable(on_step):
+        required(on_step, (), "on_step", "a function of the progress")
     given = _as_frames(psi, frames, noise_sigma, usable)
     atoms = None
     if needs_dictionary:
         made = isinstance(dictionary, Dictionary)
+        if not made and dictionary is not None:
+            required(dictionary, NAMES, "dictionary", "a dictionary, its file, or a built-in name")
         views = psi.layout.views
         atoms = dictionary if made else open_dictionary(dictionary, views, psi.binning)
     settings = settings or MethodSettings()
@@ -105,10 +121,14 @@ def _as_frames(
     usable: NDArray[np.bool_] | None,
 ) -> Frames:
     """Return frames as a method takes them: with a deviation, and which are usable."""
+    if noise_sigma is not None:
+        is_level = isinstance(noise_sigma, Real) and 0 <= noise_sigma < np.inf
+        if not is_level:
+            required(noise_sigma, (), "noise_sigma", "the readings' standard deviation, 0 or more")
     if isinstance(frames, Frames):
         given = frames
     else:
-        readings = np.asarray(frames)
+        readings = numbers_of(frames, "frames", FRAMES_TAKES)
         everywhere = np.ones(readings.shape, dtype=bool)
         if noise_sigma is None:
             deviation = sensor_deviation(psi, readings)
@@ -120,6 +140,8 @@ def _as_frames(
         given = replace(given, deviation=np.full(given.shape, noise_sigma))
     if usable is None:
         return given
+    if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
+        required(usable, (), "usable", "a boolean array (shot, pixel_y, pixel_x)")
     if usable.shape == given.shape:
         # Why they are not to be used is not known: not that there was at least so much light.
         given = replace(given, readings=np.where(usable, given.readings, 0))

@@ -13,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from drivers.clock import SYSTEM_CLOCK
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.model.arguments import path_of
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
@@ -209,7 +210,7 @@ class RigChoice:
 
 
 def rig(
-    name: str,
+    name: str | Path,
     *,
     scene: str = "deep-occlusions",
     size: tuple[int, int] | None = None,
@@ -229,10 +230,10 @@ def rig(
     >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
     'simulated'
     """
+    name = str(path_of(name, "rig", '"simulated", or the YAML file that names real devices'))
     traced: dict[str, Any] = {} if rays is None else {"rays": rays}
-    imaged = ImagedRig(
-        scene=scene, size=size, seed=seed, real_time=real_time, flaws=flaws, **traced
-    )
+    given = {"scene": scene, "size": size, "seed": seed, "real_time": real_time, "flaws": flaws}
+    imaged = validated(ImagedRig, {**given, **traced}, "the simulated rig", AppError)
     return RigChoice(name, rig_description(name, imaged))
 
 

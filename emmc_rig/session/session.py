@@ -44,6 +44,7 @@ from typing import Any
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import FILES, PARTIAL, SESSION_HEADER, SESSION_JOURNAL
 from emmc_rig.files.results import METRICS
+from emmc_rig.model.arguments import path_of
 from emmc_rig.model.reading import parse_json
 from emmc_rig.session.decisions import metered, spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
@@ -84,8 +85,9 @@ class Frozen:
 class Session:
     """An open session. One program at a time may add to it: see `lock.held`."""
 
-    def __init__(self, folder: Path, disk: Disk = SYSTEM_DISK) -> None:
+    def __init__(self, folder: str | Path, disk: Disk = SYSTEM_DISK) -> None:
         """Open a folder; raises AppError with one line when it is no session, or damaged."""
+        folder = path_of(folder, "session", "the folder of a session")
         self.folder = Path(os.path.abspath(folder))
         self.disk = disk
         try:

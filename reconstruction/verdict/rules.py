@@ -135,6 +135,12 @@ class Verdict:
             return "trust: readings, masks and noise agree with the light field"
         return f"{self.level}: " + "; ".join(f"{one.what}: {one.remedy}" for one in self.reasons)
 
+    def __str__(self) -> str:
+        return self.words
+
+    def __repr__(self) -> str:
+        return f"Verdict({self.level!r}, {len(self.reasons)} reasons, {self.evidence.method})"
+
     def as_dict(self) -> dict:
         """Return the verdict as plain data."""
         return {

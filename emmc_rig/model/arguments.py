@@ -1,0 +1,66 @@
+"""Arguments of public functions: of a type that they take, or refused in one line."""
+
+from __future__ import annotations
+
+import os
+from numbers import Integral, Real
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.errors import ModelError
+
+Kinds = type | tuple[type, ...]
+NAMES = (str, os.PathLike)
+
+
+class ArgumentError(ModelError, TypeError):
+    """An argument that a public function does not take."""
+
+
+def required(value: object, kinds: Kinds, name: str, takes: str) -> None:
+    """Raise ArgumentError, which says what the argument `name` takes, for another kind of value."""
+    if not isinstance(value, kinds):
+        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+
+
+def path_of(value: object, name: str, takes: str) -> Path:
+    """Return a path given as text or Path; raises ArgumentError for anything else."""
+    required(value, NAMES, name, takes)
+    return Path(value)  # pyright: ignore[reportArgumentType]
+
+
+def pair_of(value: object, name: str, takes: str) -> tuple[int, int]:
+    """Return two whole numbers of at least 1, such as rows and columns; raises ArgumentError."""
+    try:
+        first, second = value  # pyright: ignore[reportGeneralTypeIssues]
+        numbers = isinstance(first, Integral) and isinstance(second, Integral)
+    except (TypeError, ValueError):
+        numbers = False
+    if not numbers or min(first, second) < 1:
+        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+    return int(first), int(second)
+
+
+def numbers_of(value: object, name: str, takes: str) -> NDArray:
+    """Return an array of real numbers; raises ArgumentError for anything else."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # lists whose rows differ in length
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiub" or array.ndim == 0:
+        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+    return array
+
+
+def _described(value: object) -> str:
+    """Return what a value is, short enough for a line."""
+    if value is None or isinstance(value, (str, Real, os.PathLike)):
+        text = repr(value)
+        return text if len(text) <= 60 else f"{text[:57]}..."
+    shape = getattr(value, "shape", None)
+    kind = type(value).__name__
+    if isinstance(shape, tuple) and hasattr(value, "dtype"):
+        return f"{kind} of shape {shape}, {value.dtype}"  # pyright: ignore[reportAttributeAccessIssue]
+    return f"{kind} {value}" if isinstance(value, tuple) and len(value) <= 3 else kind
