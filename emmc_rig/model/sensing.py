@@ -346,7 +346,8 @@ class ImagingMatrix:
         entries = sparse.coo_array(sparse.csr_array(matrix, dtype=np.float32))
         pixels = size[0] // binning, size[1] // binning
         readings, samples = int(np.prod(pixels)), int(np.prod((*views, *size)))
-        (rows, columns), row, column = entries.shape, entries.row, entries.col
+        rows, columns = entries.shape  # pyright: ignore[reportGeneralTypeIssues]
+        row, column = entries.row, entries.col
         shots, per_sample = rows // max(readings, 1), columns // samples
         if rows != shots * readings or not shots or columns not in (samples, 3 * samples):
             raise SensingError(
