@@ -12,7 +12,8 @@ import numpy as np
 import tifffile
 
 from drivers.camera import CameraIdentity
-from drivers.plain_dng import SMALLEST_SIDE_PX
+from drivers.errors import RawFrameError
+from drivers.plain_dng import PRIVATE_DATA_OWNER, PRIVATE_DATA_TAG, SMALLEST_SIDE_PX
 from drivers.raw import CFA_TILE_PREFIX, RawFrame, decode_raw
 
 Array = np.ndarray
@@ -26,7 +27,7 @@ BAYER_PATTERNS = {
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
-BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
+BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 PHOTOMETRIC_TAG, PHOTOMETRIC_CFA, PHOTOMETRIC_LINEAR_RAW = 262, 32803, 34892
 D65 = 21
 IDENTITY_MATRIX = tuple(
@@ -42,12 +43,14 @@ def encode_dng(
     white_level_dn: int,
     exposure_s: float | None,
     identity: CameraIdentity = SIMULATED,
+    private: bytes | None = None,
 ) -> bytes:
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
     `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
     LibRaw's sake and carries its name beside it. `black_level_dn` is a whole number, or `(2, 2)`
     of them in mosaic order; a monochrome DNG has but one. `exposure_s`: None where it is not known.
+    `private`: other bytes to be kept in it, which `private_data` returns.
     Raises `ValueError`.
     """
     black = np.broadcast_to(np.asarray(black_level_dn), (2, 2))
@@ -64,6 +67,9 @@ def encode_dng(
     if exposure_s is not None:
         exposure = Fraction(exposure_s).limit_denominator(1_000_000)
         tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
+    if private is not None:
+        kept = PRIVATE_DATA_OWNER + private
+        tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
     if cfa == MONO:
         tags.append((50714, LONG, 1, int(black[0, 0]), True))
     else:
@@ -98,6 +104,18 @@ def encode_dng(
         with tifffile.TiffFile(file) as tiff:
             tiff.pages.first.tags[PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
     return file.getvalue()
+
+
+def private_data(dng: bytes) -> bytes:
+    """Return what `encode_dng` kept as `private`; raises `RawFrameError` where there is nothing."""
+    try:
+        with tifffile.TiffFile(io.BytesIO(dng)) as tiff:
+            kept = tiff.pages.first.tags.valueof(PRIVATE_DATA_TAG)
+    except (tifffile.TiffFileError, ValueError, TypeError) as error:
+        raise RawFrameError(f"its table of contents is damaged ({error})") from error
+    if not (isinstance(kept, bytes) and kept.startswith(PRIVATE_DATA_OWNER)):
+        raise RawFrameError("it does not hold the camera's own bytes")
+    return kept[len(PRIVATE_DATA_OWNER) :]
 
 
 def frame_of_array(

@@ -23,6 +23,9 @@ WHOLE = (tifffile.DATATYPE.SHORT, tifffile.DATATYPE.LONG)
 SMALLEST_SIDE_PX = 22
 """LibRaw takes anything smaller for a thumbnail."""
 
+PRIVATE_DATA_TAG, PRIVATE_DATA_OWNER = 50740, b"emmc-rig: camera's bytes\0"
+"""DNGPrivateData, which begins with the name of the program that can read it: this one."""
+
 FIXED = {
     254: (None, 0),
     259: (1,),
@@ -46,10 +49,10 @@ HARMLESS = frozenset(
         *(33422, 33434, 33437, 34665, 34855, 42033),
         *(50706, 50707, 50708, 50713, 50714, 50717),
         *range(50721, 50733),
-        *(50735, 50778, 50779, 50827, 51041),
+        *(50735, 50778, 50779, 50827, 51041, PRIVATE_DATA_TAG),
     )
 )
-"""Size, place, texts, colour and noise; black and white levels are read below."""
+"""Size, place, texts, colour, noise and private data; black and white levels are read below."""
 
 
 def read_in_place(data: bytes, tiff: tifffile.TiffFile) -> tuple[Array, Array, int, str] | None:
@@ -70,6 +73,9 @@ def read_in_place(data: bytes, tiff: tifffile.TiffFile) -> tuple[Array, Array, i
     if any(tag.code not in FIXED and tag.code not in HARMLESS for tag in tags):
         return None
     if any(tags.valueof(code) not in allowed for code, allowed in FIXED.items()):
+        return None
+    private = tags.valueof(PRIVATE_DATA_TAG, PRIVATE_DATA_OWNER)
+    if not (isinstance(private, bytes) and private.startswith(PRIVATE_DATA_OWNER)):
         return None
     rows, columns = page.imagelength, page.imagewidth
     phase = PHASES.get(tuple(tags.valueof(33422, ())))

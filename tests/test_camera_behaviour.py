@@ -3,7 +3,9 @@
 `pytest -m hardware --camera ptp:` runs it against a real one, as `emmc-rig devices conform` does.
 """
 
+import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -56,6 +58,20 @@ def u3v_camera(folder):
     return open_u3v(backend=bus, clock=clock)
 
 
+class DumpCamera(RawFileCamera):
+    """As a plug-in may be: its own bytes are bare samples, which nothing else can decode."""
+
+    def snap(self):
+        frame = super().snap()
+        data = frame.mosaic.tobytes()
+        return replace(frame, original=data, sha256=hashlib.sha256(data).hexdigest())
+
+
+def dump_camera(folder):
+    clock = ManualClock()
+    return DumpCamera(SimulatedRawCamera(see, clock, CFA), SHAPE, CFA, clock=clock)
+
+
 CAMERAS = {
     "raw file": raw_file_camera,
     "ptp": ptp_camera,
@@ -63,6 +79,7 @@ CAMERAS = {
     "old eos": partial(ptp_camera, simulator=partial(EosCameraSimulator, old=True)),
     "folder": folder_camera,
     "u3v": u3v_camera,
+    "dump": dump_camera,
 }
 """A new camera joins by a line here; it must see `MOSAIC` with black at 64 and white at 4095."""
 

@@ -360,10 +360,13 @@ def test_a_disk_without_room_is_reported_before_anything_is_made(run, tmp_path, 
     from emmc_rig.session.storage import SystemDisk
 
     plan_file(tmp_path)
-    monkeypatch.setattr(SystemDisk, "free_bytes", lambda self, folder: 1000)
+    monkeypatch.setattr(SystemDisk, "free_bytes", lambda self, folder: 4_190_000)
     code, _, err = run("capture", "plan.yaml", *RIG)
     assert code == 1
-    assert "62 frames need about" in one_line(err)
+    needed = "62 frames need about 442 kB, "
+    lacking = "and 100 MB stay reserved: 96.3 MB more than the 4.19 MB that are free; make room"
+    assert needed in one_line(err)
+    assert lacking in err
     assert not (tmp_path / "plan-session").exists()
 
 

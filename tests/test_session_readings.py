@@ -9,6 +9,7 @@ import pytest
 import yaml
 from capture_rigs import begun
 
+from drivers.errors import DriverError
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.errors import AppError
@@ -16,7 +17,7 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.rig.hardware import open_camera, simulated_rig
 from emmc_rig.rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
-from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
+from emmc_rig.session.frame_file import decode_frame, frame_file
 from emmc_rig.session.readings import session_readings, whiteboards
 from simulators.clock import ManualClock
 from simulators.disk import SimulatedDisk
@@ -134,10 +135,17 @@ def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
     with closing(open_camera("u3v:", clock, bus)) as camera:
         camera.set_exposure_s(0.02)
         frame = camera.snap()
-    assert suffix_of(frame) == ".bin"
-    entry = json.loads(json.dumps({"file": f"00000-x{suffix_of(frame)}", **frame_facts(frame)}))
-    back = decode_frame(frame.original, entry)
+    file = frame_file(frame)
+    assert (file.suffix, file.data) == (".bin", frame.original)
+    entry = json.loads(json.dumps({"file": f"00000-x{file.suffix}", **file.facts}))
+    back = decode_frame(file.data, entry)
     np.testing.assert_array_equal(back.mosaic, frame.mosaic)
     np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
     assert (back.cfa, back.white_level_dn) == (frame.cfa, frame.white_level_dn)
     assert (back.exposure_s, back.gain) == (frame.exposure_s, frame.gain)
+
+
+def test_a_plug_in_s_bytes_stored_by_version_0_2_are_said_to_be_undecodable():
+    entry = {"file": "00003-shot-0.bin", "black_level_dn": [[0, 0], [0, 0]], "white_level_dn": 255}
+    with pytest.raises(DriverError, match=r"00003-shot-0\.bin is in a format that only"):
+        decode_frame(bytes(2000), entry)

@@ -2,15 +2,18 @@
 
 import copy
 import errno
+import hashlib
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import PLAN_YAML, begun, frame_bytes, plan_and_camera, still_rig
+from capture_rigs import PLAN_YAML, SIZE, begun, frame_bytes, plan_and_camera, still_rig
 
+from drivers.raw import RawFrame
 from emmc_rig.capture.amend import amendment
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.sequencer import Sequencer
@@ -19,10 +22,12 @@ from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.lock import held
 from emmc_rig.session.prune import prune
+from emmc_rig.session.readings import decoded
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
 from simulators.disk import PowerCutError, SimulatedDisk
+from simulators.still import PreparedCamera
 
 ROOT = Path("/disk")
 
@@ -74,6 +79,42 @@ def test_a_frame_is_the_bytes_that_the_camera_gave(undisturbed):
     _, frames = undisturbed
     assert frames["shot-0-e1-r0"] == frame_bytes("shot-0-e1-r0", 0.04)
     assert len(frames) == 2 + 2 * 2 + 2 * 1 + 1 + 3
+
+
+DUMP = {"black_level_dn": np.array([[100.5, 99], [98, 100]]), "white_level_dn": 4000}
+
+
+def dumped(mosaic, name="", cfa="rggb"):
+    """A frame of a plug-in's camera: its own bytes are the bare samples, big-endian."""
+    data = mosaic.astype(">u2").tobytes()
+    digest = hashlib.sha256(data).hexdigest()
+    return RawFrame(mosaic, **DUMP, cfa=cfa, exposure_s=0.01, original=data, sha256=digest,
+                    metadata={"name": name, "maker": "Plug & Co"})  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "cfa"), [("", "rggb"), ("x.raw", "mono"), ("x.dng", "rgbw-random")]
+)
+def test_frames_that_only_a_plug_in_could_decode_are_read_back_without_it(tmp_path, name, cfa):
+    taken, rig = [], still_rig()
+
+    def give(exposure_s):
+        rng = np.random.default_rng(len(taken))
+        taken.append(dumped(rng.integers(100, 150, SIZE, np.uint16), name, cfa))
+        return taken[-1]
+
+    rig = replace(rig, camera=PreparedCamera(give, SIZE, cfa), about_to_expose=lambda name: None)
+    text = "{camera: rgbw-bayer-1shot, shots: [{exposure_s: 0.01}], whiteboards: null, "
+    session, plan = begun(tmp_path, SYSTEM_DISK, rig, text + "darks: {repeats: 2}}")
+    Sequencer(session, plan, rig).run()
+    again = Session(session.folder)
+    assert verify(again).is_complete
+    assert not again.strangers()[1]
+    for frame, (back, _) in zip(taken, decoded(again, again.frames), strict=True):
+        np.testing.assert_array_equal(back.mosaic, frame.mosaic)
+        np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
+        assert (back.white_level_dn, back.cfa) == (frame.white_level_dn, frame.cfa)
+        assert (back.original, back.sha256) == (frame.original, frame.sha256)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -181,10 +181,12 @@ def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -
     """Raise AppError when the frames will not fit."""
     above = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
     free = disk.free_bytes(above)
-    if expected.bytes + DISK_RESERVE_BYTES > free:
+    lacking = expected.bytes + DISK_RESERVE_BYTES - free
+    if lacking > 0:
         raise AppError(
-            f"{out}: {expected.frames} frames need about {shown_bytes(expected.bytes)}, "
-            f"{shown_bytes(free)} are free; make room, or name another --out"
+            f"{out}: {expected.frames} frames need about {shown_bytes(expected.bytes)}, and "
+            f"{shown_bytes(DISK_RESERVE_BYTES)} stay reserved: {shown_bytes(lacking)} more than "
+            f"the {shown_bytes(free)} that are free; make room, or name another --out"
         )
 
 

@@ -50,7 +50,7 @@ from emmc_rig.rig.hardware import Rig
 from emmc_rig.rig.registration import Shift, registered
 from emmc_rig.rig.trigger import EDGE_WAIT_S, signalling, triggered
 from emmc_rig.session.decisions import metered, metered_words
-from emmc_rig.session.frame_file import decode_frame, frame_facts, suffix_of
+from emmc_rig.session.frame_file import decode_frame, frame_facts, frame_file
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session, wall_time
@@ -540,30 +540,25 @@ class Sequencer:
         if planned.kind == "metering":
             self._metered.setdefault(planned.id, entry)
         kept = dict(spans)
-        self._writer.put(
-            partial(
-                self._store, planned, frame.original, frame.sha256, suffix_of(frame), entry, kept
-            )
-        )
+        self._writer.put(partial(self._store, planned, frame, entry, kept))
 
     def _store(
         self,
         planned: PlannedFrame,
-        data: bytes,
-        sha256: str,
-        suffix: str,
+        frame: RawFrame,
         entry: Entry,
         spans: dict[str, list[float]],
     ) -> None:
         """Write a frame and its journal line; runs in the writer's thread."""
         self._watcher.step("write", planned)
         began_s = self._now_s()
+        file = frame_file(frame)
 
         def facts() -> Entry:
-            return {**entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
+            return {**file.facts, **entry, "spans_s": {**spans, "write": [began_s, self._now_s()]}}
 
         session, shot = self._session, planned.bench.shot
-        session.store(planned, suffix, data, sha256, facts)
+        session.store(planned, file.suffix, file.data, file.sha256, facts)
         self._watcher.stored(planned)
         left = self._left_of_shot.get(shot, set())
         if planned.id in left:

@@ -210,23 +210,24 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     import cv2
 
     from emmc_rig.pages.frame_view import preview
-    from emmc_rig.session.frame_file import frame_facts, suffix_of
+    from emmc_rig.session.frame_file import frame_file
 
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
-    original = stem.with_suffix(suffix_of(frame))
+    file = frame_file(frame)
+    original = stem.with_suffix(file.suffix)
     ok, png = cv2.imencode(".png", preview(frame))
     if not ok:
         raise AppError(f"{stem}: its preview cannot be made")
     facts = {
         "camera_bytes": original.name,
-        "sha256": frame.sha256,
-        **frame_facts(frame),
+        "sha256": file.sha256,
+        **file.facts,
     }
     files = {
         stem.with_suffix(".png"): png.tobytes(),
         stem.with_suffix(".json"): (json.dumps(facts, indent=2) + "\n").encode(),
-        original: frame.original,
+        original: file.data,
     }
     for path, data in files.items():
         with new_file(path) as partial:

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import CameraSettingError, DriverError
+from emmc_rig.session.frame_file import decode_frame, frame_file
+from emmc_rig.session.planned import Bench, PlannedFrame
+from emmc_rig.session.session import Frozen, Session
 
 
 def choose(limits, most=0.2):
@@ -37,6 +40,25 @@ def test_the_levels_of_a_frame_are_in_order(camera):
 def test_a_frame_keeps_the_cameras_bytes_and_their_digest(camera):
     frame = camera.snap()
     assert hashlib.sha256(frame.original).hexdigest() == frame.sha256
+
+
+def test_a_frame_that_a_session_stored_is_read_back_without_the_camera(camera, tmp_path):
+    frame = camera.snap()
+    planned = PlannedFrame("shot-0", "shot", Bench("scene", "white", 0, 0, True), None)
+    about = {"title": "conformance", "created": "", "command": "", "versions": {}}
+    session = Session.create(tmp_path / "session", Frozen("", {}, {}, (planned,)), about)
+    file = frame_file(frame)
+    session.store(planned, file.suffix, file.data, file.sha256, lambda: file.facts)
+    again = Session(session.folder)
+    back = decode_frame(again.read(planned.id), again.stored[planned.id])
+    np.testing.assert_array_equal(back.mosaic, frame.mosaic)
+    np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
+    assert (back.white_level_dn, back.cfa) == (frame.white_level_dn, frame.cfa)
+    assert (back.original, back.exposure_s, back.gain) == (
+        frame.original,
+        frame.exposure_s,
+        frame.gain,
+    )
 
 
 def test_frames_are_stamped_in_their_order(camera):

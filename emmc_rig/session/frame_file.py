@@ -1,24 +1,42 @@
-"""A frame as a file: the camera's own bytes out, and the frame back with what the journal knows."""
+"""A frame as a file that decodes to it again, on any machine, without the camera's driver.
+
+That is the camera's own bytes where they are of a format known here; of any other camera, such as
+a plug-in's, a DNG of the mosaic with the camera's own bytes in it. Which of both is found by
+decoding what would be stored and comparing it with the frame.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from drivers.camera import CameraIdentity
+from drivers.dng import MONO, encode_dng, private_data
+from drivers.errors import DriverError, RawFrameError
 from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
+from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Entry
 
 STREAMED = ".bin"
 """Frames of USB3 Vision cameras: leader, payload and trailer."""
+CAMERA_DIGEST = "camera_sha256"
+"""In the journal line of a frame whose file is a DNG of the mosaic: digest of the bytes in it."""
+UNSTORABLE = "the camera's frame cannot be stored so that it is read back: mend its driver"
 
 
-def suffix_of(frame: RawFrame) -> str:
-    """Return the kind of file that the camera's bytes are."""
-    suffix = Path(frame.metadata.get("name", "")).suffix.lower()
-    if suffix in RAW_SUFFIXES:
-        return suffix
-    return ".dng" if frame.original[:4] in TIFF_MAGICS else STREAMED
+@dataclass(frozen=True)
+class FrameFile:
+    """What is stored of a frame; facts: what its journal line says of it."""
+
+    suffix: str
+    data: bytes
+    sha256: str
+    facts: Mapping[str, Any]
 
 
 def frame_facts(frame: RawFrame) -> dict[str, Any]:
@@ -36,14 +54,85 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
     }
 
 
+def frame_file(frame: RawFrame) -> FrameFile:
+    """Return the file from which `decode_frame` returns the frame.
+
+    Raises AppError for a frame that no file can hold.
+    """
+    facts = frame_facts(frame)
+    own = FrameFile(_suffix_of(frame), frame.original, frame.sha256, facts)
+    if _decodes_to(own, frame):
+        return own
+    data = _dng_of(frame)
+    digest = hashlib.sha256(data).hexdigest()
+    made = FrameFile(".dng", data, digest, {**facts, CAMERA_DIGEST: frame.sha256})
+    if not _decodes_to(made, frame):
+        raise AppError(f"{UNSTORABLE} (a DNG of it decodes to something else)")
+    return made
+
+
 def decode_frame(data: bytes, entry: Entry) -> RawFrame:
     """Return the frame in a session's file; entry: its journal line. Raises a `DriverError`."""
-    if Path(entry["file"]).suffix == STREAMED:
+    if CAMERA_DIGEST in entry:
+        frame = replace(
+            decode_raw(data),
+            # A DNG has whole levels.
+            black_level_dn=np.array(entry["black_level_dn"], np.float64),
+            white_level_dn=entry["white_level_dn"],
+            cfa=entry["cfa"],
+            original=private_data(data),
+            sha256=entry[CAMERA_DIGEST],
+        )
+    elif Path(entry["file"]).suffix == STREAMED:
         # Its kernels take half a second to load, and most cameras write files.
         from drivers.u3v import decode_u3v
+        from drivers.u3v_codec import LEADER_PREFIX, begins_with
 
+        if not begins_with(data, LEADER_PREFIX):
+            raise RawFrameError(
+                f"{entry['file']} is in a format that only the plug-in of its camera knows: "
+                "emmc-rig 0.2 stored it without its mosaic"
+            )
         black_dn = float(entry["black_level_dn"][0][0])
         frame = decode_u3v(data, black_dn, entry["white_level_dn"])
     else:
         frame = decode_raw(data)
     return replace(frame, exposure_s=entry["exposure_s"], gain=entry["gain"])
+
+
+def _suffix_of(frame: RawFrame) -> str:
+    """Return the kind of file that the camera's bytes are, if they are of a known one."""
+    suffix = Path(frame.metadata.get("name", "")).suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return suffix
+    return ".dng" if frame.original[:4] in TIFF_MAGICS else STREAMED
+
+
+def _decodes_to(file: FrameFile, frame: RawFrame) -> bool:
+    try:
+        back = decode_frame(file.data, {"file": f"frame{file.suffix}", **file.facts})
+    except DriverError:
+        return False
+    return (
+        (back.cfa, back.white_level_dn) == (frame.cfa, frame.white_level_dn)
+        and np.array_equal(back.black_level_dn, frame.black_level_dn)
+        and np.array_equal(back.mosaic, frame.mosaic)
+        and (back.original, back.sha256) == (frame.original, frame.sha256)
+    )
+
+
+def _dng_of(frame: RawFrame) -> bytes:
+    black_dn = np.maximum(np.round(frame.black_level_dn), 0)
+    identity = CameraIdentity(frame.metadata.get("maker", ""), frame.metadata.get("model", ""))
+    try:
+        return encode_dng(
+            frame.mosaic,
+            frame.cfa,
+            black_dn[0, 0] if frame.cfa == MONO else black_dn,
+            frame.white_level_dn,
+            frame.exposure_s,
+            identity,
+            frame.original,
+        )
+    except (ValueError, OverflowError) as fault:
+        raise AppError(f"{UNSTORABLE} ({fault})") from fault

@@ -1,4 +1,4 @@
-"""A session: the frozen plan, one file per frame with the camera's own bytes, and the journal.
+"""A session: the frozen plan, one file per frame, and the journal.
 
     SESSION/
         session.json   when, by what command and versions; what the session is for
@@ -6,7 +6,7 @@
         camera.json    the camera as planned: each shot with its masks and where they stand
         rig.json       what stage and camera were asked for, and where the axes are centred
         frames.json    every frame to be taken, in the order of the capture
-        frames/        00012-shot-02.dng: the camera's own bytes, named by place and frame
+        frames/        00012-shot-02.dng: decodes to the frame (see `frame_file`)
         journal.jsonl  what happened
         amended-1-plan.yaml, ...camera.json, ...rig.json, ...frames.json
                        the plan as edited meanwhile, and what follows from it: these hold now

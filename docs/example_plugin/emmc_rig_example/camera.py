@@ -5,6 +5,10 @@ address: "rpicam-still --raw --immediate --shutter {exposure_us} --output {folde
 file: frame.dng
 shape: [3040, 4056]
 cfa: bggr
+
+Sessions store the RAW file as it is, for LibRaw decodes it. A camera whose bytes no other program
+decodes returns a `drivers.raw.RawFrame` with the mosaic and with its own bytes in `original`:
+sessions then store a DNG of the mosaic with these bytes in it.
 """
 
 import shlex

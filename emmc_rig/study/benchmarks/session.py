@@ -28,6 +28,7 @@ from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import refuse_inside_session
+from emmc_rig.files.results import shown_bytes
 from emmc_rig.pages.timeline import overlap, run_entries
 from emmc_rig.rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line
@@ -222,8 +223,12 @@ def verification(folder: Path, shots: int) -> Verification:
     with _scratch(folder) as scratch:
         frame = _frame(LARGE_SHAPE, 0)
         free = shutil.disk_usage(scratch).free
-        if shots * len(frame.original) * 1.05 > free:
-            raise AppError(f"{folder}: {shots} frames of 24 MP do not fit; use fewer --shots")
+        needed = 1.05 * shots * len(frame.original)
+        if needed > free:
+            raise AppError(
+                f"{folder}: {shots} frames of 24 MP need {shown_bytes(needed)}, "
+                f"{shown_bytes(free)} are free; use fewer --shots"
+            )
         session = _begun(shots, SYSTEM_DISK, scratch / "session")[0]
         data = bytearray(frame.original)
         for place, planned in enumerate(session.frames):

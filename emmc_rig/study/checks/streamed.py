@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import subprocess
 import sys
 import tempfile
@@ -28,7 +27,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.frames import PSI
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.model.camera import psi_layout
-from emmc_rig.session.frame_file import frame_facts, suffix_of
+from emmc_rig.session.frame_file import frame_file
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Frozen, Session
 from emmc_rig.study.checks.rows import Row, target_row
@@ -150,11 +149,9 @@ def drawn_session(folder: Path, settings: CalibrateSettings) -> tuple[Session, S
         data = encode_dng(
             mosaic, camera.sensor.cfa_name, noise.black_level_dn, noise.white_level_dn, exposure_s
         )
-        frame = decode_raw(data)
-        facts = {**frame_facts(frame), "exposure_s": exposure_s, "gain": 1.0}
-        facts["host_time_s"] = seconds
-        digest = hashlib.sha256(data).hexdigest()
-        session.store(planned, suffix_of(frame), data, digest, lambda facts=facts: facts)
+        file = frame_file(decode_raw(data))
+        facts = {**file.facts, "exposure_s": exposure_s, "gain": 1.0, "host_time_s": seconds}
+        session.store(planned, file.suffix, file.data, file.sha256, lambda facts=facts: facts)
     return session, shadow
 
 
