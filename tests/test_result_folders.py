@@ -149,7 +149,11 @@ def test_a_session_is_refused_by_every_way_to_it(tmp_path):
         write(session / "calibrations", NEW, belongs_to=session / "calibration")
 
 
-def test_two_commands_never_write_into_one_folder_at_a_time(tmp_path):
+@pytest.mark.parametrize("can_lock", [True, False])
+def test_two_commands_never_write_into_one_folder_at_a_time(tmp_path, monkeypatch, can_lock):
+    if not can_lock:
+        # As some network disks do; opening nothing raises OSError.
+        monkeypatch.setattr("fcntl.flock", lambda *given: os.open("/nowhere/at/all", 0))
     with result_folder(tmp_path / "out", "simulate") as folder:
         (folder / "metrics.json").write_text("first")
         with pytest.raises(AppError, match="another emmc-rig command"):

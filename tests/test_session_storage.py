@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -438,6 +440,61 @@ def test_two_programs_do_not_work_on_one_session(on_disk):
     with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
         pass
     assert not (on_disk.folder / LOCK).exists()
+
+
+KILLED = """
+import fcntl, os, pathlib, sys
+from emmc_rig.session.lock import held
+
+def refuse(descriptor, how):
+    raise OSError(37, "No locks available")
+
+fcntl.flock = refuse
+with held(pathlib.Path(sys.argv[1])):
+    os._exit(9)
+"""
+
+
+@pytest.fixture
+def no_locks(monkeypatch):
+    """A disk on which files cannot be locked, as some in a network."""
+
+    def refuse(descriptor, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_two_programs_do_not_work_on_one_session_where_files_cannot_be_locked(on_disk):
+    who = rf"held by `.*` \(process {os.getpid()} on .*; wait until it ends, .*, delete .*{LOCK}"
+    for folder in (on_disk.folder, on_disk.folder.with_name("to-be-made")):
+        with held(folder), pytest.raises(AppError, match=who.replace(LOCK, "lock")), held(folder):
+            pass
+    assert not list(on_disk.folder.parent.rglob("*lock"))
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_a_killed_capture_where_files_cannot_be_locked_says_what_to_delete(on_disk):
+    killed = [sys.executable, "-c", KILLED, on_disk.folder]
+    assert subprocess.run(killed, check=False).returncode == 9
+    with pytest.raises(AppError, match=f"it has ended: delete .*{LOCK}"), held(on_disk.folder):
+        pass
+    (on_disk.folder / LOCK).unlink()
+    with held(on_disk.folder):
+        pass
+
+
+def test_a_lock_by_file_holds_also_for_a_program_that_can_lock_files(on_disk):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fcntl.flock", lambda *given: os.open("/nowhere/at/all", 0))
+        lock = held(on_disk.folder)
+        lock.__enter__()
+    with pytest.raises(AppError, match="held by"), held(on_disk.folder):
+        pass
+    lock.__exit__(None, None, None)
+    with held(on_disk.folder):
+        pass
 
 
 def test_a_folder_that_is_no_session_is_reported(tmp_path):

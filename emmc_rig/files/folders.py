@@ -3,7 +3,7 @@
     OUT/
         metrics.json, ...    what a command wrote
         files.json           the command, and the SHA-256 of every file it wrote
-        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json, kept/
+        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json, kept/, lock
 
 A command writes into `new`. When it is done, the files of the earlier result move to `earlier`,
 the new ones take their places, and the hidden folder goes. `moves.json` is there from before the
@@ -18,17 +18,18 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.lock_file import TakenError, take_lock
 
 FILES = "files.json"
 PARTIAL = ".emmc-rig.partial"
 NEW, EARLIER, MOVES = "new", "earlier", "moves.json"
-KEPT = "kept"
+KEPT, LOCK = "kept", "lock"
 SESSION_HEADER, SESSION_JOURNAL = "session.json", "journal.jsonl"
 
 
@@ -240,7 +241,7 @@ def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
     What a killed program left in it goes too, but for interrupted moves, and what is kept where
     `resumes`. Raises AppError where another program works in it, and OSError.
     """
-    descriptor = _held(place)
+    release = _held(place)
     spared = KEPT if resumes else None
     try:
         if not (place / MOVES).exists():
@@ -251,40 +252,24 @@ def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
             with suppress(OSError):
                 if not (place / MOVES).exists():
                     _clear(place, spared)
-                    place.rmdir()
         finally:
-            if descriptor is not None:
-                os.close(descriptor)
+            with suppress(OSError):
+                release()
+                place.rmdir()
 
 
-def _held(place: Path) -> int | None:
-    """Make a folder and lock it; the lock goes with the program, however that ends.
-
-    Returns what to close, None where folders cannot be locked (Windows).
-    """
-    try:
-        import fcntl
-    except ImportError:
-        place.mkdir(exist_ok=True)
-        return None
+def _held(place: Path) -> Callable[[], None]:
+    """Make a folder and lock it; returns what removes the lock. Raises AppError, OSError."""
     while True:
         place.mkdir(exist_ok=True)
         try:
-            descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except FileNotFoundError:
-            continue
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as fault:
-            os.close(descriptor)
+            return take_lock(place / LOCK)
+        except TakenError as taken:
             raise AppError(
-                f"{place.parent}: another emmc-rig command writes there; wait for its end"
-            ) from fault
-        except OSError:
-            return descriptor  # a disk that knows no locks, as some in the network
-        if place.exists() and os.path.samestat(os.fstat(descriptor), place.stat()):
-            return descriptor
-        os.close(descriptor)  # whoever held it has removed it meanwhile
+                f"{place.parent}: another emmc-rig command writes there: {taken}"
+            ) from None
+        except FileNotFoundError:
+            continue  # whoever held it has removed it meanwhile
 
 
 def _holds_work(kept: Path) -> bool:
@@ -303,7 +288,8 @@ def _clear(place: Path, spared: str | None = None) -> None:
         if not at and spared in inner and _holds_work(place / spared):
             inner.remove(spared)
         for name in names:
-            os.unlink(os.path.join(folder, name))
+            if at or name != LOCK:
+                os.unlink(os.path.join(folder, name))
         for name in inner:
             path = os.path.join(folder, name)
             os.unlink(path) if os.path.islink(path) else os.rmdir(path)

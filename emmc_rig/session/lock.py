@@ -1,40 +1,34 @@
 """The lock of a session: one program writes at a time, and a second one names it in its error.
 
 A session is locked by `session.lock` in it; one that is yet to be made by `.NAME.lock` beside it.
-The lock is the operating system's and goes with the program, however that ends; the file says who
-holds it and is removed at the end. Where files cannot be locked (Windows, some network disks)
-nothing is held.
+The file says who holds it and is removed at the end; what a killed program leaves of it is in
+nobody's way, but for disks that cannot lock files (see `lock_file`).
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import socket
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
-from emmc_rig.files.results import command_line
-from emmc_rig.session.session import KNOWN, LOCK, wall_time
+from emmc_rig.files.lock_file import TakenError, take_lock
+from emmc_rig.session.session import KNOWN, LOCK
 from emmc_rig.session.storage import PART
 
 OURS = re.compile(r"\.?(\d{5}|amended-\d+)-")
 """How frames and amended files are called, parts of them too."""
-TRIES, WAIT_S = 200, 0.01
-"""A program that has just taken the lock needs a moment to write who it is."""
 
 
 class HeldError(AppError):
     """Another program writes the session; `holder` says which one."""
 
-    def __init__(self, folder: Path, holder: str) -> None:
-        super().__init__(f"{folder}: held by {holder}; wait until it ends, or stop it")
-        self.holder = holder
+    def __init__(self, folder: Path, taken: TakenError) -> None:
+        super().__init__(f"{folder}: held by {taken.holder}; {taken.advice}")
+        self.holder = taken.holder
 
 
 @contextmanager
@@ -68,7 +62,9 @@ def held(folder: Path) -> Iterator[None]:
 @contextmanager
 def _locked(path: Path, folder: Path) -> Iterator[None]:
     try:
-        descriptor = _acquired(path, folder)
+        release = take_lock(path)
+    except TakenError as taken:
+        raise HeldError(folder, taken) from None
     except OSError as fault:
         made = "written" if is_session(folder) else "made"
         raise AppError(
@@ -78,72 +74,7 @@ def _locked(path: Path, folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if descriptor is not None:
-            if _is_named(descriptor, path):
-                os.unlink(path)
-            os.close(descriptor)
-
-
-def _acquired(path: Path, folder: Path) -> int | None:
-    """Return the descriptor of a lock file that is held; None where files cannot be locked."""
-    try:
-        import fcntl
-    except ImportError:
-        return None
-    for _ in range(TRIES):
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        descriptor = os.open(path, flags, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = _holder(os.pread(descriptor, 4096, 0))
-            os.close(descriptor)
-            if holder:
-                raise HeldError(folder, holder) from None
-            time.sleep(WAIT_S)
-            continue
-        except OSError:
-            os.unlink(path)
-            os.close(descriptor)
-            return None
-        named = _is_named(descriptor, path)
-        if named and os.fstat(descriptor).st_size == 0:
-            # On a full disk the lock holds without a name.
-            with suppress(OSError):
-                os.write(descriptor, _own_name())
-            return descriptor
-        if named:
-            # Left by a killed program: its name must not be read any more.
-            os.unlink(path)
-        os.close(descriptor)
-    raise HeldError(folder, "another program")
-
-
-def _is_named(descriptor: int, path: Path) -> bool:
-    """Return whether the open file is still the one of that name."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
-    except FileNotFoundError:
-        return False
-
-
-def _own_name() -> bytes:
-    name = {
-        "command": command_line(),
-        "process": os.getpid(),
-        "host": socket.gethostname(),
-        "since": wall_time(),
-    }
-    return json.dumps(name).encode()
-
-
-def _holder(data: bytes) -> str:
-    """Return who wrote a lock file; "" where it is not written yet."""
-    try:
-        name = json.loads(data)
-        return "`{command}` (process {process} on {host}, since {since})".format(**name)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return ""
+        release()
 
 
 @contextmanager

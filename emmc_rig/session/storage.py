@@ -16,6 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+from emmc_rig.files.lock_file import is_running
+
 PART = ".part"
 
 
@@ -182,20 +184,7 @@ def is_part(name: str) -> bool:
 def is_abandoned(name: str) -> bool:
     """Return whether no program on this computer writes a part any more."""
     writer = re.search(rf"\.(\d+)-[0-9a-f]+{re.escape(PART)}$", name)
-    return is_part(name) and (writer is None or not _is_running(int(writer[1])))
-
-
-def _is_running(process: int) -> bool:
-    """Return whether another process of that number runs; Windows is not asked."""
-    if process == os.getpid() or os.name == "nt":
-        return False
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
+    return is_part(name) and (writer is None or not is_running(int(writer[1])))
 
 
 def write_whole(disk: Disk, path: Path, data: bytes | memoryview) -> None:
