@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_frame
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw, exposure_and_time
+
+ANY_EXPOSURE_S: Limits = (1e-6, 3600.0)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A RAW file: its name, and what it states; captured: as EXIF writes times, "" where not."""
+
+    name: str
+    exposure_s: float | None
+    captured: str
 
 
 class FolderCamera:
     """The RAW files of a folder, in the order of their names (2 comes before 10).
 
     All must have the first one's shape and colours. The exposure of a recording cannot be chosen:
-    asking for the one that the next frame has is accepted, so that a sequence can be run again.
+    asking for the one that the next frame has is accepted, so that a sequence can be run again; of
+    a file that states none, any. `choose` names the file that is next.
     Raises `FolderCameraError` when there is no file, and after the last one.
     """
 
@@ -26,6 +38,8 @@ class FolderCamera:
     def __init__(self, folder: Path | str, clock: Clock = SYSTEM_CLOCK) -> None:
         self.folder = Path(folder)
         self._clock = clock
+        self._asked_s: float | None = None
+        self._chosen = False
         try:
             self._left = sorted(
                 (
@@ -38,7 +52,7 @@ class FolderCamera:
             )
         except OSError as fault:
             raise FolderCameraError(str(folder), f"it cannot be read ({fault.strerror})") from fault
-        self._count = len(self._left)
+        self._paths, self._count = tuple(self._left), len(self._left)
         first = self._read()
         self._next: RawFrame | None = first
         self.shape: tuple[int, int] = first.mosaic.shape
@@ -50,16 +64,20 @@ class FolderCamera:
 
     @property
     def exposure_s(self) -> float:
-        """Exposure of the next frame; raises `CameraSettingError` where its file does not say."""
-        exposure_s = self._peek().exposure_s
+        """Exposure of the next frame, what was asked for where its file does not say.
+
+        Raises `CameraSettingError` where nothing was.
+        """
+        exposure_s = self._peek().exposure_s or self._asked_s
         if exposure_s is None:
             raise CameraSettingError("exposure", "is not stated in the recording")
         return exposure_s
 
     @property
     def exposure_limits_s(self) -> Limits:
-        """The next frame's exposure, twice."""
-        return self.exposure_s, self.exposure_s
+        """The next frame's exposure, twice; any where it is not stated, or files are chosen."""
+        exposure_s = None if self._chosen else self._peek().exposure_s
+        return ANY_EXPOSURE_S if exposure_s is None else (exposure_s, exposure_s)
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Accept the next frame's exposure.
@@ -75,6 +93,7 @@ class FolderCamera:
                 f"was {recorded_s:g} s when this was recorded, not {exposure_s:g} s: "
                 "replay it with the plan of the recording",
             )
+        self._asked_s = exposure_s
 
     def set_gain(self, gain: float) -> None:
         """Accept a gain of 1; raises as `set_exposure_s`."""
@@ -99,6 +118,20 @@ class FolderCamera:
             metadata={**frame.metadata, "name": name},
         )
 
+    def files(self) -> tuple[Recorded, ...]:
+        """Return all files with what they state, by the time of capture, else by their names.
+
+        Raises `FolderCameraError`; of a damaged file only the name is known.
+        """
+        found = [self._recorded(path) for path in reversed(self._paths)]
+        if all(one.captured for one in found):
+            found.sort(key=lambda one: one.captured)
+        return tuple(found)
+
+    def choose(self, name: str) -> None:
+        """Let the next frame be that of a file."""
+        self._left, self._next, self._chosen = [self.folder / name], None, True
+
     def close(self) -> None:
         """Forget the frames that are left."""
         self._left, self._next = [], None
@@ -108,6 +141,14 @@ class FolderCamera:
         if self._next is None:
             self._next = check_frame(self._read(self.shape), self.cfa)
         return self._next
+
+    def _recorded(self, path: Path) -> Recorded:
+        try:
+            return Recorded(path.name, *exposure_and_time(path.read_bytes()))
+        except RawFrameError:
+            return Recorded(path.name, None, "")
+        except OSError as fault:
+            raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault
 
     def _read(self, shape: tuple[int, int] | None = None) -> RawFrame:
         if not self._left:

@@ -166,6 +166,15 @@ class _TiffTags:
     pixels: tuple[Array, Array, int, str] | None = None
 
 
+def exposure_and_time(data: bytes) -> tuple[float | None, str]:
+    """Return exposure in s and time of capture as a RAW file states them, None and "" where not.
+
+    The picture is not decoded; only files laid out as TIFF are read. Raises `RawFrameError`.
+    """
+    tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
+    return tags.exposure_s, tags.metadata.get("captured", "")
+
+
 def decode_by_libraw(data: bytes) -> tuple[Array, Array, int, str]:
     """Return mosaic, black levels `(2, 2)`, white level and phase; raises `RawFrameError`."""
     try:

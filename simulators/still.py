@@ -18,8 +18,15 @@ TRAVEL_UM = (0.0, 100_000.0)
 class StillStage:
     """A `drivers.stage.Stage` whose moves take `move_s` on its clock, however far they go."""
 
-    def __init__(self, axes: Iterable[str], clock: Clock, move_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        axes: Iterable[str],
+        clock: Clock,
+        move_s: float = 0.0,
+        travel_um: Limits = TRAVEL_UM,
+    ) -> None:
         self.axes = tuple(axes)
+        self._travel_um = travel_um
         self.moves = 0
         self.stops = 0
         self._at_um: dict[str, float] = {}
@@ -38,8 +45,8 @@ class StillStage:
         for axis, target_um in targets_um.items():
             if axis not in self._at_um:
                 raise NotHomedError(axis)
-            if not TRAVEL_UM[0] <= target_um <= TRAVEL_UM[1]:
-                raise LimitExceededError(axis, target_um, TRAVEL_UM)
+            if not self._travel_um[0] <= target_um <= self._travel_um[1]:
+                raise LimitExceededError(axis, target_um, self._travel_um)
         if self._move_s:
             self._clock.sleep(self._move_s)
         self._at_um |= targets_um
@@ -58,7 +65,7 @@ class StillStage:
 
     def limits_um(self, axis: str) -> tuple[float, float]:
         """The travel."""
-        return TRAVEL_UM
+        return self._travel_um
 
     def speed_um_s(self, axis: str) -> float:
         """A speed to reckon with."""

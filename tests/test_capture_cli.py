@@ -381,26 +381,67 @@ def test_work_by_hand_without_a_terminal_is_reported(run, tmp_path, monkeypatch)
     assert "somebody has to switch the lamp off" in one_line(err)
 
 
-def test_a_recorded_session_is_replayed_through_the_folder_camera(captured, run, tmp_path):
-    recorded = tmp_path / "recorded"
-    recorded.mkdir()
-    for path in (captured / "plan-session" / "frames").iterdir():
-        if path.name[6:].startswith(("dark", "shot-0")):
-            (recorded / path.name).write_bytes(path.read_bytes())
-    rig = {
-        "stage": "simulated",
-        "camera": f"folder:{recorded}",
-        "zero_um": dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0),
-        "window_um": 1000.0,
-        "by_hand": False,
-    }
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
-    plan_file(tmp_path, whiteboards=None, shots=[{"exposure_s": [0.02, 0.08]}])
+SHOTS = ("shot-0-e0-r0", "shot-0-e1-r0")
+BARE = "stage: simulated\ncamera: 'folder:recorded'\nby_hand: false\n"
+PAGE = """
+zero_um: {mask_x: 12700, mask_y: 12700, aperture_x: 25000, aperture_y: 25000}
+window_um: 50000
+"""
+"""As docs/capture.md has them of a real rig."""
+
+
+@pytest.fixture
+def recorded(captured, tmp_path):
+    """A folder with the files of a session, its plan, and the shortest rig's file that replays."""
+    shutil.copytree(captured / "plan-session" / "frames", tmp_path / "recorded")
+    (tmp_path / "rig.yaml").write_text(BARE)
+    plan_file(tmp_path)
+    return tmp_path / "recorded"
+
+
+@pytest.mark.parametrize("more", ["", PAGE])
+def test_a_recorded_session_is_replayed_as_the_page_says(captured, recorded, run, tmp_path, more):
+    (tmp_path / "rig.yaml").write_text(BARE + more)
     code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
     assert code == 0, err
     again = Session(tmp_path / "plan-session")
-    for frame in again.frames:
-        assert again.read(frame.id) == contents(captured / "plan-session")[frame.id]
+    assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
+
+
+def test_a_file_that_is_missing_is_named_and_the_session_goes_on(captured, recorded, run, tmp_path):
+    lost = next(recorded.glob("*-shot-0-e1-r0.dng"))
+    data = lost.read_bytes()
+    lost.unlink()
+    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
+    assert code == 130
+    assert "recorded: no file is known to be shot-0-e1-r0 (0.08 s)" in err
+    assert "1 of 62 frames are still to be taken" in one_line(err)
+    (recorded / "shot-0-e1-r0.dng").write_bytes(data)
+    code, _, err = run("capture", "plan.yaml")
+    assert code == 0, err
+    again = Session(tmp_path / "plan-session")
+    assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
+
+
+def test_files_of_any_name_are_matched_by_their_exposures(captured, recorded, run, tmp_path):
+    """Their own program named them so that the longest exposure comes first."""
+    plan_file(tmp_path, whiteboards=None, shots=[{"exposure_s": [0.02, 0.08]}])
+    theirs = {
+        frame_id: path.rename(recorded / f"{9 - number}.dng").read_bytes()
+        for number, frame_id in enumerate(("dark-0-r0", "dark-0-r1", *SHOTS))
+        for path in recorded.glob(f"*-{frame_id}.dng")
+    }
+    for path in recorded.glob("*-*.dng"):
+        path.unlink()
+    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
+    assert code == 0, err
+    again = Session(tmp_path / "plan-session")
+    assert [again.read(name) for name in SHOTS] == [theirs[name] for name in SHOTS]
+    (recorded / "9.dng").unlink()
+    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml", "--out", "other")
+    assert code == 130
+    assert "no file is known to be dark" in err
+    assert {*Session(tmp_path / "other").stored} == {*SHOTS}
 
 
 def test_prune_removes_a_crash_s_leftovers(captured, run, tmp_path):

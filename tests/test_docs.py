@@ -35,6 +35,14 @@ def blocks(document):
             yield found["why"], list(commands(found["text"]))
 
 
+def written_files(document):
+    """Yield name and text of every file that the page shows whole: its first line is the name."""
+    for found in BLOCK.finditer(document.read_text(encoding="utf-8")):
+        named = re.match(r"# ([\w-]+\.yaml)\n", found["text"])
+        if found["language"] == "yaml" and named:
+            yield named[1], found["text"]
+
+
 def commands(text):
     """Yield the words of every emmc-rig command of a block, as a shell splits them."""
     for line in text.splitlines():
@@ -96,6 +104,8 @@ def _fitted_once():
 @pytest.mark.usefixtures("small", "small_pictures", "_fitted_once")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
+    for name, text in written_files(document):
+        Path(name).write_text(text)
     for why, found in blocks(document):
         for words in found if why is None else ():
             before, ours = files_of(Path()), listed(Path())

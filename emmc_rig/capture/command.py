@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from drivers.folder import FolderCamera, Recorded
 from emmc_rig.capture.amend import Amendment, amendment
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.estimate import (
@@ -29,6 +30,7 @@ from emmc_rig.capture.metering import first_meterings
 from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.preflight import refuse_impossible
+from emmc_rig.capture.replay import missing_words, replaying, there
 from emmc_rig.capture.retries import GaveUpError
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.capture.suspend import Suspend, suspended_by
@@ -281,6 +283,12 @@ def run_capture(
             )
         else:
             frames = still_possible(wish, session)
+        recording: Mapping[str, Recorded] | None = None
+        if isinstance(rig.camera, FolderCamera):
+            folder = rig.camera.folder
+            rig, recording = replaying(rig, planned)
+            if words := missing_words(folder, frames, recording):
+                watcher.tell(words)
         refuse_impossible(rig, frames)
         details = getattr(rig.camera, "details", dict)
         suspended = suspended_by(wish.plan.suspend, details, suspend)
@@ -304,7 +312,9 @@ def run_capture(
                         if wish.until_db not in (None, session.target_db):
                             session.note("until", target_db=wish.until_db, wall=wall_time())
                         control.preview = partial(_edit_words, wish, session, rig)
-                        choose = None if session.target_db is None else Until(session, watcher)
+                        choose = None if recording is None else there(session, recording)
+                        if session.target_db is not None:
+                            choose = Until(session, watcher)
                         run = Sequencer(
                             session,
                             wish.plan,

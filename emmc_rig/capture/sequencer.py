@@ -435,8 +435,8 @@ class Sequencer:
         rig, applied = self._rig, self._applied.offsets_um
         assert rig.trigger is not None
         offset_um = planned.bench.offsets_um[axis]
-        self._set_camera(planned, self._exposure_s(planned))
         rig.about_to_expose(planned.id)
+        self._set_camera(planned, self._exposure_s(planned))
         delay_s = rig.trigger.delay_s + self._plan.settle_s
         with triggered(self._camera).armed(rig.trigger.line, delay_s) as receive:
             with self._span("move", planned, spans):
@@ -464,6 +464,8 @@ class Sequencer:
 
     def _exposure_s(self, planned: PlannedFrame) -> float:
         """Return the exposure to ask the camera for."""
+        if planned.id in self._rig.recorded_s:
+            return self._rig.recorded_s[planned.id]
         if planned.exposure_s is not None:
             return planned.exposure_s
         if planned.kind == "shot":
@@ -476,7 +478,7 @@ class Sequencer:
         return metered_exposure_s(entry, level, planned.light, self._camera.exposure_limits_s)
 
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
-        if planned.kind != "metering":
+        if planned.kind != "metering" or planned.id in self._rig.recorded_s:
             return self._snap(planned, exposure_s)
         low_s, high_s = self._camera.exposure_limits_s
         if planned.bench.target == "scene":
@@ -490,8 +492,8 @@ class Sequencer:
         return frame, found
 
     def _snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
-        self._set_camera(planned, exposure_s)
         self._rig.about_to_expose(planned.id)
+        self._set_camera(planned, exposure_s)
         frame = self._camera.snap()
         return frame, figures(frame)
 

@@ -124,7 +124,8 @@ class Rig:
     about_to_expose: called with a frame's name before its exposure. trigger: the line by which
     the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
     of that square window, to put its edges between views; None: not known. stands_um: where axes
-    that no plan moves stand in a capture, as the focus.
+    that no plan moves stand in a capture, as the focus. recorded_s: of a recording that is
+    replayed, the exposure of each frame by its name.
     """
 
     stage: Stage
@@ -138,6 +139,7 @@ class Rig:
     trigger: Trigger | None = None
     window_side_um: float | None = None
     stands_um: Mapping[str, float] = field(default_factory=dict)
+    recorded_s: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

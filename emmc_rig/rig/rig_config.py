@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from drivers.clock import SYSTEM_CLOCK
+from drivers.stage import Stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
@@ -21,8 +22,10 @@ from emmc_rig.rig.hardware import NO_FLAWS, STAGE_AXES, Rig, open_camera, open_s
 from emmc_rig.rig.trigger import SimulatedTrigger, Trigger, check_trigger
 from simulators.bench import RAYS_PER_VIEW
 from simulators.effects import EFFECTS, TOGETHER, flawed
+from simulators.still import StillStage
 
 SIMULATED = "simulated"
+RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
 LATER = ("trigger", "focus_um", "stands_um", "mask")
 Ask = Callable[[str], None]
 
@@ -62,6 +65,7 @@ class RealRig(AnyRig):
     far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
     the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
     plate's open window; window_side_um: its side, for plans that open parts of the aperture.
+    Of a recording (camera `folder:DIR`, stage `simulated`) neither has to be given.
     by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
     not, nothing of that changes, as in a recording that is replayed. trigger: the wire by which
     the stage's arrival begins an exposure, where there is one.
@@ -275,14 +279,21 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         yield rig
         return
     real = validated(RealRig, settings, "the rig", AppError)
-    with open_stage(real.stage) as stage, closing(open_camera(real.camera)) as device:
+    zero_um = dict(real.zero_um)
+    if real.stage == SIMULATED and real.camera.startswith(RECORDING):
+        # Nothing moves any more, wherever the stage of the recording was sent.
+        still: Stage = StillStage((*STAGE_AXES, *real.stands_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM)
+        zero_um = dict.fromkeys(STAGE_AXES, 0.0) | zero_um
+    else:
+        still = open_stage(real.stage)
+    with still as stage, closing(open_camera(real.camera)) as device:
         if real.trigger is not None:
             check_trigger(real.trigger, stage, device)
         rig = Rig(
             stage,
             device,
             AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
-            real.zero_um,
+            zero_um,
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),
             trigger=real.trigger,
