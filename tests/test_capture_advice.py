@@ -30,7 +30,7 @@ from emmc_rig import cli
 from emmc_rig.capture import command, sequencer
 from emmc_rig.capture.checks import SaturatedError
 from emmc_rig.capture.retries import HOPELESS
-from emmc_rig.rig.rig_config import AskingAttendant
+from emmc_rig.rig.rig_config import AskingAttendant, opened_rig
 from emmc_rig.session import session as session_module
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import whiteboards
@@ -60,7 +60,7 @@ GUARDS = (
     "give trigger or focus_um; without either",  # likewise
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
     " is moved by plans: give its zero_um instead",  # likewise
-    "another program",  # a program that holds the lock and never says its name
+    "no file of it is frame ",  # frames without a file are not taken, but for --until
 )
 """What other commands print, and what earlier checks keep a capture from."""
 PLAN = {
@@ -739,6 +739,27 @@ def work_by_hand_without_a_terminal(bench):
     terminal = io.StringIO("\n" * 40)
     terminal.isatty = lambda: True
     bench.patch.setattr("sys.stdin", terminal)
+
+
+@walk(" cannot be said from number and exposures; name them by their frames")
+def a_recording_of_two_files_for_each_frame(bench):
+    assert bench.run(*CAPTURE)[0] == 0
+    recorded = bench.folder / "recorded"
+    (bench.session / "frames").rename(recorded)
+    shutil.rmtree(bench.session)
+    bench.patch.setattr(command, "opened_rig", opened_rig)
+    rig = {"stage": "simulated", "camera": f"folder:{recorded}", "by_hand": False}
+    (bench.folder / "rig.yaml").write_text(yaml.safe_dump(rig))
+    bench.finish = ("capture", "plan.yaml", "--rig", "rig.yaml")
+    theirs = {
+        path.rename(recorded / f"{number}.dng"): path
+        for number, path in enumerate(sorted(recorded.iterdir()))
+    }
+    for path in theirs:
+        shutil.copy(path, path.with_stem(f"again-{path.stem}"))
+    yield bench.refused()
+    for path, named in theirs.items():
+        path.rename(named)
 
 
 @walk(": exists already; choose another name, or move it away first")
