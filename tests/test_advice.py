@@ -1,15 +1,16 @@
 """`--budget` and `--want` of `emmc-rig reconstruct`: by a trial of the methods on the frames."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 
 from emmc_rig.advice import trial
-from emmc_rig.advice.recommend import advised, parse_budget, parse_wanted
+from emmc_rig.advice.recommend import advised, parse_wanted
 from emmc_rig.advice.trial import CANDIDATES, UNSURE_DB, Prospect, prospects
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import METRICS
+from emmc_rig.files.results import METRICS, parse_seconds
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db
 from simulators.scenes import render
@@ -23,15 +24,18 @@ EXPECTED = [
 
 
 @pytest.mark.parametrize(
-    ("text", "seconds"), [("30s", 30), ("2min", 120), ("1.5 h", 5400), ("0.5", 0.5), ("3M", 180)]
-)
-def test_budgets_are_read(text, seconds):
-    assert parse_budget(text) == seconds
+    ("text", "seconds"),
+    [("30s", 30), ("2min", 120), ("1.5 h", 5400), ("0.5", 0.5), ("3M", 180), ("20ms", 0.02),
+     ("500 us", 5e-4), ("1e9", 1e9)],
+)  # fmt: skip
+def test_times_are_read(text, seconds):
+    assert parse_seconds(text, "--budget") == pytest.approx(seconds)
 
 
 def test_nonsense_is_one_line():
-    for call, text in ((parse_budget, "soon"), (parse_budget, "0s"), (parse_budget, "-3s"),
-                       (parse_wanted, "good"), (parse_wanted, "28 lux")):  # fmt: skip
+    budget = partial(parse_seconds, option="--budget")
+    for call, text in ((budget, "soon"), (budget, "0s"), (budget, "-3s"), (parse_wanted, "good"),
+                       (parse_wanted, "28 lux")):  # fmt: skip
         with pytest.raises(AppError, match="write a"):
             call(text)
     assert parse_wanted("28 dB") == 28

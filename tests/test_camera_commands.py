@@ -17,7 +17,7 @@ from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
 from emmc_rig.commands import device_cameras
 from emmc_rig.commands.device_cameras import register, save_frame
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.pages.frame_view import (
     frame_figures,
     histogram,
@@ -68,7 +68,7 @@ def test_info_names_the_camera_and_what_it_can_do(run):
 
 def test_snap_saves_the_cameras_bytes_a_preview_and_the_facts(run, tmp_path):
     done = run(
-        *("snap", "--camera", "simulated", "--exposure", "0.03", "--gain", "2", "--out", "frames")
+        *("snap", "--camera", "simulated", "--exposure", "30ms", "--gain", "2", "--out", "frames")
     )
     assert done.exit_code == 0, done.output
     assert files(tmp_path) == [f"frames/frame-0001{s}" for s in (".dng", ".json", ".png")]
@@ -125,7 +125,8 @@ def test_live_writes_nothing_unless_asked(run, tmp_path):
         (("camera", "--camera", "ptp:9"), UsbNotFoundError, "serial 9"),
         (("camera", "--camera", "webcam"), AppError, "use ptp:"),
         (("snap", "--camera", "folder:nowhere"), DriverError, "nowhere"),
-        (("snap", "--camera", "simulated", "--exposure", "0"), AppError, "not positive"),
+        (("snap", "--camera", "simulated", "--exposure", "0"), WrongUsageError, "0.02, 20ms"),
+        (("snap", "--camera", "simulated", "--exposure", "soon"), WrongUsageError, "in seconds"),
         (("snap", "--camera", "simulated", "--exposure", "1e9"), DriverError, "0.0002 to 30"),
         (("snap", "--camera", "simulated", "--out", "file"), AppError, "cannot be made"),
     ],

@@ -288,6 +288,35 @@ def test_an_export_says_what_is_missing_of_what_it_was_given(run, tmp_path):
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize("command", ["export", "figure"])
+def test_the_size_in_the_environment_reaches_exported_scenes(run, monkeypatch, tmp_path, command):
+    monkeypatch.setenv("EMMC_SIZE", "24x32")
+    code, _, err = run(command, "near-planar", "--out", "r")
+    assert code == 0, err
+    metrics = json.loads((tmp_path / "r/metrics.json").read_text())
+    assert metrics.get("shape", [5, 5, 24, 32, 3]) == [5, 5, 24, 32, 3]
+    assert "views of 24x32 pixels" in metrics.get("caption", "views of 24x32 pixels")
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        ["reconstruct", "nowhere"],
+        ["calibrate", "nowhere"],
+        ["calibrate", "--drift", "taken", "--known", "nowhere"],
+        ["session", "list", "nowhere"],
+        ["session", "show", "nowhere"],
+        ["session", "verify", "nowhere"],
+        ["session", "sheet", "nowhere"],
+    ],
+)
+def test_a_folder_that_is_not_there_is_said_so_with_what_to_do(run, typed):
+    code, _, err = run(*typed)
+    assert code == 1
+    assert "nowhere: no such folder; " in one_line(err)
+    assert "emmc-rig" in one_line(err).partition("; ")[2]
+
+
 @pytest.mark.parametrize("command", [["demo"], ["reconstruct", "taken"]])
 def test_a_dictionary_that_the_method_would_not_read_is_refused(run, command):
     code, _, err = run(*command, "--dictionary", "nothing.h5")

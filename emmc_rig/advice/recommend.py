@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from emmc_rig.advice.trial import Prospect, prospects
-from emmc_rig.errors import WrongUsageError
-from emmc_rig.files.results import parse_psnr
+from emmc_rig.files.results import parse_psnr, parse_seconds
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 
-_NUMBER = r"(\d+(?:\.\d+)?)\s*"
-_SECONDS = {"": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 
 
 @dataclass(frozen=True)
@@ -22,16 +18,6 @@ class Advice:
 
     method: str
     why: str
-
-
-def parse_budget(text: str) -> float:
-    """Return the seconds of "30s", "2min", "1h" or "30"; raise WrongUsageError for others."""
-    found = re.fullmatch(_NUMBER + "(s|min|m|h|)", text.strip().lower())
-    if found is None or float(found[1]) == 0:
-        raise WrongUsageError(
-            f"--budget {text}: write a time above 0, for instance 30s, 2min or 1h"
-        )
-    return float(found[1]) * _SECONDS[found[2]]
 
 
 def parse_wanted(text: str) -> float:
@@ -45,7 +31,7 @@ def advice_for(psi: ImagingMatrix, frames: Frames, budget: str | None, want: str
     budget, want: as typed, such as "30s" and "28dB". Raises WrongUsageError for what cannot be
     read, ReconstructionError for frames that do not fit Psi.
     """
-    budget_s = None if budget is None else parse_budget(budget)
+    budget_s = parse_seconds(budget, "--budget")
     wanted_db = None if want is None else parse_wanted(want)
     return advised(prospects(psi, frames), budget_s, wanted_db)
 

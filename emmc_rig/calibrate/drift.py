@@ -22,6 +22,7 @@ from calibration.placement import SCALARS, Placement, with_aperture_mean_one
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.calibrate.stored import CALIBRATION
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.frames import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera, psi_layout
@@ -64,11 +65,10 @@ class Known:
 def read_calibration(folder: Path) -> Known:
     """Read a folder of `emmc-rig calibrate`; raises AppError when it is none, or damaged."""
     path = folder / CALIBRATION
+    remedy = "name one that `emmc-rig calibrate` wrote"
+    refuse_missing(folder, remedy)
     if not path.is_file() or not (folder / PSI).is_file():
-        raise AppError(
-            f"{folder}: holds no {CALIBRATION} and {PSI}; name a folder that `emmc-rig calibrate` "
-            "wrote"
-        )
+        raise AppError(f"{folder}: holds no {CALIBRATION} and {PSI}; {remedy}")
     psi = ImagingMatrix.load(folder / PSI)
     camera = Camera.model_validate_json(psi.camera_json)
     stages, k = shot_stages(camera), psi.binning

@@ -43,7 +43,8 @@ RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
 ]
 ExposureOption = Annotated[
-    float | None, typer.Option("--exposure", help="in seconds (default: as the camera is set)")
+    str | None,
+    typer.Option("--exposure", help="in seconds, or as 20ms (default: as the camera is set)"),
 ]
 GainOption = Annotated[
     float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
@@ -83,11 +84,13 @@ def snap(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
+    from emmc_rig.files.results import parse_seconds
     from emmc_rig.pages.frame_view import frame_figures
 
+    exposure_s = parse_seconds(exposure, "--exposure")
     with closing(open_camera(_chosen(camera, rig))) as device:
         folder = frames_folder(out)
-        choose(device, exposure, gain)
+        choose(device, exposure_s, gain)
         saved = []
         with shown_progress() as progress:
             for number in range(count):
@@ -113,13 +116,15 @@ def live(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
+    from emmc_rig.files.results import parse_seconds
     from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text
 
+    exposure_s = parse_seconds(exposure, "--exposure")
     folder = frames_folder(out) if save_every else None
     console = Console()
     device = open_camera(_chosen(camera, rig))
     with closing(device), pressed_keys() as pressed, suppress(KeyboardInterrupt):
-        choose(device, exposure, gain)
+        choose(device, exposure_s, gain)
         drawn_live = console.is_terminal and not json_wanted.get()
         showing = Live(console=console, auto_refresh=False) if drawn_live else None
         with showing or nullcontext(), closing(_frames(device)) as stream:

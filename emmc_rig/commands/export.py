@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.options import ExportSizeOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
 
@@ -22,6 +23,7 @@ def export(
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, for the viewer")
     ] = None,
+    size: ExportSizeOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write (default: emmc-FORMAT)")
     ] = None,
@@ -30,7 +32,7 @@ def export(
     from emmc_rig.files.exports import open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
-    from emmc_rig.files.results import command_line, shown_bytes, versions, write_metrics
+    from emmc_rig.files.results import command_line, parse_size, shown_bytes, versions, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 
     known = {VIEWER.name: VIEWER, **FORMATS}
@@ -46,7 +48,7 @@ def export(
         raise typer.BadParameter("name a result or a scene, or --list the formats")
     out = out or Path(f"emmc-{form}")
     with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
-        opened = open_export(result, truth)
+        opened = open_export(result, truth, parse_size(size))
         bars.begin("write")
         known[form].write(folder, opened)
         files = [path for path in folder.rglob("*") if path.is_file()]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import OutOption
+from emmc_rig.commands.options import ExportSizeOption, OutOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
 
@@ -31,12 +31,13 @@ def figure(
     width: Annotated[
         float, typer.Option("--width", min=2, max=40, help="of the figure, inches")
     ] = 7.16,
+    size: ExportSizeOption = None,
     out: OutOption = Path("emmc-figure"),
 ) -> None:
     """Draw results of one capture side by side: PDF, SVG, PNG and a caption with their sources."""
     from emmc_rig.files.exports import open_export
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import write_metrics
+    from emmc_rig.files.results import parse_size, write_metrics
     from emmc_rig.pages.result_figure import FigureSettings, draw_results
 
     settings = FigureSettings(
@@ -46,7 +47,9 @@ def figure(
         width,
     )
     with result_folder(out, "figure") as folder, shown_progress("read") as bars:
-        opened = [open_export(results[0], truth), *(open_export(one) for one in results[1:])]
+        truths = (truth, *[None] * (len(results) - 1))
+        asked = parse_size(size)
+        opened = [open_export(*one, asked) for one in zip(results, truths, strict=True)]
         bars.begin("draw")
         drawn = draw_results(opened, settings)
         drawn.save(folder)

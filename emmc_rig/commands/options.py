@@ -28,6 +28,12 @@ SizeOption = Annotated[
         "--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS: the middle of a scene, or its size"
     ),
 ]
+ExportSizeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of a scene; a result keeps its own"
+    ),
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
 ClusterOption = Annotated[

@@ -26,10 +26,13 @@ LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 IN_SESSION = "reconstruction"
 
 
-def open_export(spec: str, truth: str | None = None) -> Export:
+def open_export(
+    spec: str, truth: str | None = None, size: tuple[int, int] | None = None
+) -> Export:
     """Open a result's folder, a session's reconstruction, or a scene, see `open_scene`.
 
-    truth: the scene that was captured, to compare with. Raises AppError or SceneError.
+    truth: the scene that was captured, to compare with. size: of a scene, see `open_scene`; results
+    keep theirs. Raises AppError or SceneError.
     """
     folder = Path(spec)
     if is_session(folder):
@@ -46,7 +49,7 @@ def open_export(spec: str, truth: str | None = None) -> Export:
         near = nearest_of(spec, SCENES)
         raise AppError(f"no folder or file '{spec}', and no built-in scene: {near}")
     else:
-        scene = open_scene(spec)
+        scene = open_scene(spec, size)
         light_field, caption, metrics = scene.light_field, scene.provenance, {}
         maps = {} if scene.disparity_px is None else {"disparity": scene.disparity_px}
     true = None

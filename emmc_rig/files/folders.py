@@ -186,6 +186,12 @@ def _place_beside(path: Path) -> Path:
     return path.with_name(f".{path.name}{PARTIAL}")
 
 
+def refuse_missing(folder: Path, remedy: str) -> None:
+    """Raise AppError, with what to do, where there is no such folder."""
+    if not folder.exists():
+        raise AppError(f"{folder}: no such folder; {remedy}")
+
+
 def is_session(folder: Path) -> bool:
     """Return whether a folder is a session."""
     return (folder / SESSION_JOURNAL).is_file() and (folder / SESSION_HEADER).is_file()

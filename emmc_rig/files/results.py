@@ -21,6 +21,7 @@ from emmc_rig.files.shards import ENDING, save_arrays
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
+_SECONDS = {"us": 1e-6, "ms": 1e-3, "": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
 
 
@@ -42,6 +43,19 @@ def parse_psnr(text: str, option: str) -> float:
     if found is None or not float(found[1]) > 0:
         raise WrongUsageError(f"{option} {text}: write a PSNR, for instance 28dB")
     return float(found[1])
+
+
+def parse_seconds(text: str | None, option: str) -> float | None:
+    """Return the seconds of "20ms", "0.02", "30s", "2min" or "1h"; raises WrongUsageError."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+\.?\d*(?:e[+-]?\d+)?|\.\d+)\s*([a-z]*)", text.strip().lower())
+    if found is None or found[2] not in _SECONDS or not float(found[1]) > 0:
+        raise WrongUsageError(
+            f"{option} {text}: write a time above 0, in seconds or with a unit, for instance 0.02, "
+            "20ms or 2min"
+        )
+    return float(found[1]) * _SECONDS[found[2]]
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
+from emmc_rig.files.folders import is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.reading import parse_json, parse_yaml
 from emmc_rig.session.decisions import ended, metered
@@ -21,6 +21,7 @@ from emmc_rig.session.journal import heads
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
+    LISTED,
     PLAN,
     RECONSTRUCTION,
     Session,
@@ -77,6 +78,7 @@ class Wanted:
 
 def summary(folder: Path) -> Summary:
     """Return a session's summary; raises AppError when it cannot be read."""
+    refuse_missing(folder, LISTED)
     try:
         entries = heads((folder / JOURNAL).read_bytes())
         header = parse_json((folder / HEADER).read_bytes(), str(folder / HEADER), AppError)
@@ -140,6 +142,7 @@ def sessions_in(folder: Path) -> Iterator[Summary]:
 
     Hidden folders, and what lies in sessions, are passed over. Raises AppError.
     """
+    refuse_missing(folder, "`emmc-rig capture PLAN` makes sessions")
     try:
         next(folder.iterdir(), None)
     except OSError as fault:

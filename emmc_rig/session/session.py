@@ -42,7 +42,13 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import FILES, PARTIAL, SESSION_HEADER, SESSION_JOURNAL
+from emmc_rig.files.folders import (
+    FILES,
+    PARTIAL,
+    SESSION_HEADER,
+    SESSION_JOURNAL,
+    refuse_missing,
+)
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.reading import parse_json
@@ -70,6 +76,7 @@ KNOWN = {
     *FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK, CALIBRATION, RECONSTRUCTION, FILES, PARTIAL
 }  # fmt: skip
 FORMAT = 1
+LISTED = "`emmc-rig session list` shows the sessions there are"
 
 
 @dataclass(frozen=True)
@@ -93,9 +100,8 @@ class Session:
         try:
             self.journal = Journal(disk, self.folder / JOURNAL)
         except (FileNotFoundError, NotADirectoryError) as fault:
-            raise AppError(
-                f"{folder}: no session, it holds no {JOURNAL}; `emmc-rig session list` shows them"
-            ) from fault
+            refuse_missing(Path(folder), LISTED)
+            raise AppError(f"{folder}: no session, it holds no {JOURNAL}; {LISTED}") from fault
         except OSError as fault:
             raise AppError(f"{folder}: cannot be read ({fault.strerror}); mend that") from fault
 
