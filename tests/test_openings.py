@@ -42,6 +42,20 @@ def test_a_part_of_the_aperture_reads_the_sum_of_its_views(window):
     np.testing.assert_allclose(bench.reading(Setting(window=window)), np.sum(alone, 0), atol=1e-9)
 
 
+@pytest.mark.parametrize(("size", "opens_every_view"), [("32x40", True), ("192x256", False)])
+def test_few_whiteboards_never_take_more_frames_than_every_view(
+    run, tmp_path, size, opens_every_view
+):
+    planned = {}
+    for name, more in (("all", ()), ("few", ("--few",))):
+        code, _, _ = run("calibrate", "--plan", "--size", size, "--out", tmp_path / name, *more)
+        assert code == 0
+        planned[name] = json.loads((tmp_path / name / "metrics.json").read_text())
+    assert planned["few"]["frames"] <= planned["all"]["frames"]
+    same = planned["few"]["frames_by_kind"] == planned["all"]["frames_by_kind"]
+    assert same == opens_every_view
+
+
 def test_few_whiteboards_are_planned_by_parts_of_the_aperture(run, tmp_path):
     out = tmp_path / "plan"
     asked = ("--plan", "--few", "--size", "32x48", "--target", "0.01", "--out", out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -201,18 +202,29 @@ def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> Pla
 def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
     kind reach the target. Raises AppError where none do.
+
+    A plan of few whiteboards that would take more frames than one of every view gives way to it.
     """
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
     light = plan_light(bench, mask)
     planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
-    counts = frames_by_kind(settings, planned)
+    counts, few, more = frames_by_kind(settings, planned), settings.few, 0
+    if few:
+        # The frames allowed may be too few to open every view.
+        with suppress(AppError):
+            whole = combined_plan(settings, mask, light)
+            of_whole = frames_by_kind(settings, whole)
+            if of_whole.total() < counts.total():
+                few, more = False, counts.total()
+                planned, counts = whole, of_whole
     metrics = {
         "camera": settings.camera_name,
         "size": list(settings.size),
         "target_relative_error": settings.target,
-        "model_error": FEW_MODEL_ERROR if settings.few else MODEL_ERROR,
+        "model_error": FEW_MODEL_ERROR if few else MODEL_ERROR,
+        "few_would_take_frames": more or None,
         "exposures": {
             "open_s": light.exposure_s,
             "pinhole_s": light.exposure_s * float(np.prod(camera.views)),

@@ -61,8 +61,8 @@ def calibrate(
         bool,
         typer.Option(
             "--few",
-            help="about ten whiteboards, parts of the aperture instead of every view; for masks "
-            "that are as designed",
+            help="about ten whiteboards of parts of the aperture in place of those of every view, "
+            "for masks that are as designed; references, darks and checks stay",
         ),
     ] = False,
     leave_out: Annotated[
@@ -160,6 +160,11 @@ def calibrate(
             f"{metrics['frames']} frames for a relative error of Psi of "
             f"{metrics['expected_relative_error']:.2%}, the model's own included"
         )
+        if metrics["few_would_take_frames"]:
+            tell(
+                f"every view is opened: few whiteboards would take {metrics['few_would_take_frames']} "
+                "frames for this --target"
+            )
         tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         give_result(out)
         return
