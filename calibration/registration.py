@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from calibration.boards import Board
 from calibration.errors import CalibrationError
 from calibration.placement import Placement
-from calibration.shadow import Shadow, ShadowMask
+from calibration.repeats import vertex
+from calibration.shadow import SEARCH_UM, Shadow, ShadowMask
 
 Array = NDArray[np.floating]
 CROP_PX = 160
-SEARCH_UM = 600.0
 LEAST_CORRELATION = 0.3
 CLEAR_CORRELATION = 0.6
 ROTATIONS_DEG = (0.0, 0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0)
@@ -88,6 +88,8 @@ def correlated(
 ) -> Registration:
     """Return the start moved to the best shift, and the correlation coefficient there.
 
+    Of a mask that repeats it is the place nearest to the start that looks so.
+
     reach_um: shifts tried, along either axis. crop_px: the middle of the picture that is used.
     """
     rows, columns = board.reading.shape
@@ -129,24 +131,14 @@ def correlated(
     scores = product / np.sqrt(np.maximum(energy, 1e-12) * max(mine, 1e-12))
     peak = np.unravel_index(int(np.argmax(scores)), scores.shape)
     shift_px = [
-        margin - (at + _vertex(np.moveaxis(scores, axis, 0), peak if axis == 0 else peak[::-1]))
+        margin - (at + vertex(np.moveaxis(scores, axis, 0), peak if axis == 0 else peak[::-1]))
         for axis, at in enumerate(peak)
     ]
     # The shadow moves by 1 / (1 - rho) of what the mask does.
     ratio = mask.distance_um * (1 + start.distance_share) / mask.lens_um
+    shift_um = np.array(shift_px[::-1]) * pixel_um * (1 - ratio)
+    x_um, y_um = mask.repeats.nearest(shift_um)
     moved = replace(
-        start,
-        offset_x_um=start.offset_x_um + shift_px[1] * pixel_um * (1 - ratio),
-        offset_y_um=start.offset_y_um + shift_px[0] * pixel_um * (1 - ratio),
+        start, offset_x_um=start.offset_x_um + x_um, offset_y_um=start.offset_y_um + y_um
     )
     return Registration(moved, float(scores[peak]))
-
-
-def _vertex(scores: Array, peak: tuple[np.intp, ...]) -> float:
-    """Return where the parabola through a peak along the first axis has its top, from the peak."""
-    at, other = int(peak[0]), int(peak[1])
-    if at == 0 or at == len(scores) - 1:
-        return 0.0
-    before, here, after = (float(scores[at + step, other]) for step in (-1, 0, 1))
-    bend = before - 2 * here + after
-    return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))

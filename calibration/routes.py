@@ -185,6 +185,7 @@ def calibrate(
                 frames[name] = few.exposures
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings((mixed or parametric).fit)
+        findings += [mask.repeats.words] if mask.repeats.words else []
     if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")

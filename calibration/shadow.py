@@ -10,6 +10,7 @@ the cells (an error of rotation x footprint, under 0.2 um at 0.3 degrees).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit, prange
@@ -18,6 +19,7 @@ from scipy.special import ndtr
 
 from calibration.errors import CalibrationError
 from calibration.placement import SCALARS, Placement
+from calibration.repeats import Repeats, repeats_of
 from emmc_rig.model.camera import Camera, Plate, draw_plates
 
 Array = NDArray[np.floating]
@@ -31,6 +33,8 @@ OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
 """Beyond the beam, for a mask that sits askew."""
+SEARCH_UM = 600.0
+"""How far from where it should be a mask is looked for, along either axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,7 @@ class ShadowMask:
     """The one mask between lens and sensor, as designed, and the camera's geometry in um.
 
     cells: (frame, row, column, 4): red, green, blue, and their mean, for a pixel that sees all.
+    coloured: some pixel sees one colour alone.
     """
 
     cells: NDArray[np.float32]
@@ -51,6 +56,13 @@ class ShadowMask:
     views: tuple[int, int]
     size: tuple[int, int]
     binning: int
+    coloured: bool = True
+
+    @cached_property
+    def repeats(self) -> Repeats:
+        """After which shifts within SEARCH_UM the sensor sees the same mask."""
+        seen = self.cells[0, :, :, :3] if self.coloured else self.cells[0, :, :, 3:]
+        return repeats_of(seen, self.cell_um, SEARCH_UM)
 
     @property
     def corner_um(self) -> float:
@@ -95,6 +107,7 @@ def shadow_mask(camera: Camera, size: tuple[int, int]) -> ShadowMask:
         camera.views,
         size,
         sensor.binning,
+        sensor.cfa_name != "mono" or any(shot.filter != "none" for shot in camera.shots),
     )
 
 

@@ -10,10 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
+from calibration.repeats import repeats_of
 
 FEWEST_PLACES = 3
 CLEAR_RESPONSE = 0.1
 """Least share of the correlation's energy at its peak: two unrelated frames give 0.02 to 0.05."""
+
+SELF_ALIKE = 0.5
+"""Correlation of a shadow with itself, shifted, that noise lowers and only a mask that repeats has
+beyond a cell."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,8 @@ def shadow_shift_px(before: NDArray[np.uint16], after: NDArray[np.uint16]) -> tu
     """Return how far the mask's shadow moved between two frames (y, x), as (x, y) in pixels.
 
     By phase correlation with a Hann window. Good to tenths of a pixel for moves below a quarter
-    of the frame; a mask that repeats itself must move by less than half its period. Raises
-    CalibrationError for frames that show no common shadow.
+    of the frame. Raises CalibrationError for frames that show no common shadow, or one that repeats:
+    by how many of its periods it moved is not seen.
     """
     if before.shape != after.shape:
         raise CalibrationError(f"frames of {before.shape} and {after.shape} pixels")
@@ -70,6 +75,12 @@ def shadow_shift_px(before: NDArray[np.uint16], after: NDArray[np.uint16]) -> tu
         raise CalibrationError(
             f"no common shadow in two frames (correlation {response:.2f}): light a whiteboard, "
             "fit the mask, and move less between frames"
+        )
+    repeats = repeats_of(first[..., None], 1.0, min(first.shape) / 4, SELF_ALIKE)
+    if repeats.words:
+        raise CalibrationError(
+            "the mask's shadow repeats, or shows nothing along one direction, so that several moves "
+            "look the same: fit a mask that does not repeat, or read a ruler (leave --camera out)"
         )
     return float(shift[0]), float(shift[1])
 

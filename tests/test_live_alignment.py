@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationError
+from calibration.repeats import Repeats, repeats_of
 from drivers.raw import RawFrame
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live import focus
 from emmc_rig.live.alignment import MaskGauge, grid_direction
 from emmc_rig.live.focus import REMEMBERED_S, FocusMeter, sharpness
-from emmc_rig.model.camera import shipped_cameras
+from emmc_rig.model.camera import Camera, shipped_cameras
 from simulators.bench import Bench, MountingErrors
 
 SIZE = (72, 96)
@@ -34,6 +35,14 @@ def frame_of(mosaic, cfa="mono", white=WHITE):
         original=b"",
         sha256="",
     )
+
+
+def with_pattern(**pattern):
+    """The camera of one colour mask with another pattern in it."""
+    described = CAMERAS["rgbw-bayer-1shot"].model_dump(mode="json")
+    (mask,) = described["masks"].values()
+    mask["pattern"] = pattern
+    return Camera.model_validate(described)
 
 
 def bench_frame(camera, target="whiteboard", exposure_s=0.05, lamp="white", **errors):
@@ -66,10 +75,50 @@ def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and
     turned, stretched = place.rotation_deg + 0.7, place.scale - 0.9965
     assert abs(turned) < min(0.1, 4 * place.rotation_deviation_deg)
     assert abs(stretched) < min(1e-3, 4 * place.scale_deviation)
-    if place.offset_um is None:
-        assert name == "dual-mask-sinusoids"
-    else:
-        assert np.abs(np.subtract(place.offset_um, (11.0, -7.0))).max() < 1.5
+    assert np.abs(np.subtract(place.offset_um, (11.0, -7.0))).max() < 1.5
+    assert bool(place.ambiguity) == (name == "dual-mask-sinusoids")
+
+
+RANDOM = np.random.default_rng(3).integers(0, 2, (48, 40)).astype(float)
+STRIPES = np.tile([0.0, 1, 1, 0, 1, 0, 0, 0], (50, 6))
+CELL_UM = 36.0
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (RANDOM, Repeats()),
+        (np.tile(RANDOM[:8, :8], (8, 6)), Repeats(((8 * CELL_UM, 0), (0, 8 * CELL_UM)))),
+        (np.tile(RANDOM[:, :6], (1, 8)), Repeats(((6 * CELL_UM, 0),))),
+        (np.tile(RANDOM[:12, :6], (5, 8)), Repeats(((6 * CELL_UM, 0), (0, 12 * CELL_UM)))),
+        (np.indices((50, 50)).sum(axis=0) % 2, Repeats(((-CELL_UM, CELL_UM), (CELL_UM, CELL_UM)))),
+        (STRIPES, Repeats(uniform=True)),
+        (STRIPES.T, Repeats(uniform=True)),
+        (np.ones((50, 50)), Repeats(uniform=True)),
+    ],
+)
+def test_how_a_mask_repeats_follows_from_its_cells(cells, expected):
+    found = repeats_of(np.repeat(cells[..., None], 3, axis=-1), CELL_UM, 600.0)
+    assert found.uniform == expected.uniform
+    np.testing.assert_allclose(sorted(found.steps_um), sorted(expected.steps_um), atol=0.5)
+
+
+@pytest.mark.parametrize("offset_um", [(11.0, -7.0), (60.0, -110.0), (170.0, 20.0)])
+def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
+    camera = with_pattern(kind="tile", cells=RANDOM[:8, :8].tolist())
+    place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=offset_um))
+    period_um = 8 * CELL_UM
+    off_um = np.subtract(place.offset_um, offset_um)
+    assert np.abs(off_um - period_um * np.round(off_um / period_um)).max() < 1.5
+    assert np.abs(place.offset_um).max() < period_um / 2 + 1.5
+    assert "repeats every" in place.ambiguity
+
+
+def test_where_stripes_stand_along_themselves_is_not_stated():
+    camera = with_pattern(kind="tile", cells=STRIPES[:1, :8].tolist())
+    place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=(11.0, -7.0)))
+    assert place.offset_um is None
+    assert "along one direction" in place.ambiguity
 
 
 @pytest.mark.parametrize("name", WITHOUT_SHADOW)

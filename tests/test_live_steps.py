@@ -1,5 +1,7 @@
 """From an unpacked box to a plan: focus and the mask's place are found, and written where asked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -109,6 +111,19 @@ def test_the_mask_is_centred_by_what_was_measured_and_written(tmp_path):
     assert "# by eye" in path.read_text()
     assert written["mask"]["rotation_deg"] == pytest.approx(-0.03, abs=0.1)
     assert rig_description(str(path), ImagedRig(scene="dark"))["mask"]["scale"] > 0.99
+
+
+def test_the_place_of_a_mask_that_repeats_is_not_written(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG_YAML)
+    camera, rig, centre_um = lit_rig()
+    with watching(
+        rig.camera, rig.stage, rig.attendant.place, (), centre_um, camera, None, Files(None, path)
+    ) as watch:
+        unique = found().mask
+        for place in (unique, replace(unique, ambiguity="it repeats")):
+            watch._found = Found(mask=place)
+            assert ("zero_um" in watch.preview(["centre"])["diff"]) == (place is unique)
 
 
 def found():

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from calibration.errors import CalibrationError
-from calibration.stage_scale import fit_step_length
+from calibration.stage_scale import fit_step_length, shadow_shift_px
 from drivers.apt import ACTUATORS
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import ScaleError, SpeedLimitError
@@ -215,6 +215,22 @@ def test_the_shadow_of_the_mask_measures_the_step_in_the_cameras_frames():
     rig.attendant.set_lamp("off")
     with pytest.raises(CalibrationError, match="no common shadow"):
         measure(counted, "mask_x", 20_000, 3, shadow_reader(rig.camera, um_per_pixel))
+
+
+@pytest.mark.parametrize("tile", [(8, 8), (96, 8), (1, 8)])
+def test_a_shadow_that_repeats_measures_no_step(tile):
+    rng = np.random.default_rng(0)
+    cells = (
+        np.tile(rng.integers(500, 3000, tile), (96 // tile[0], 16))
+        .repeat(2, axis=0)
+        .repeat(2, axis=1)
+    )
+    frames = [
+        (np.roll(cells, by, axis=1) + rng.normal(0, 50, cells.shape)).astype(np.uint16)
+        for by in (0, 11)
+    ]
+    with pytest.raises(CalibrationError, match="repeats"):
+        shadow_shift_px(*frames)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from calibration.registration import LEAST_CORRELATION, register
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from drivers.raw import RawFrame
 from emmc_rig.model.camera import Camera, draw_plates, psi_layout
-from emmc_rig.model.masks import Sinusoids
 from emmc_rig.pages.frame_view import thinned
 
 Array = NDArray[np.floating]
@@ -62,8 +61,8 @@ class MaskPlace:
 
     rotation_deg: of the mask, counterclockwise in the picture. scale: 1 as designed; the shadow
     cannot distinguish a stretched mask from one at another distance. offset_um: of the mask, x and
-    y, from where the stage should have it; None for a periodic mask, whose periods look alike.
-    correlation: of frame and shadow, up to 1.
+    y, from where the stage should have it; None where it is not seen. correlation: of frame and
+    shadow, up to 1. ambiguity: what the offset leaves open, in words, "" for nothing.
     """
 
     rotation_deg: float
@@ -73,6 +72,7 @@ class MaskPlace:
     offset_um: tuple[float, float] | None
     offset_deviation_um: float
     correlation: float
+    ambiguity: str = ""
 
 
 def grid_direction(plane: Array) -> tuple[float, float]:
@@ -112,8 +112,6 @@ class MaskGauge:
         size = pixels[0] * k, pixels[1] * k
         single, weights = _with_one_mask(camera, size)
         self._mask = shadow_mask(single, size)
-        (mask,) = single.masks.values()
-        self._periodic = isinstance(mask.pattern, Sinusoids)
         start = designed_placement(single)
         self._start = replace(
             start, blur_um=BLUR_CELLS * self._mask.cell_um, aperture=weights or start.aperture
@@ -197,7 +195,8 @@ class MaskGauge:
                 f"the picture decides the mask's rotation to {turn:.2g} degrees and its scale to "
                 f"{100 * stretch:.2g} % only: look at a white board, expose longer"
             )
-        offset = None if self._periodic else (placement.offset_x_um, placement.offset_y_um)
+        repeats = self._mask.repeats
+        offset = None if repeats.uniform else (placement.offset_x_um, placement.offset_y_um)
         place = MaskPlace(
             -float(np.degrees(placement.rotation_rad)),
             float(turn),
@@ -206,6 +205,7 @@ class MaskGauge:
             offset,
             float(max(deviations[:2])),
             correlation,
+            repeats.words,
         )
         return place, placement
 

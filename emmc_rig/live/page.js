@@ -67,8 +67,8 @@ function drawMask() {
   write("scale", place ? `${percent(place.scale - 1, place.scale_deviation)} off the design` : "not seen");
   const offset = place?.offset_um;
   write("offset", offset ? `x ${offset[0].toFixed(1)}, y ${offset[1].toFixed(1)} \u00b1 ${place.offset_deviation_um.toFixed(1)} \u00b5m`
-    : place ? "periodic: not told apart" : "not seen");
-  write("mask-why", state.mask?.why || "");
+    : "not seen");
+  write("mask-why", state.mask?.why || place?.ambiguity || "");
 }
 
 function drawHint() {

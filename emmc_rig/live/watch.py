@@ -286,7 +286,7 @@ class Watch:
         exposure_s = self._state["settings"]["exposure_s"]
         zero_um = None
         place = self._found.mask
-        if place is not None and place.offset_um is not None:
+        if place is not None and place.offset_um is not None and not place.ambiguity:
             axes = zip(("mask_x", "mask_y"), place.offset_um, strict=True)
             zero_um = {a: self._centre_um[a] - um for a, um in axes if a in self._centre_um}
         self._found = replace(self._found, exposure_s=exposure_s, zero_um=zero_um)
