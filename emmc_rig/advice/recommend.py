@@ -11,7 +11,6 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 
 
-
 @dataclass(frozen=True)
 class Advice:
     """The method to take, and why, in words."""

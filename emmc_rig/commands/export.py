@@ -32,7 +32,13 @@ def export(
     from emmc_rig.files.exports import open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
-    from emmc_rig.files.results import command_line, parse_size, shown_bytes, versions, write_metrics
+    from emmc_rig.files.results import (
+        command_line,
+        parse_size,
+        shown_bytes,
+        versions,
+        write_metrics,
+    )
     from emmc_rig.pages.viewer import VIEWER
 
     known = {VIEWER.name: VIEWER, **FORMATS}

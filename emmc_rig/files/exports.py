@@ -26,9 +26,7 @@ LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 IN_SESSION = "reconstruction"
 
 
-def open_export(
-    spec: str, truth: str | None = None, size: tuple[int, int] | None = None
-) -> Export:
+def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | None = None) -> Export:
     """Open a result's folder, a session's reconstruction, or a scene, see `open_scene`.
 
     truth: the scene that was captured, to compare with. size: of a scene, see `open_scene`; results
