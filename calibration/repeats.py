@@ -93,13 +93,13 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float, alike: float = ALI
         # Of a shift and its opposite, one.
         if (round(y), round(x)) > (0, 0):
             peaks.append((float(x) * cell_um, float(y) * cell_um))
-    steps: list[tuple[float, float]] = []
-    for x, y in sorted(peaks, key=lambda one: float(np.hypot(*one))):
-        if not steps or abs(x * steps[0][1] - y * steps[0][0]) > PARALLEL * np.hypot(
-            x, y
-        ) * np.hypot(*steps[0]):
-            steps.append((x, y))
-    return Repeats(tuple(steps[:2]))
+    steps = sorted(peaks, key=lambda one: float(np.hypot(*one)))
+    for x, y in steps[1:]:
+        first_x, first_y = steps[0]
+        area = abs(first_x * y - first_y * x)
+        if area > PARALLEL * np.hypot(x, y) * np.hypot(first_x, first_y):
+            return Repeats((steps[0], (x, y)))
+    return Repeats(tuple(steps[:1]))
 
 
 def vertex(scores: Array, peak: tuple[np.intp, ...]) -> float:

@@ -63,8 +63,8 @@ def shadow_shift_px(before: NDArray[np.uint16], after: NDArray[np.uint16]) -> tu
     """Return how far the mask's shadow moved between two frames (y, x), as (x, y) in pixels.
 
     By phase correlation with a Hann window. Good to tenths of a pixel for moves below a quarter
-    of the frame. Raises CalibrationError for frames that show no common shadow, or one that repeats:
-    by how many of its periods it moved is not seen.
+    of the frame. Raises CalibrationError for frames that show no common shadow, or one that
+    repeats: by how many of its periods it moved is not seen.
     """
     if before.shape != after.shape:
         raise CalibrationError(f"frames of {before.shape} and {after.shape} pixels")
@@ -79,8 +79,9 @@ def shadow_shift_px(before: NDArray[np.uint16], after: NDArray[np.uint16]) -> tu
     repeats = repeats_of(first[..., None], 1.0, min(first.shape) / 4, SELF_ALIKE)
     if repeats.words:
         raise CalibrationError(
-            "the mask's shadow repeats, or shows nothing along one direction, so that several moves "
-            "look the same: fit a mask that does not repeat, or read a ruler (leave --camera out)"
+            "the mask's shadow repeats, or shows nothing along one direction, so that several "
+            "moves look the same: fit a mask that does not repeat, or read a ruler (leave --camera "
+            "out)"
         )
     return float(shift[0]), float(shift[1])
 

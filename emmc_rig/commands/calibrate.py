@@ -160,10 +160,9 @@ def calibrate(
             f"{metrics['frames']} frames for a relative error of Psi of "
             f"{metrics['expected_relative_error']:.2%}, the model's own included"
         )
-        if metrics["few_would_take_frames"]:
+        if wanted := metrics["few_would_take_frames"]:
             tell(
-                f"every view is opened: few whiteboards would take {metrics['few_would_take_frames']} "
-                "frames for this --target"
+                f"every view is opened: few whiteboards would take {wanted} frames for this target"
             )
         tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         give_result(out)

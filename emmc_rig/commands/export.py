@@ -32,13 +32,7 @@ def export(
     from emmc_rig.files.exports import open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
-    from emmc_rig.files.results import (
-        command_line,
-        parse_size,
-        shown_bytes,
-        versions,
-        write_metrics,
-    )
+    from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 
     known = {VIEWER.name: VIEWER, **FORMATS}
@@ -67,8 +61,6 @@ def export(
                 "keeps": known[form].keeps,
                 "shape": list(opened.light_field.shape),
                 "bytes": size,
-                "command": command_line(),
-                "versions": versions(),
             },
         )
         shown = files[0].relative_to(folder) if len(files) == 1 else None
