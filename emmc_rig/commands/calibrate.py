@@ -162,7 +162,7 @@ def calibrate(
         )
         if wanted := metrics["few_would_take_frames"]:
             tell(
-                f"every view is opened: few whiteboards would take {wanted} frames for this target"
+                f"every view is opened: few whiteboards would take {wanted} frames"
             )
         tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         give_result(out)
