@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
+from calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
 from calibration.levels import Check, Levels
 from calibration.openings import CENTRED, Window, views_open
 from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
@@ -102,20 +102,7 @@ class BoardSet:
 
     def dark_at(self, exposure_s: float) -> MeanFrame:
         """Return the dark frame of an exposure: black level and dark current of every pixel."""
-        exact = [one for one in self.darks if np.isclose(one.exposure_s, exposure_s, rtol=0.02)]
-        if exact:
-            return exact[0]
-        first, last = self.dark, max(self.darks, key=lambda frame: frame.exposure_s)
-        if last.exposure_s == first.exposure_s:
-            return first
-        share = (exposure_s - first.exposure_s) / (last.exposure_s - first.exposure_s)
-        mean = (first.mean_dn + share * (last.mean_dn - first.mean_dn)).astype(np.float32)
-        spread = first.variance_dn2 + share * (last.variance_dn2 - first.variance_dn2)
-        mine = (1 - share) ** 2 * first.variance_dn2 / first.count
-        theirs = share**2 * last.variance_dn2 / last.count
-        count = min(first.count, last.count)
-        extra = max(mine + theirs - max(spread, 0.0) / count, 0.0)
-        return MeanFrame(mean, max(spread, 0.0), count, exposure_s, extra_variance_dn2=extra)
+        return dark_at(self.darks, exposure_s)
 
     @property
     def exposures(self) -> int:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.errors import CalibrationError
 
@@ -15,6 +15,10 @@ BAND_PIXELS = 2**20
 """Worked on at once: a dozen temporary arrays of them take 100 MB."""
 LARGEST_CLIPPED_SHARE = 1e-3
 LARGEST_FLICKER = 0.02
+SAME_EXPOSURE = 0.02
+"""Relative: exposures that differ by less have one dark frame."""
+DARK_ELECTRONS_PER_S = 100.0
+"""Standard deviation of a dark current that no dark frame shows: uncooled sensors have as much."""
 SURE = 6.0
 """Deviations that noise alone hardly reaches."""
 
@@ -109,6 +113,46 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
         (before.taken_s + after.taken_s) / 2,
         change**2 / 12,
     )
+
+
+def dark_shares(darks: Sequence[MeanFrame], exposure_s: float) -> NDArray[np.float64]:
+    """Return of which darks that of an exposure is the sum, and by which share of each, (dark,).
+
+    The one of that exposure; else a line through the shortest and the longest, whose slope is the
+    dark current; where all are of one exposure, the first.
+    """
+    shares = np.zeros(len(darks))
+    times_s = np.array([one.exposure_s for one in darks])
+    own = np.flatnonzero(np.isclose(times_s, exposure_s, rtol=SAME_EXPOSURE))
+    first, last = int(np.argmin(times_s)), int(np.argmax(times_s))
+    if own.size or not dark_current_known(times_s, exposure_s):
+        shares[own[0] if own.size else first] = 1.0
+        return shares
+    shares[last] = (exposure_s - times_s[first]) / (times_s[last] - times_s[first])
+    shares[first] = 1 - shares[last]
+    return shares
+
+
+def dark_at(darks: Sequence[MeanFrame], exposure_s: float) -> MeanFrame:
+    """Return the dark frame of an exposure: black level and dark current of every pixel."""
+    shares = dark_shares(darks, exposure_s)
+    if shares.max() == 1:
+        return darks[int(np.argmax(shares))]
+    used = [(share, one) for share, one in zip(shares, darks, strict=True) if share]
+    mean = sum(share * one.mean_dn for share, one in used)
+    spread = max(float(sum(share * one.variance_dn2 for share, one in used)), 0.0)
+    noise = float(sum(share**2 * one.variance_dn2 / one.count for share, one in used))
+    count = min(one.count for _, one in used)
+    extra = max(noise - spread / count, 0.0)
+    mean_dn = np.asarray(mean, dtype=np.float32)
+    return MeanFrame(mean_dn, spread, count, exposure_s, extra_variance_dn2=extra)
+
+
+def dark_current_known(darks_s: ArrayLike, exposure_s: float) -> bool:
+    """Return whether darks of these exposures tell the dark current that an exposure collects."""
+    times_s = np.asarray(darks_s)
+    apart = not np.allclose(times_s, times_s[0], rtol=SAME_EXPOSURE, atol=0)
+    return apart or bool(np.isclose(times_s[0], exposure_s, rtol=SAME_EXPOSURE))
 
 
 def _check_steady(levels: list[float], noise: float, what: str, lit: bool) -> None:

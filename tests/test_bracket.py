@@ -5,7 +5,7 @@ import pytest
 
 from calibration.bracket import fuse
 from calibration.errors import CalibrationError
-from calibration.frames import SensorGain, average
+from calibration.frames import DARK_ELECTRONS_PER_S, SensorGain, average
 from emmc_rig.model.noise import SensorNoise
 
 NOISE = SensorNoise(
@@ -20,9 +20,14 @@ EXPOSURES_S = (0.005, 0.02, 0.08)
 DARKS = 16
 
 
-def dark_frame(size, rng):
-    frames = [NOISE.expose_dn(np.zeros(size), 0.01, 1.0, rng) for _ in range(DARKS)]
-    return average(frames, 0.01, NOISE.white_level_dn, "dark")
+def dark_frames(size, rng, exposures_s=EXPOSURES_S, electrons_per_s=0.0):
+    """Darks of each exposure; their noise is that of GAIN."""
+    found = []
+    for exposure_s in exposures_s:
+        current = np.full(size, electrons_per_s / NOISE.electrons_per_s)
+        frames = [NOISE.expose_dn(current, exposure_s, 1.0, rng) for _ in range(DARKS)]
+        found.append(average(frames, exposure_s, NOISE.white_level_dn, "dark"))
+    return found
 
 
 def bracket_of(readings, rng, exposures_s=EXPOSURES_S):
@@ -41,8 +46,8 @@ def ramp():
 
 def test_the_fused_rate_is_unbiased_and_its_deviation_is_true(ramp):
     rng = np.random.default_rng(0)
-    dark = dark_frame(ramp.shape, rng)
-    fused = fuse(bracket_of(ramp, rng), EXPOSURES_S, dark, GAIN, NOISE.white_level_dn)
+    darks = dark_frames(ramp.shape, rng)
+    fused = fuse(bracket_of(ramp, rng), EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
     # Above 3 the shortest exposure comes near white itself.
     judged = fused.usable & (ramp < 3.0)
     assert judged[:, ramp[0] < 3.0].all()
@@ -54,18 +59,39 @@ def test_the_fused_rate_is_unbiased_and_its_deviation_is_true(ramp):
         assert part.std() == pytest.approx(1, abs=0.06)
 
 
+@pytest.mark.parametrize(
+    "darks_s",
+    [EXPOSURES_S, (0.005, 0.08), (0.005, 0.02), (0.04,)],
+    ids=["own", "ends", "beyond", "one"],
+)
+def test_dark_current_is_subtracted_of_every_exposure_or_counted_as_unknown(darks_s):
+    """A hundredth of white of dark current, as much as a tenth of the darkest readings."""
+    rng = np.random.default_rng(5)
+    electrons_per_s = 2000.0 if len(darks_s) > 1 else DARK_ELECTRONS_PER_S
+    readings = np.geomspace(0.01, 0.9, 200)[None].repeat(300, axis=0)
+    lit = readings + electrons_per_s / NOISE.electrons_per_s
+    darks = dark_frames(readings.shape, rng, darks_s, electrons_per_s)
+    fused = fuse(bracket_of(lit, rng), EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
+    score = ((fused.dn_per_s - true_rate(readings)) / np.sqrt(fused.variance))[fused.usable]
+    if len(darks_s) > 1:
+        assert abs(score.mean()) < 0.02
+        assert score.std() == pytest.approx(1, abs=0.03)
+    else:
+        assert abs(score.mean()) < 1
+
+
 def test_the_bracket_beats_its_single_exposures(ramp):
     rng = np.random.default_rng(1)
-    dark = dark_frame(ramp.shape, rng)
+    darks = dark_frames(ramp.shape, rng)
     frames = bracket_of(ramp, rng)
-    fused = fuse(frames, EXPOSURES_S, dark, GAIN, NOISE.white_level_dn)
+    fused = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
     shadow, light = ramp[0] < 0.01, (ramp[0] > 1.2) & (ramp[0] < 3)
     truth = true_rate(ramp)
 
     def error(rate, where):
         return np.sqrt(np.mean((rate[:, where] - truth[:, where]) ** 2))
 
-    alone = [(f - dark.mean_dn) / t for f, t in zip(frames, EXPOSURES_S, strict=True)]
+    alone = [(f - dark.mean_dn) / t for f, dark, t in zip(frames, darks, EXPOSURES_S, strict=True)]
     assert error(fused.dn_per_s, shadow) < 0.2 * error(alone[0], shadow)
     assert error(fused.dn_per_s, light) < 0.2 * error(alone[2], light)
     assert error(fused.dn_per_s, light) < 1.02 * error(alone[0], light)
@@ -76,7 +102,7 @@ def test_a_pixel_saturated_in_every_exposure_is_not_usable():
     readings = np.full((8, 8), 0.1)
     readings[3, 4] = 50.0
     fused = fuse(
-        bracket_of(readings, rng), EXPOSURES_S, dark_frame((8, 8), rng), GAIN, NOISE.white_level_dn
+        bracket_of(readings, rng), EXPOSURES_S, dark_frames((8, 8), rng), GAIN, NOISE.white_level_dn
     )
     assert not fused.usable[3, 4]
     assert np.isinf(fused.variance[3, 4])
@@ -91,9 +117,9 @@ def test_a_dead_pixel_says_nothing_however_bright_it_is():
     readings = np.full((8, 8), 50.0)
     dead = np.zeros((8, 8), bool)
     dead[3, 4] = True
-    dark = dark_frame((8, 8), rng)
+    darks = dark_frames((8, 8), rng)
     frames = bracket_of(readings, rng)
-    fused = fuse(frames, EXPOSURES_S, dark, GAIN, NOISE.white_level_dn, dead)
+    fused = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn, dead)
     assert fused.dn_per_s[3, 4] == 0
     assert (fused.dn_per_s[~dead] > 0).all()
 
@@ -101,10 +127,10 @@ def test_a_dead_pixel_says_nothing_however_bright_it_is():
 def test_repeats_of_one_exposure_divide_the_variance():
     rng = np.random.default_rng(3)
     readings = np.full((40, 50), 0.2)
-    dark = dark_frame(readings.shape, rng)
+    darks = dark_frames(readings.shape, rng)
     frames = bracket_of(readings, rng, [0.02] * 9)
-    many = fuse(frames, [0.02] * 9, dark, GAIN, NOISE.white_level_dn)
-    one = fuse(frames[:1], [0.02], dark, GAIN, NOISE.white_level_dn)
+    many = fuse(frames, [0.02] * 9, darks, GAIN, NOISE.white_level_dn)
+    one = fuse(frames[:1], [0.02], darks, GAIN, NOISE.white_level_dn)
     shared = GAIN.dark_variance_dn2 / DARKS / 0.02**2
     assert np.median(one.variance - shared) == pytest.approx(
         9 * np.median(many.variance - shared), rel=0.05
@@ -113,16 +139,16 @@ def test_repeats_of_one_exposure_divide_the_variance():
 
 def test_the_order_of_the_exposures_does_not_matter(ramp):
     rng = np.random.default_rng(4)
-    dark = dark_frame(ramp.shape, rng)
+    darks = dark_frames(ramp.shape, rng)
     frames = bracket_of(ramp, rng)
-    one = fuse(frames, EXPOSURES_S, dark, GAIN, NOISE.white_level_dn)
-    other = fuse(frames[::-1], EXPOSURES_S[::-1], dark, GAIN, NOISE.white_level_dn)
+    one = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
+    other = fuse(frames[::-1], EXPOSURES_S[::-1], darks, GAIN, NOISE.white_level_dn)
     np.testing.assert_array_equal(one.dn_per_s, other.dn_per_s)
 
 
 def test_a_bracket_without_frames_is_reported():
-    dark = dark_frame((4, 4), np.random.default_rng(0))
+    darks = dark_frames((4, 4), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="needs frames"):
-        fuse([], [], dark, GAIN, 4095)
+        fuse([], [], darks, GAIN, 4095)
     with pytest.raises(CalibrationError, match="differ in size"):
-        fuse([np.zeros((4, 5), np.uint16)], [0.1], dark, GAIN, 4095)
+        fuse([np.zeros((4, 5), np.uint16)], [0.1], darks, GAIN, 4095)

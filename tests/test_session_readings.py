@@ -13,14 +13,18 @@ from drivers.errors import DriverError
 from emmc_rig.capture.plan import Plan, planned_camera
 from emmc_rig.capture.sequencer import Sequencer
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.rig.hardware import open_camera, simulated_rig
+from emmc_rig.rig.hardware import NO_FLAWS, open_camera, simulated_rig
 from emmc_rig.rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame, frame_file
 from emmc_rig.session.readings import session_readings, whiteboards
 from simulators.clock import ManualClock
 from simulators.disk import SimulatedDisk
+from simulators.effects import Flaws
+from simulators.flaws import SensorFlaws
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 
@@ -28,11 +32,11 @@ SIZE = (24, 32)
 BRIGHT = 0.08
 
 
-def captured(text):
+def captured(text, flaws=NO_FLAWS):
     """Run a plan on the simulated rig; returns its session and the camera as planned."""
     camera = planned_camera(Plan.model_validate(yaml.safe_load(text)))
     samples = fine_scene("near-planar", 1, 1, size=SIZE, views=camera.views).samples
-    rig, _ = simulated_rig(camera, samples, SIZE, seed=0)
+    rig, _ = simulated_rig(camera, samples, SIZE, seed=0, flaws=flaws)
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, text)
     assert Sequencer(session, plan, rig).run().complete
     return session, camera
@@ -73,6 +77,38 @@ def test_readings_do_not_depend_on_the_gain_and_their_deviation_is_true(without_
         assert abs(score.mean()) < 0.2
         # The dark frames are shared, so that the difference is a little surer than foretold.
         assert 0.85 < score.std() < 1.1
+
+
+@pytest.mark.parametrize("shot", ["18.7", "[0.5, 18.7]", "auto"])
+@pytest.mark.parametrize("of_shots", [0, 4])
+def test_dark_current_of_long_shots_is_subtracted_or_said_to_be_unknown(tmp_path, shot, of_shots):
+    """White is 3,000 electrons/s, the dark current 100: 0.033 of white."""
+    camera = find_camera("rgbw-bayer-1shot")
+    noise = camera.sensor.noise.model_copy(update={"electrons_per_s": 3000.0})
+    sensor = camera.sensor.model_copy(update={"noise": noise})
+    path = tmp_path / "dim.yaml"
+    path.write_text(camera.model_copy(update={"sensor": sensor}).model_dump_json())
+    text = f"""
+camera: {path}
+shots: [{{exposure_s: {shot}}}]
+whiteboards: null
+metering: {{bracket: false, level: 0.6}}
+darks: {{repeats: 4, of_shots: {of_shots}}}
+"""
+    warm = Flaws(sensor=SensorFlaws(dark_electrons_per_s=100.0))
+    (session, _), (cold, _) = captured(text, warm), captured(text)
+    taken, truth = session_readings(session), session_readings(cold)
+    off = (taken.readings - truth.readings)[taken.usable & truth.usable]
+    deviation = np.sqrt(np.median(taken.variance))
+    reasons = [reason.what for reason in exposure_reasons(shot_exposures(session))]
+    if of_shots:
+        assert abs(off.mean()) < 0.001
+        assert deviation < 0.01
+        assert not reasons
+    else:
+        assert off.mean() == pytest.approx(0.033, abs=0.003)
+        assert off.mean() < 1.5 * deviation
+        assert any("no dark frame is exposed as long" in text for text in reasons)
 
 
 def test_a_person_is_asked_again_only_when_something_changes():

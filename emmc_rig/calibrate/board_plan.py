@@ -38,7 +38,7 @@ PLAN_HEAD = """\
 # Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
 # and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
 """
-METERING_DARKS, BOARD_DARKS = 2, 1
+METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
 LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
@@ -126,7 +126,10 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
             turned=0 if "turned" in settings.leave_out else TURNED_REPEATS,
         ),
         darks=Darks(
-            exposure_s=(METERING_EXPOSURE_S,), repeats=METERING_DARKS, of_boards=BOARD_DARKS
+            exposure_s=(METERING_EXPOSURE_S,),
+            repeats=METERING_DARKS,
+            of_boards=BOARD_DARKS,
+            of_shots=SHOT_DARKS,
         ),
     )
 

@@ -85,10 +85,12 @@ class Exposures:
         if frame.exposure_s is not None:
             return frame.exposure_s
         shot = str(frame.bench.shot)
-        if frame.kind == "shot":
+        if frame.is_exposed_as_shots:
             if decided is not None and shot in decided["exposures_s"]:
                 return decided["exposures_s"][shot] * frame.light
-            earlier_s = self._earlier.get(("shot", frame.bench.lamp))
+            earlier_s = self._earlier.get(
+                ("shot", "white" if frame.kind == "dark" else frame.bench.lamp)
+            )
         else:
             entry = meterings.get(frame.metered_by or "")
             if entry is not None and entry["figures"]["bright_dn"] >= 1:

@@ -20,7 +20,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.masks import cfa_tile
-from emmc_rig.session.planned import Bench, PlannedFrame
+from emmc_rig.session.planned import SHOT_DARK, Bench, PlannedFrame
 
 OPEN_LAMP = "white"
 TURN_DEG = 90.0
@@ -336,9 +336,42 @@ def _scene_meterings(plan: Plan, camera: Camera, window_um: float) -> dict[int, 
     return found
 
 
+def _shot_darks(
+    plan: Plan, camera: Camera, meterings: Mapping[int, PlannedFrame]
+) -> Iterator[PlannedFrame]:
+    """Yield darks at the longest exposure of the shots: of those planned, and of each metered one.
+
+    Shots that are metered alike have one. At shorter exposures the dark current lies on a line.
+    """
+    if plan.darks is None or not plan.darks.of_shots:
+        return
+    planned = [max(bracket) for bracket in exposures_s(plan, camera) if bracket is not None]
+    exposures: list[tuple[int, float | None, str | None]] = []
+    if planned and max(planned) > max(plan.darks.exposure_s):
+        exposures.append((0, max(planned), None))
+    kept: dict[object, int] = {}
+    for place in meterings:
+        shot = plan.shots[place]
+        kept.setdefault((shot.lamp, shot.gain) if plan.metering.alike else place, place)
+    exposures += [(place, None, meterings[place].id) for place in kept.values()]
+    for place, exposure_s, metered_by in exposures:
+        bench = Bench("scene", "off", place, 0, masks_in=True)
+        for repeat in range(plan.darks.of_shots):
+            name = f"{SHOT_DARK}-{place if metered_by else 'longest'}-r{repeat}"
+            yield PlannedFrame(
+                name,
+                "dark",
+                bench,
+                exposure_s,
+                repeat=repeat,
+                metered_by=metered_by,
+            )
+
+
 def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
     meterings = _scene_meterings(plan, camera, window_um)
     yield from {frame.id: frame for frame in meterings.values()}.values()
+    yield from _shot_darks(plan, camera, meterings)
     steps = MOST_STEPS if plan.metering.bracket else 0
     for place, (shot, bracket) in enumerate(
         zip(plan.shots, exposures_s(plan, camera), strict=True)

@@ -46,6 +46,7 @@ metering:                   # of shots with exposure_s: auto
 darks:
   exposure_s: [0.01]
   repeats: 4
+  of_shots: 4               # at the longest exposure of the shots, for their dark current
 
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own

@@ -30,8 +30,10 @@ def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, .
         return frames
     groups: dict[object, list[PlannedFrame]] = {}
     for frame in frames:
-        # The scene is metered, all of it, before the first shot.
-        meters = frame.kind == "metering" and frame.bench.target == "scene"
+        # The scene is metered, all of it, before the first shot and the darks of the shots.
+        meters = frame.bench.target == "scene" and (
+            frame.kind == "metering" or (frame.kind == "dark" and frame.is_exposed_as_shots)
+        )
         key = (frame.part, frame.bench.lamp == "off", meters, *frame.bench.set_by_hand)
         groups.setdefault(key, []).append(frame)
     found: list[PlannedFrame] = []

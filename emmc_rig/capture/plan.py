@@ -14,6 +14,7 @@ from pydantic import (
     Field,
     Tag,
     WithJsonSchema,
+    field_validator,
     model_validator,
 )
 
@@ -158,6 +159,17 @@ class Darks(Settings):
         default=0,
         description="at every exposure of the whiteboards too, so many before and after them",
     )
+    of_shots: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="so many at the longest exposure of the shots, before them; 0, or at least 2",
+    )
+
+    @field_validator("of_shots")
+    @classmethod
+    def _repeated(cls, count: int) -> int:
+        if count == 1:
+            raise ValueError("write 0, or 2 or more: one frame does not tell its own noise")
+        return count
 
 
 class Retries(Settings):

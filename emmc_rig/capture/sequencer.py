@@ -240,7 +240,7 @@ class Sequencer:
                 return False
             if self._control.again:
                 return True
-            if frame.is_metered_shot and self._decide_exposures():
+            if frame.is_exposed_as_shots and self._decide_exposures():
                 return True
             self._take(frame)
         return True
@@ -468,7 +468,7 @@ class Sequencer:
             return self._rig.recorded_s[planned.id]
         if planned.exposure_s is not None:
             return planned.exposure_s
-        if planned.kind == "shot":
+        if planned.is_exposed_as_shots:
             asked = metered(self._session.journal.entries)
             assert asked is not None
             return asked["exposures_s"][str(planned.bench.shot)] * planned.light

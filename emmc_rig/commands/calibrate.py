@@ -161,9 +161,7 @@ def calibrate(
             f"{metrics['expected_relative_error']:.2%}, the model's own included"
         )
         if wanted := metrics["few_would_take_frames"]:
-            tell(
-                f"every view is opened: few whiteboards would take {wanted} frames"
-            )
+            tell(f"every view is opened: few whiteboards would take {wanted} frames")
         tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
         give_result(out)
         return

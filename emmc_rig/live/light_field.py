@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.bracket import fuse
 from calibration.errors import CalibrationError
+from calibration.frames import dark_at
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.formats import Export
@@ -148,10 +149,10 @@ class LiveLightField:
         """Return whether a frame differs from the held one of its shot by more than noise."""
         held = self._held[shot]
         one, other = self._rate(frame), self._rate(held)
-        gain, dark = self._scale.gain, self._scale.dark
+        gain = self._scale.gain
         mean = np.maximum((one + other) / 2, 0)
         variance = sum(
-            (gain.gain_dn_per_electron * mean + dark.variance_dn2 / exposure_s) / exposure_s
+            (gain.gain_dn_per_electron * mean + gain.dark_variance_dn2 / exposure_s) / exposure_s
             for exposure_s in (_exposure_s(frame), _exposure_s(held))
         )
         square = np.where(self._scale.good, (one - other) ** 2 / variance, 1.0)
@@ -159,8 +160,10 @@ class LiveLightField:
 
     def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
         """Return DN per second above the dark, (y, x)."""
-        rate = frame.mosaic - np.asarray(self._scale.dark.mean_dn, np.float32)
-        rate /= np.float32(_exposure_s(frame))
+        exposure_s = _exposure_s(frame)
+        dark = dark_at(self._scale.darks, exposure_s)
+        rate = frame.mosaic - np.asarray(dark.mean_dn, np.float32)
+        rate /= np.float32(exposure_s)
         return rate
 
     def _of_shots(self) -> tuple[list[int], ImagingMatrix]:
@@ -211,7 +214,7 @@ class LiveLightField:
         for place, shot in enumerate(shots):
             held = self._held[shot]
             linear = fuse(
-                [held.mosaic], [_exposure_s(held)], scale.dark, scale.gain, held.white_level_dn
+                [held.mosaic], [_exposure_s(held)], scale.darks, scale.gain, held.white_level_dn
             )
             seen = scale.white_dn_per_s[shot] > 0
             white = np.where(seen, scale.white_dn_per_s[shot], 1.0)

@@ -49,7 +49,7 @@ def open_scale(place: Path) -> Scale:
         raise AppError(f"{file}: does not fit the {CALIBRATION} beside it; calibrate again")
     dark = MeanFrame(dark_dn, gain.dark_variance_dn2, MANY, 0.0)
     everywhere = np.ones(dark_dn.shape, dtype=bool)
-    return Scale(psi, white, dark, gain, everywhere if good is None else good)
+    return Scale(psi, white, (dark,), gain, everywhere if good is None else good)
 
 
 def designed_scale(psi: ImagingMatrix) -> Scale:
@@ -64,7 +64,7 @@ def designed_scale(psi: ImagingMatrix) -> Scale:
     return Scale(
         psi,
         white,
-        MeanFrame(black, read_variance, MANY, 0.0),
+        (MeanFrame(black, read_variance, MANY, 0.0),),
         SensorGain(noise.gain_dn_per_electron, read_variance),
         np.ones(shape, dtype=bool),
     )

@@ -26,7 +26,7 @@ from calibration.errors import CalibrationError
 from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file
-from emmc_rig.session.readings import decoded, fused_shot, mean_dark, shot_frames, whiteboards
+from emmc_rig.session.readings import decoded, fused_shot, session_darks, shot_frames, whiteboards
 from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
@@ -149,7 +149,7 @@ def _fused(session: Session, entry: Group) -> None:
     shots = shot_frames(session)
     if not shots or not any(frame.kind == "dark" for frame in session.frames):
         return
-    dark = mean_dark(session)
+    darks = session_darks(session)
     gain = None
     with suppress(AppError, CalibrationError):
         boards = whiteboards(session)
@@ -157,13 +157,13 @@ def _fused(session: Session, entry: Group) -> None:
     if gain is None:
         return
     group = _group(entry, "fused", "NXdata", signal="data", axes=["shot", ".", "."])
-    shape = (len(shots), *dark.mean_dn.shape)
+    shape = (len(shots), *darks[0].mean_dn.shape)
     data = group.create_dataset("data", shape, np.float32)
     errors = group.create_dataset("data_errors", shape, np.float32)
     usable = group.create_dataset("usable", shape, bool)
     data.attrs["units"] = errors.attrs["units"] = "DN/s"
     for place, frames in enumerate(shots.values()):
-        linear = fused_shot(session, frames, dark, gain)
+        linear = fused_shot(session, frames, darks, gain)
         data[place], errors[place] = linear.dn_per_s, np.sqrt(linear.variance)
         usable[place] = linear.usable
     group["shot"] = list(shots)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.frames import DARK_ELECTRONS_PER_S, dark_current_known
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.session import Session
 from reconstruction.verdict.rules import Reason
@@ -21,18 +22,22 @@ half of what metering aims at."""
 OVEREXPOSED = 0.001
 """Share of the readings that are saturated by every exposure: the rest of 99.9 %, by which frames
 are metered."""
+DARK_SHARE = 0.005
+"""Of the brightest reading: twice what a good calibration is off by."""
 
 
 @dataclass(frozen=True)
 class ShotExposure:
     """Of one shot: how bright its brightest readings are, and the share that no exposure holds.
 
-    level: 1 at white, by its longest exposure. saturated: by its shortest.
+    level: 1 at white, by its longest exposure. saturated: by its shortest. dark_share: of its
+    brightest readings, what a dark current of DARK_ELECTRONS_PER_S adds that no dark frame shows.
     """
 
     shot: int
     level: float
     saturated: float
+    dark_share: float = 0.0
 
     @property
     def factor(self) -> float:
@@ -47,7 +52,26 @@ def shot_exposures(session: Session) -> list[ShotExposure]:
         entry = session.stored.get(frame.id)
         if frame.kind == "shot" and entry is not None:
             frames[frame.bench.shot].append(entry)
-    return [_of_shot(shot, entries) for shot, entries in sorted(frames.items())]
+    darks_s = [
+        float(session.stored[frame.id]["exposure_s"])
+        for frame in session.frames
+        if frame.kind == "dark" and frame.id in session.stored
+    ]
+    gain = session.camera["sensor"]["noise"]["gain_dn_per_electron"]
+    return [
+        replace(_of_shot(shot, entries), dark_share=_dark_share(entries, darks_s, gain))
+        for shot, entries in sorted(frames.items())
+    ]
+
+
+def _dark_share(entries: Sequence[Entry], darks_s: Sequence[float], gain: float) -> float:
+    """Return `ShotExposure.dark_share`; gain: DN per electron. 0 without any dark."""
+    longest = max(entries, key=lambda one: one["exposure_s"])
+    exposure_s = float(longest["exposure_s"])
+    if not darks_s or dark_current_known(darks_s, exposure_s):
+        return 0.0
+    unknown_dn = gain * DARK_ELECTRONS_PER_S * abs(exposure_s - darks_s[0])
+    return unknown_dn / max(longest["figures"]["bright_dn"], 1.0)
 
 
 def _of_shot(shot: int, entries: Sequence[Entry]) -> ShotExposure:
@@ -89,6 +113,19 @@ def exposure_reasons(shots: Sequence[ShotExposure], gain_db: float | None = None
                 "by every exposure",
                 worst.saturated,
                 "add a shorter exposure, or write exposure_s: auto",
+                "doubt",
+            )
+        )
+    unknown = [one for one in shots if one.dark_share > DARK_SHARE]
+    if unknown:
+        worst = max(unknown, key=lambda one: one.dark_share)
+        found.append(
+            Reason(
+                f"no dark frame is exposed as long as {_shots(worst, unknown)}: a dark current of "
+                f"{DARK_ELECTRONS_PER_S:g} electrons/s, which would not be seen, is "
+                f"{worst.dark_share:.1%} of the brightest reading",
+                worst.dark_share,
+                "take darks of the shots too (`darks: {of_shots: 4}`)",
                 "doubt",
             )
         )

@@ -21,6 +21,9 @@ KINDS: tuple[Kind, ...] = (
     "shot",
 )
 
+SHOT_DARK = "dark-shot"
+"""How ids of darks begin that are exposed as the shots are."""
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -73,6 +76,16 @@ class PlannedFrame:
     def is_metered_shot(self) -> bool:
         """Whether it shows the scene, exposed as metering asks for."""
         return self.kind == "shot" and self.exposure_s is None
+
+    @property
+    def is_exposed_as_shots(self) -> bool:
+        """Whether it is a metered shot of the scene, or a dark of one."""
+        return self.exposure_s is None and self.bench.target == "scene"
+
+    @property
+    def is_dark_of_shots(self) -> bool:
+        """Whether it is a dark for the shots of the scene alone."""
+        return self.kind == "dark" and self.id.startswith(SHOT_DARK)
 
     @property
     def is_optional(self) -> bool:

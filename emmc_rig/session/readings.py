@@ -56,12 +56,13 @@ class SessionReadings:
 class Scale:
     """What turns a session's frames into readings, of every planned shot, taken or not.
 
-    white_dn_per_s: (shot, y, x), what a reading of 1 gives. good: (y, x), pixels to use at all.
+    white_dn_per_s: (shot, y, x), what a reading of 1 gives. darks: of one exposure or
+    more. good: (y, x), pixels to use at all.
     """
 
     psi: ImagingMatrix
     white_dn_per_s: NDArray[np.floating]
-    dark: MeanFrame
+    darks: tuple[MeanFrame, ...]
     gain: SensorGain
     good: NDArray[np.bool_]
 
@@ -140,7 +141,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     references = {key: _mean(session, frames) for key, frames in _references(session).items()}
     # The white lamp's first: the sensor's gain follows from it.
     references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
-    darks = _board_darks(session)
+    darks = session_darks(session, of_shots=False)
     every = BoardSet(darks, references, ())
     checks = tuple(_checks(session, every, channels))
     few = [*found["open"], *(found["whiteboard"] if found["open"] else ())]
@@ -190,7 +191,7 @@ def stage_frames(session: Session) -> tuple[list[PlannedFrame], BoardSet]:
         BoardFrame(partial(_mean, session, [one]), 1, _stage_um(one), window=one.window)
         for one in planned
     )
-    return planned, BoardSet(_board_darks(session), references, boards)
+    return planned, BoardSet(session_darks(session, of_shots=False), references, boards)
 
 
 def _stage_um(frame: PlannedFrame) -> tuple[float, float]:
@@ -207,10 +208,15 @@ def _references(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
     return found
 
 
-def _board_darks(session: Session) -> tuple[MeanFrame, ...]:
-    """Return the darks of each exposure; those taken before and after the whiteboards as one."""
+def session_darks(session: Session, of_shots: bool = True) -> tuple[MeanFrame, ...]:
+    """Return the darks of each exposure; those taken before and after the whiteboards as one.
+
+    of_shots: those too that were taken for the shots of the scene.
+    """
     groups: dict[tuple[float, int], list[PlannedFrame]] = defaultdict(list)
     for frame in _darks(session):
+        if frame.is_dark_of_shots and not of_shots:
+            continue
         groups[_exposure_s(session, frame), frame.part].append(frame)
     found: dict[float, MeanFrame] = {}
     for (exposure_s, _), frames in sorted(groups.items()):
@@ -259,7 +265,7 @@ def _by_exposure(
 
 def mean_dark(session: Session) -> MeanFrame:
     """Return the average of the dark frames of the shortest exposure; raises AppError."""
-    return min(_board_darks(session), key=lambda frame: frame.exposure_s)
+    return min(session_darks(session, of_shots=False), key=lambda frame: frame.exposure_s)
 
 
 def _darks(session: Session) -> list[PlannedFrame]:
@@ -331,7 +337,10 @@ def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
 
 
 def fused_shot(
-    session: Session, frames: list[PlannedFrame], dark: MeanFrame, gain: SensorGain
+    session: Session,
+    frames: list[PlannedFrame],
+    darks: Sequence[MeanFrame],
+    gain: SensorGain,
 ) -> LinearFrame:
     """Return a shot's bracket as one linear frame, at a gain of 1."""
     mosaics, exposures_s, white_dn = [], [], 0
@@ -344,18 +353,21 @@ def fused_shot(
         raise AppError(f"{session.folder}: the gain differs within one shot; plan it alike")
     factor = amplified.pop()
     if factor == 1:
-        return fuse(mosaics, exposures_s, dark, gain, white_dn)
+        return fuse(mosaics, exposures_s, darks, gain, white_dn)
     # The signal above the black grows with the gain, its shot noise per DN too.
     amplified_gain = SensorGain(
         gain.gain_dn_per_electron * factor, gain.dark_variance_dn2 * factor**2
     )
     black = np.mean(session.stored[frames[0].id]["black_level_dn"])
-    lifted = MeanFrame(
-        (black + factor * (dark.mean_dn - black)).astype(np.float32),
-        dark.variance_dn2 * factor**2,
-        dark.count,
-        dark.exposure_s,
-    )
+    lifted = [
+        replace(
+            dark,
+            mean_dn=(black + factor * (dark.mean_dn - black)).astype(np.float32),
+            variance_dn2=dark.variance_dn2 * factor**2,
+            extra_variance_dn2=dark.extra_variance_dn2 * factor**2,
+        )
+        for dark in darks
+    ]
     fused = fuse(mosaics, exposures_s, lifted, amplified_gain, white_dn)
     return LinearFrame(fused.dn_per_s / factor, fused.variance / factor**2, fused.usable)
 
@@ -465,18 +477,18 @@ def session_scale(session: Session) -> Scale:
     Without whiteboards it is the designed Psi and the camera's own noise model, which is coarser.
     Raises AppError or CalibrationError.
     """
-    dark = mean_dark(session)
+    darks, dark = session_darks(session), mean_dark(session)
     if any(frame.kind in ("whiteboard", "open") for frame in session.frames):
         known = session_calibration(session)
         good = np.ones(dark.mean_dn.shape, dtype=bool) if known.good is None else known.good
-        return Scale(known.psi, known.white_dn_per_s, dark, known.gain, good)
+        return Scale(known.psi, known.white_dn_per_s, darks, known.gain, good)
     camera = camera_of(session)
     noise = camera.sensor.noise
     psi = designed_psi(session, dark)
     per_second = noise.gain_dn_per_electron * noise.electrons_per_s
     white = per_second * pixel_light(camera, psi.size)
     gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
-    return Scale(psi, white, dark, gain, np.ones(dark.mean_dn.shape, dtype=bool))
+    return Scale(psi, white, darks, gain, np.ones(dark.mean_dn.shape, dtype=bool))
 
 
 def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> SessionReadings:
@@ -488,7 +500,7 @@ def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> Ses
     variance = np.empty(psi.frames_shape, dtype=np.float32)
     usable = np.empty(psi.frames_shape, dtype=bool)
     for place, shot in enumerate(shots):
-        linear = fused_shot(session, frames[shot], scale.dark, scale.gain)
+        linear = fused_shot(session, frames[shot], scale.darks, scale.gain)
         seen = scale.white_dn_per_s[shot] > 0
         white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
         readings[place] = linear.dn_per_s / white
