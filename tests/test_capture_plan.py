@@ -13,6 +13,7 @@ from emmc_rig.capture.new_plan import new_plan
 from emmc_rig.capture.order import ordered, travel_um
 from emmc_rig.capture.plan import (
     Boards,
+    Darks,
     OpenBoard,
     Plan,
     differences,
@@ -176,6 +177,7 @@ def test_sizes_are_shown_for_people():
         ({"shots": [{"mask_um": [1, 2], "mask_cells": [1, 2]}]}, "not both"),
         ({"shots": [{"lamp": "purple"}]}, "'white'"),
         ({"order": "fastest"}, "least-travel"),
+        ({"darks": {"of_shots": 1}}, "0, or 2 or more"),
         ({"darks": {"repeats": 1}}, "greater than or equal to 2"),
     ],
 )
@@ -218,6 +220,26 @@ def test_the_schema_that_is_shipped_is_that_of_the_plan():
     assert plan_schema()["properties"]["shots"]["minItems"] == 1
 
 
+@pytest.mark.parametrize("order", ["as-planned", "least-travel"])
+def test_darks_of_the_shots_come_after_the_scene_is_metered_and_before_the_first_shot(order):
+    plan = plan_of(
+        shots=[{"exposure_s": "auto"}, {"exposure_s": [0.5, 3.0]}, {"exposure_s": "auto"}],
+        darks={"of_shots": 2},
+    )
+    frames = ordered(frames_of(plan), order)
+    places = {frame.id: place for place, frame in enumerate(frames)}
+    darks = [frame for frame in frames if frame.is_dark_of_shots]
+    assert (
+        sorted((frame.exposure_s, frame.metered_by) for frame in darks if frame.exposure_s)
+        == [(3.0, None)] * 2
+    )
+    (meter,) = {frame.metered_by for frame in darks if frame.exposure_s is None}
+    first_shot = min(place for name, place in places.items() if name.startswith("shot-"))
+    for frame in darks:
+        assert places[frame.id] < first_shot
+        assert frame.exposure_s is not None or places[meter] < places[frame.id]
+
+
 @pytest.mark.parametrize("name", list(shipped_cameras()))
 def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     camera = find_camera(name)
@@ -226,7 +248,9 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     plan = load_plan(path)
     assert planned_camera(plan).shots == camera.shots
     boards = Boards(open=(OpenBoard(held_out=True),))
-    assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards) == plan
+    # Older plans, which do not name them, are expanded as before.
+    darks = Darks(of_shots=4)
+    assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards, darks=darks) == plan
     assert exposures_s(plan, camera) == [None] * len(camera.shots)  # metered
 
 
