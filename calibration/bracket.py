@@ -121,8 +121,8 @@ def _used(
     unclipped: list[NDArray[np.bool_]],
     times_s: Array,
     gain: SensorGain,
-    room_dn: list[Array],
-    current_dn: list[Array],
+    room_dn: Sequence[Array],
+    current_dn: Sequence[Array],
 ) -> list[NDArray[np.bool_]]:
     """Return where each frame is used: the shortest where not clipped, others as foretold."""
     used = []
@@ -162,7 +162,7 @@ def _weights(
     used: list[NDArray[np.bool_]],
     times_s: Array,
     gain: SensorGain,
-    current_dn: list[Array],
+    current_dn: Sequence[Array],
 ) -> list[Array]:
     """Return the inverse variance of each frame's rate, 0 where it is not used."""
     return [

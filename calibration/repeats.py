@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,7 +59,6 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float, alike: float = ALI
     on it does.
     """
     # Half of what starting most commands takes.
-    from scipy.ndimage import label
     from scipy.signal import fftconvolve
 
     sides = np.array(cells.shape[:2])
@@ -79,12 +79,13 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float, alike: float = ALI
     product = sum(overlapped(plane, plane) for plane in np.moveaxis(middle, -1, 0))
     both = overlapped(energy, ones) + overlapped(ones, energy)
     likeness = 2 * product / np.maximum(both, 1e-9)
-    islands, count = label(likeness >= alike)
+    alike_enough = (likeness >= alike).astype(np.uint8)
+    count, islands = cv2.connectedComponents(alike_enough, connectivity=4)
     own = islands == islands[tuple(reach)]
     if own[0].any() or own[:, 0].any():
         return Repeats(uniform=True)
     peaks = []
-    for island in range(1, count + 1):
+    for island in range(1, count):
         at = np.unravel_index(np.argmax(np.where(islands == island, likeness, -1)), own.shape)
         y, x = (
             place + vertex(likeness.T if axis else likeness, at[::-1] if axis else at) - most
