@@ -11,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.errors import SceneError
+from emmc_rig.model.json_text import one_line, shown_path
 from emmc_rig.model.lightfield import check_light_field
-from emmc_rig.model.reading import one_line, shown_path
+from emmc_rig.model.reading import FREE_BYTES, MOST_COMPRESSED
 
 ENDING = ".zarr"
 MISSING_BYTE = 255
 CHUNK, SHARD = 128, 512
 """Samples a side of what is read at once, and of one file."""
+
+_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError)
 
 Place = tuple[slice, slice]
 
@@ -93,8 +97,8 @@ def save_arrays(folder: Path, arrays: Mapping[str, NDArray]) -> None:
 class StoredGroup:
     """The arrays of a Zarr group, read as `emmc_rig.model.reading.StoredArrays` are."""
 
-    def __init__(self, group: Any) -> None:
-        self._group, self.attributes = group, group.attrs
+    def __init__(self, group: Any, folder: Path) -> None:
+        self._group, self._folder, self.attributes = group, folder, group.attrs
 
     def __contains__(self, name: str) -> bool:
         return name in self._group
@@ -104,8 +108,17 @@ class StoredGroup:
         return self._group[name]
 
     def array(self, name: str) -> NDArray:
-        """Return an array, all of it."""
-        return np.asarray(self._group[name][...])
+        """Return an array, all of it; raises ValueError where its files cannot hold so much."""
+        found = self._group[name]
+        check_fits(found.nbytes, self._folder)
+        return np.asarray(found[...])
+
+
+def check_fits(unpacked_bytes: int, folder: Path) -> None:
+    """Raise ValueError for an array of more bytes than a folder's files may unpack to."""
+    size_bytes = sum(path.stat().st_size for path in folder.rglob("*"))
+    if unpacked_bytes > MOST_COMPRESSED * size_bytes + FREE_BYTES:
+        raise ValueError(f"an array of {unpacked_bytes:.3g} bytes does not fit into its files")
 
 
 @contextmanager
@@ -113,10 +126,10 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
     """Yield the arrays of a group; raises `error` where one is not there, AppError without Zarr."""
     zarr = _zarr()
     try:
-        yield StoredGroup(zarr.open_group(folder, mode="r"))
+        yield StoredGroup(zarr.open_group(folder, mode="r"), folder)
     except error:
         raise
-    except (OSError, KeyError, ValueError, TypeError) as fault:
+    except _FAULTS as fault:
         why = f"no Zarr group, damaged or incomplete ({one_line(fault)})"
         raise error(f"{shown_path(folder)}: {why}; {remedy}") from fault
 
@@ -126,7 +139,7 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
     zarr = _zarr()
     try:
         found = zarr.open_group(folder, mode=mode)[name]
-    except (OSError, KeyError, ValueError, TypeError) as fault:
+    except _FAULTS as fault:
         raise AppError(
             f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
         ) from fault
@@ -135,5 +148,10 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
 
 def load_light_field(folder: Path) -> NDArray[np.float32]:
     """Return the array `light_field` of a group, all of it; raises AppError or SceneError."""
-    found = np.asarray(opened_array(folder, "light_field")[...])
+    stored = opened_array(folder, "light_field")
+    try:
+        check_fits(stored.nbytes, folder)
+        found = np.asarray(stored[...])
+    except _FAULTS as fault:
+        raise SceneError(f"{shown_path(folder)}: damaged ({one_line(fault)})") from fault
     return check_light_field(found, shown_path(folder)).astype(np.float32)

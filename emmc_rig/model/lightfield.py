@@ -6,7 +6,6 @@ view is at x + disparity (u - U // 2) in view u, and likewise along (v, y). Pict
 linear values themselves, with no gamma.
 """
 
-import contextlib
 import os
 import re
 from collections.abc import Mapping
@@ -19,11 +18,13 @@ import numpy as np
 
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
-from emmc_rig.model.reading import check_png_size, one_line, stored_arrays
+from emmc_rig.model.reading import decode_picture, one_line, stored_arrays
 
 _DATASET = "light_field"
 _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_MOST_VIEWS = 10_000
+"""In a grid of which most are missing; what asks for more is another number, such as a time."""
+_PNG_START = b"\x89PNG\r\n\x1a\n"
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -53,7 +54,7 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
         raise SceneError(f"{source}: values are {lf.dtype}, needs floating values in [0, 1]")
     if not (lf.min() >= 0 and lf.max() <= 1):
         wrong = ~((lf >= 0) & (lf <= 1))
-        v, u, y, x, c = (int(i[0]) for i in np.nonzero(wrong))
+        v, u, y, x, c = (int(i) for i in np.unravel_index(wrong.argmax(), lf.shape))
         raise SceneError(
             f"{source}: {np.count_nonzero(wrong)} samples are not in [0, 1], the first "
             f"{lf[v, u, y, x, c]:.4g} at view ({v}, {u}), y {y}, x {x}, colour {c}"
@@ -83,17 +84,7 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
             paths[place] = path
     if not paths:
         raise SceneError(f"{folder}: no views; they are named view_ROW_COL.png")
-    rows, columns = (
-        range(min(place[k] for place in paths), max(place[k] for place in paths) + 1)
-        for k in (0, 1)
-    )
-    missing = [f"view_{r}_{c}.png" for r in rows for c in columns if (r, c) not in paths]
-    if missing:
-        rest = f" and {len(missing) - 6} more" if len(missing) > 6 else ""
-        raise SceneError(
-            f"{folder}: {len(missing)} of {len(rows)}x{len(columns)} views missing: "
-            f"{', '.join(missing[:6])}{rest}"
-        )
+    rows, columns = grid_of_views(paths, folder, SceneError)
     with ThreadPoolExecutor() as pool:
         views = list(pool.map(read_picture, (paths[r, c] for r in rows for c in columns)))
     for path, view in zip((paths[r, c] for r in rows for c in columns), views, strict=True):
@@ -104,6 +95,38 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
             )
     lf = np.stack(views).reshape(len(rows), len(columns), *views[0].shape)
     return check_light_field(lf, str(folder))
+
+
+def grid_of_views(
+    paths: Mapping[tuple[int, int], Path], folder: Path, error: type[Exception]
+) -> tuple[range, range]:
+    """Return the rows and columns of views that files make; raises `error` where one is missing.
+
+    paths: by row and column, from any first ones on.
+    """
+    rows, columns = (
+        range(min(place[k] for place in paths), max(place[k] for place in paths) + 1)
+        for k in (0, 1)
+    )
+    count = len(rows) * len(columns)
+    if count > max(_MOST_VIEWS, 4 * len(paths)):
+        middle = np.median(list(paths), axis=0)
+        odd = max(paths, key=lambda place: np.abs(place - middle).sum())
+        raise error(
+            f"{folder}: {len(paths)} views do not fill {len(rows)}x{len(columns)}, as "
+            f"{paths[odd].name} asks for; names are view_ROW_COL, rows and columns counted from "
+            "0: rename it or move it away"
+        )
+    if len(paths) < count:
+        places = ((row, column) for row in rows for column in columns)
+        ending = next(iter(paths.values())).suffix
+        missing = [f"view_{r}_{c}{ending}" for r, c in places if (r, c) not in paths]
+        rest = f" and {len(missing) - 6} more" if len(missing) > 6 else ""
+        raise error(
+            f"{folder}: {len(missing)} of {len(rows)}x{len(columns)} views missing: "
+            f"{', '.join(missing[:6])}{rest}"
+        )
+    return rows, columns
 
 
 def save_views(folder: str | os.PathLike, lf: np.ndarray) -> None:
@@ -144,7 +167,9 @@ def load_hdf5(path: str | os.PathLike) -> np.ndarray:
             raise SceneError(f"{path}: no dataset '{_DATASET}'; it holds {held}")
         lf = stored.array(_DATASET)
     if lf.dtype in (np.uint8, np.uint16):
-        lf = lf.astype(np.float32) / np.iinfo(lf.dtype).max
+        full_scale = np.iinfo(lf.dtype).max
+        lf = lf.astype(np.float32)
+        lf /= full_scale
     return check_light_field(lf, str(path))
 
 
@@ -416,22 +441,16 @@ def read_picture(path: Path) -> np.ndarray:
     content = path.read_bytes()
     if not content.startswith(_PNG_START):
         raise SceneError(f"{path}: not a PNG picture")
-    check_png_size(content, str(path), SceneError)
-    codes = None
-    # OpenCV prints its own complaint about a file that is cut short: see that it has an end first.
-    if _PNG_END in content[-32:]:
-        with contextlib.suppress(cv2.error):
-            codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if codes is None:
-        raise SceneError(f"{path}: a PNG picture cut short or damaged; copy it again")
+    codes = decode_picture(content, str(path), SceneError)
     full_scale = 255 if codes.dtype == np.uint8 else 65535
     if codes.ndim == 3 and codes.shape[2] == 4:
         if np.any(codes[..., 3] != full_scale):
             raise SceneError(f"{path}: partly transparent; save it without an alpha channel")
         codes = codes[..., :3]
-    if codes.ndim == 2:
-        codes = np.repeat(codes[..., np.newaxis], 3, axis=2)
-    return codes[..., ::-1].astype(np.float32) / full_scale
+    picture = np.empty((*codes.shape[:2], 3), np.float32)
+    picture[...] = codes[..., ::-1] if codes.ndim == 3 else codes[..., np.newaxis]
+    picture /= full_scale
+    return picture
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:

@@ -7,17 +7,15 @@ shows frame s in shot s. Reference numbers are those of the paper.
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from emmc_rig.model.errors import CameraError
-from emmc_rig.model.reading import check_png_size
+from emmc_rig.model.reading import decode_picture
 from emmc_rig.model.settings import Settings
 
 FILTERS = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": (1, 1, 1)}
@@ -321,15 +319,14 @@ class Picture(Pattern):
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the picture scaled to [0, 1]; raises CameraError when it cannot be read."""
-        picture = None
-        with contextlib.suppress(cv2.error, OSError, ValueError):
+        source = f"mask picture {self.path}"
+        try:
             content = self.path.read_bytes()
-            check_png_size(content, f"mask picture {self.path}", CameraError)
-            picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if picture is None:
-            raise CameraError(f"mask picture {self.path}: no such file, or not a picture")
+        except (OSError, ValueError) as fault:
+            raise CameraError(f"{source}: no such file, or not a picture") from fault
+        picture = decode_picture(content, source, CameraError)
         if picture.dtype not in (np.uint8, np.uint16):
-            raise CameraError(f"mask picture {self.path}: use 8 or 16 bits a channel")
+            raise CameraError(f"{source}: use 8 or 16 bits a channel")
         grey = picture.ndim == 2
         levels = picture.astype(np.float64) / np.iinfo(picture.dtype).max
         cells = _grey(levels) if grey else levels[:, :, 2::-1].astype(np.float32)

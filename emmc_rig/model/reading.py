@@ -1,12 +1,16 @@
-"""Files from outside as plain data: YAML, JSON, HDF5 and PNG, bounded in depth and memory.
+"""Files from outside as plain data: YAML, HDF5 and pictures, bounded in depth and memory.
 
-Whatever is wrong with a file raises the caller's error with one line that names the file.
+Whatever is wrong with a file raises the caller's error with one line that names the file. No other
+module calls these decoders, nor JSON's beside `json_text`: `tests/test_decoders.py` says so.
 """
 
 from __future__ import annotations
 
-import json
+import io
+import math
 import struct
+import warnings
+import zlib
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,18 +21,35 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-MOST_YAML_BYTES, MOST_VALUES = 16_000_000, 1_000_000
-"""Of a file of settings, and of the values in it with aliases written out: a plan of a thousand
-shots has a hundredth of either."""
+from emmc_rig.model.json_text import one_line, shown_path
+
+MOST_YAML_BYTES, MOST_VALUES, MOST_NESTED = 1_000_000, 1_000_000, 100
+"""Of a file of settings, of the values in it with aliases written out, and of lists within lists: a
+plan of a thousand shots has 160 kB, 10,000 values and 6 within one another."""
+LONGEST_NUMBER = 4000
+"""In characters; the time for one in base 60 grows with the square of its length."""
 MOST_PICTURE_PIXELS = 2**28
-MOST_COMPRESSED, FREE_BYTES = 1100, 2**26
-"""How many times its file a data set may be: deflate packs 1,032 equal bytes into one. And the
-bytes that even a nearly empty file may unfold to."""
-_PNG_START, _PNG_HEADER = b"\x89PNG\r\n\x1a\n", struct.Struct(">8s4x4sII")
-_FAULTS = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError)
+MOST_DEFLATED = 1032
+"""How many equal bytes deflate packs into one (RFC 1951: 258 bytes in 2 bits)."""
+MOST_COMPRESSED, FREE_BYTES, FREE_PICTURE_BYTES = 100, 2**26, 2**30
+"""How many times its file a data set may be, and the bytes that even a nearly empty file may hold
+unpacked: light fields pack to a tenth, even maps by lzf to a ninetieth. A picture, as float32, may
+be more, since masks have large even areas: 89 megapixels, or MOST_DEFLATED times its file."""
+_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
+_FILTERS = frozenset((_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF))
+"""Filters of HDF5 whose memory a chunk's size bounds; others allocate what the file says."""
+_PNG_START, _PNG_HEADER = b"\x89PNG\r\n\x1a\n", struct.Struct(">IIBBBBB")
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+_PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+"""By colour type. Source: PNG 1.2, table 11.1 (the channels, and the depths allowed)."""
+_OTHER_PICTURES = ("BMP", "GIF", "JPEG", "JPEG2000", "PPM", "TIFF", "WEBP")
+_FAULTS = (
+    *(OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
+    MemoryError,
+)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
     """YAML's safe types; a key given twice is refused instead of overwritten."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -58,18 +79,13 @@ def read_yaml(path: Path, error: type[Exception]) -> object:
     return parse_yaml(data, name, error)
 
 
-def shown_path(path: Path) -> str:
-    """Return a path on one line: control characters escaped, no longer than a name can be."""
-    text = "".join(one if one.isprintable() else repr(one)[1:-1] for one in str(path))
-    return text if len(text) <= 300 else f"{text[:300]}..."
-
-
 def parse_yaml(data: bytes | str, source: str, error: type[Exception]) -> object:
     """Return the content of YAML; raises `error` naming `source`."""
     if len(data) > MOST_YAML_BYTES:
         raise error(f"{source}: larger than {MOST_YAML_BYTES // 1_000_000} MB: not settings")
     try:
         text = data.decode("utf-8") if isinstance(data, bytes) else data
+        _check_nesting(text)
         content = yaml.load(text, _Loader)
     except UnicodeDecodeError as fault:
         raise error(f"{source}: not text in UTF-8 (byte {fault.start})") from fault
@@ -85,6 +101,25 @@ def parse_yaml(data: bytes | str, source: str, error: type[Exception]) -> object
     if _unfolded(content) > MOST_VALUES:
         raise error(f"{source}: more than {MOST_VALUES} values once its aliases are written out")
     return content
+
+
+def _check_nesting(text: str) -> None:
+    """Raise RecursionError for lists within lists, ValueError for numbers too long to be any.
+
+    libyaml's loader nests on the machine's stack, and would end the program.
+    """
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.ScalarEvent):
+            plain = event.implicit[0] and len(event.value) > LONGEST_NUMBER
+            if plain and event.value.lstrip("+-")[:1].isdigit():
+                raise ValueError(f"a number of {len(event.value)} characters")
+        if depth > MOST_NESTED:
+            raise RecursionError
 
 
 def _unfolded(content: object) -> float:
@@ -105,22 +140,13 @@ def _unfolded(content: object) -> float:
     return counted.get(id(content), 1)
 
 
-def parse_json(data: bytes | str, source: str, error: type[Exception]) -> Any:
-    """Return the content of JSON; raises `error` naming `source`."""
-    try:
-        return json.loads(data)
-    except RecursionError as fault:
-        raise error(f"{source}: nested too deeply") from fault
-    except ValueError as fault:
-        raise error(f"{source}: not JSON ({one_line(fault)})") from fault
-
-
 class StoredArrays:
     """The data sets of an open HDF5 file: in the file itself, and no larger than it can hold."""
 
     def __init__(self, file: h5py.File, size_bytes: int) -> None:
         self.file = file
         self.attributes = file.attrs
+        self._size_bytes = size_bytes
         self._most_bytes = MOST_COMPRESSED * size_bytes + FREE_BYTES
 
     def __contains__(self, name: str) -> bool:
@@ -138,7 +164,36 @@ class StoredArrays:
             raise ValueError(f"'{name}' lies in other files")
         if found.nbytes > self._most_bytes:
             raise ValueError(f"'{name}' of {found.nbytes:.3g} bytes does not fit into its file")
+        if found.chunks is not None:
+            self._check_chunks(name, found)
         return found
+
+    def _check_chunks(self, name: str, found: h5py.Dataset) -> None:
+        """Raise ValueError where reading a chunk may take more memory than a data set may."""
+        chunk_bytes = math.prod(found.chunks) * found.dtype.itemsize
+        if chunk_bytes > self._most_bytes:
+            raise ValueError(
+                f"'{name}' has chunks of {chunk_bytes:.3g} bytes, which do not fit into its file"
+            )
+        made = found.id.get_create_plist()
+        filters = [made.get_filter(i)[0] for i in range(made.get_nfilters())]
+        if len(set(filters)) < len(filters) or not _FILTERS.issuperset(filters):
+            raise ValueError(f"'{name}' is packed in another way than by gzip or lzf, once")
+        chunks: list[Any] = []
+        if filters:
+            found.id.chunk_iter(chunks.append)
+        if any(chunk.size > self._size_bytes for chunk in chunks):
+            raise ValueError(f"'{name}' is cut short")
+        for chunk in chunks:
+            # HDF5 unpacks a chunk to its end, however long that is.
+            if _DEFLATE in filters and MOST_DEFLATED * chunk.size > self._most_bytes:
+                _, packed = found.id.read_direct_chunk(chunk.chunk_offset)
+                try:
+                    unpacked = zlib.decompressobj().decompress(packed, chunk_bytes + 5)
+                except zlib.error as fault:
+                    raise ValueError(f"'{name}' cannot be unpacked ({fault})") from fault
+                if len(unpacked) > chunk_bytes + 4:  # with a checksum
+                    raise ValueError(f"'{name}' has a chunk that unpacks to more than its size")
 
     def array(self, name: str) -> NDArray:
         """Return a data set of numbers or truths; raises KeyError or ValueError."""
@@ -178,16 +233,83 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
         raise error(f"{shown_path(path)}: {why}; {remedy}") from fault
 
 
-def check_png_size(content: bytes, source: str, error: type[Exception]) -> None:
-    """Raise `error` for a PNG whose header claims more pixels than a picture has."""
-    if len(content) < _PNG_HEADER.size:
-        return
-    start, chunk, columns, rows = _PNG_HEADER.unpack_from(content)
-    if start == _PNG_START and chunk == b"IHDR" and columns * rows > MOST_PICTURE_PIXELS:
+def holds_array(path: Path, name: str, form: str | None = None) -> bool:
+    """Return whether a path is HDF5 with a data set of that name, its `format` as given."""
+    try:
+        with stored_arrays(path, ValueError, "") as stored:
+            return stored.dataset(name) is not None and (
+                form is None or stored.attributes.get("format") == form
+            )
+    except ValueError:
+        return False
+
+
+def decode_picture(content: bytes, source: str, error: type[Exception]) -> NDArray:
+    """Return the codes of a picture file, (y, x) or (y, x, channel), blue first.
+
+    PNG is checked whole before it is decoded. Raises `error` for what is no picture, is damaged, or
+    claims more pixels than its bytes can hold.
+    """
+    import cv2  # a sixth of a second, which settings need not
+
+    if content.startswith(_PNG_START):
+        rows, columns = _png_size(content, source, error)
+    else:
+        rows, columns = _picture_size(content, source, error)
+    if rows * columns > MOST_PICTURE_PIXELS:
         raise error(f"{source}: {columns} x {rows} pixels, more than any picture here can have")
+    if 12 * rows * columns > MOST_DEFLATED * len(content) + FREE_PICTURE_BYTES:
+        raise error(f"{source}: {columns} x {rows} pixels, more than {len(content)} bytes can hold")
+    try:
+        codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError) as fault:
+        raise error(f"{source}: cannot be decoded ({one_line(fault)})") from fault
+    if codes is None:
+        raise error(f"{source}: a picture cut short or damaged; copy it again")
+    return np.asarray(codes)
 
 
-def one_line(fault: object) -> str:
-    """Return an error's message on one line, cut to a length."""
-    text = fault.args[0] if isinstance(fault, KeyError) and fault.args else fault
-    return " ".join(str(text).split())[:300]
+def _png_size(content: bytes, source: str, error: type[Exception]) -> tuple[int, int]:
+    """Return rows and columns; raises `error` unless header, checksums and length are right."""
+    damaged = error(f"{source}: a PNG picture cut short or damaged; copy it again")
+    place, header, data_bytes, name = len(_PNG_START), b"", 0, b""
+    while name != b"IEND":
+        length = int.from_bytes(content[place : place + 4], "big")
+        name, end = content[place + 4 : place + 8], place + 8 + length
+        if end + 4 > len(content):
+            raise damaged
+        chunk = memoryview(content)[place + 4 : end]
+        if zlib.crc32(chunk) != int.from_bytes(content[end : end + 4], "big"):
+            raise damaged
+        if not header:
+            header = bytes(chunk)
+        data_bytes += length if name == b"IDAT" else 0
+        place = end + 4
+    if header[:4] != b"IHDR" or len(header) != 4 + _PNG_HEADER.size:
+        raise damaged
+    columns, rows, depth, kind, packing, filtering, interlace = _PNG_HEADER.unpack(header[4:])
+    if depth not in _PNG_DEPTHS.get(kind, ()):
+        raise error(f"{source}: {depth} bits a sample of colour type {kind}, which no PNG has")
+    if packing or filtering or interlace > 1 or not columns or not rows:
+        raise damaged
+    unpacked_bytes = rows * math.ceil(columns * _PNG_CHANNELS[kind] * depth / 8)
+    if rows * columns <= MOST_PICTURE_PIXELS and unpacked_bytes > MOST_DEFLATED * data_bytes:
+        raise error(f"{source}: {columns} x {rows} pixels, more than {len(content)} bytes can hold")
+    return rows, columns
+
+
+def _picture_size(content: bytes, source: str, error: type[Exception]) -> tuple[int, int]:
+    """Return rows and columns of a picture that is no PNG, from its header alone."""
+    from PIL import Image
+
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(content), formats=_OTHER_PICTURES) as picture,
+        ):
+            columns, rows = picture.size
+    except Image.DecompressionBombError as fault:
+        raise error(f"{source}: {one_line(fault)}") from fault
+    except (SyntaxError, struct.error, *_FAULTS) as fault:
+        raise error(f"{source}: not a picture, or damaged") from fault
+    return rows, columns

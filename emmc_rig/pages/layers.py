@@ -14,7 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from emmc_rig.files.exports import IN_SESSION, LIGHT_FIELD, open_export
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import focus_disparities, refocus
+from emmc_rig.model.reading import holds_array
 from emmc_rig.model.sensing import FORMAT, ImagingMatrix
 from emmc_rig.model.srgb import srgb_of
 from emmc_rig.session.session import Session
@@ -137,16 +137,8 @@ def _readable(path: Path) -> bool:
     """Return whether a path is a session, a result, or HDF5 of a light field or a Psi."""
     if path.is_dir():
         return is_session(path) or (path / LIGHT_FIELD).is_file()
-    return path.suffix.lower() in HDF5 and (_is_psi(path) or _holds(path, "light_field"))
+    return path.suffix.lower() in HDF5 and (_is_psi(path) or holds_array(path, "light_field"))
 
 
 def _is_psi(path: Path) -> bool:
-    return path.suffix.lower() in HDF5 and _holds(path, "weights", FORMAT)
-
-
-def _holds(path: Path, name: str, form: str | None = None) -> bool:
-    try:
-        with h5py.File(path) as file:
-            return name in file and (form is None or file.attrs.get("format") == form)
-    except OSError:
-        return False
+    return path.suffix.lower() in HDF5 and holds_array(path, "weights", FORMAT)

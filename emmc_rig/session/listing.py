@@ -14,7 +14,8 @@ from pathlib import Path
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session, refuse_missing
 from emmc_rig.files.results import METRICS
-from emmc_rig.model.reading import parse_json, parse_yaml
+from emmc_rig.model.json_text import parse_json
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.session.decisions import ended, metered
 from emmc_rig.session.exposure import shot_exposures
 from emmc_rig.session.journal import heads

@@ -51,7 +51,7 @@ from emmc_rig.files.folders import (
 )
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
-from emmc_rig.model.reading import parse_json
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.session.decisions import metered, spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame

@@ -21,7 +21,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.lightfield import read_picture
 from emmc_rig.model.novel_view import centre_disparity
-from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.reading import holds_array, stored_arrays
 from emmc_rig.model.srgb import codes_of, linear_of, srgb_of
 
 PARAMETERS, DISPARITY = "parameters.cfg", "gt_disp_lowres.pfm"
@@ -79,10 +79,15 @@ def _read_folder(path: Path) -> Array:
         raise AppError(
             f"{path / PARAMETERS}: num_cams_x and num_cams_y cannot be read; copy it again"
         ) from fault
+    there = sum(1 for _ in path.glob("input_Cam*.png"))
+    if not 0 < rows * columns <= there:
+        raise AppError(
+            f"{path}: {there} files input_Cam###.png, but {PARAMETERS} says {rows}x{columns}"
+        )
     paths = [path / f"input_Cam{number:03}.png" for number in range(rows * columns)]
-    missing = [one.name for one in paths if not one.is_file()]
+    missing = next((one.name for one in paths if not one.is_file()), None)
     if missing:
-        raise AppError(f"{path}: {len(missing)} views are missing, the first {missing[0]}")
+        raise AppError(f"{path}: {missing} is missing; copy it again")
     views = [linear_of(read_picture(one)) for one in paths]
     if len({view.shape for view in views}) > 1:
         raise AppError(f"{path}: the views differ in size")
@@ -101,13 +106,7 @@ def _write_hdf5(folder: Path, export: Export) -> None:
 
 
 def _holds_hdf5(path: Path) -> bool:
-    if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
-        return False
-    try:
-        with h5py.File(path) as file:
-            return isinstance(file.get("LF"), h5py.Dataset)
-    except OSError:
-        return False
+    return path.suffix.lower() in (".h5", ".hdf5") and holds_array(path, "LF")
 
 
 def _read_hdf5(path: Path) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.io
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.child import read_in_child
 from emmc_rig.files.formats.format import Array, Export, Format, write_picture
 from emmc_rig.model.lightfield import read_picture
 from emmc_rig.model.srgb import codes_of, linear_of, srgb_of
@@ -39,9 +40,11 @@ def _holds_mat(path: Path) -> bool:
 
 def _read_mat(path: Path) -> Array:
     try:
-        pictures = scipy.io.loadmat(path, variable_names=["LF"])["LF"]
-    except Exception as fault:  # SciPy raises whatever it runs into
-        raise AppError(f"{path}: no MAT file of LFToolbox that holds LF; save it again") from fault
+        pictures = read_in_child("mat", [path])
+    except (OSError, ValueError) as fault:
+        raise AppError(
+            f"{path}: no MAT file of LFToolbox that holds LF ({fault}); save it again"
+        ) from fault
     if pictures.ndim != 5 or pictures.dtype not in (np.uint8, np.uint16):
         raise AppError(
             f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, not a light field"

@@ -13,6 +13,8 @@ import numpy as np
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.formats.format import Array, Export, Format, extra_module
+from emmc_rig.files.shards import check_fits
+from emmc_rig.model.json_text import parse_json
 
 NAME = "light_field.ome.zarr"
 SCALES = 3
@@ -28,7 +30,7 @@ def _write(folder: Path, export: Export) -> None:
     multiscales = ngff.to_multiscales(image, [{"y": s, "x": s} for s in scales])
     ngff.to_ngff_zarr(str(folder / NAME), multiscales, version="0.4")
     path = folder / NAME / ".zattrs"
-    attributes = json.loads(path.read_text())
+    attributes = parse_json(path.read_bytes(), path.name, AppError)
     attributes["emmc_rig"] = {"views": [rows, columns], "colour": "linear RGB, 1 is white"}
     path.write_text(json.dumps(attributes))
     # Where Zarr keeps its metadata together too, both must agree.
@@ -41,9 +43,10 @@ def _holds(path: Path) -> bool:
 
 def _read(path: Path) -> Array:
     try:
-        attributes = json.loads((path / ".zattrs").read_text())
+        attributes = parse_json((path / ".zattrs").read_bytes(), ".zattrs", ValueError)
         rows, columns = attributes["emmc_rig"]["views"]
         stored = extra_module("ngff_zarr", "OME-Zarr").from_ngff_zarr(str(path)).images[0].data
+        check_fits(stored.nbytes, path)
         data = np.asarray(stored, dtype=np.float32)
         return data.reshape(rows, columns, *data.shape[1:]).transpose(0, 1, 3, 4, 2)
     except (OSError, ValueError, KeyError, TypeError) as fault:

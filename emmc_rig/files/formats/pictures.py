@@ -10,14 +10,16 @@ import re
 import struct
 import zlib
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.files.child import read_in_child
 from emmc_rig.files.formats.format import Array, Export, Format, extra_module, write_picture
+from emmc_rig.model.lightfield import grid_of_views
 from emmc_rig.model.srgb import codes_of
 
 IHDR_END = 33
@@ -57,11 +59,6 @@ def _write_exr(folder: Path, export: Export) -> None:
             file.write(str(folder / f"view_{v}_{u}.exr"))
 
 
-def _read_exr(path: Path) -> NDArray:
-    with extra_module("OpenEXR", "EXR").File(str(path)) as file:
-        return file.channels()["RGB"].pixels
-
-
 def _views(path: Path, ending: str) -> dict[tuple[int, int], Path]:
     if not path.is_dir():
         return {}
@@ -75,17 +72,15 @@ def _holds(path: Path, ending: str) -> bool:
 
 def _read(path: Path, ending: str) -> Array:
     views = _views(path, ending)
-    rows, columns = (max(place[k] for place in views) + 1 for k in (0, 1))
-    missing = [place for place in np.ndindex(rows, columns) if place not in views]
-    if missing:
-        raise AppError(f"{path}: view_{missing[0][0]}_{missing[0][1]}.{ending} is missing")
-    read = tifffile.imread if ending == "tif" else _read_exr
+    rows, columns = grid_of_views(views, path, AppError)
+    if ending == "exr":
+        extra_module("OpenEXR", "EXR")
     try:
-        pictures = [read(views[place]) for place in np.ndindex(rows, columns)]
-        stacked = np.stack(pictures).astype(np.float32)
-    except (OSError, ValueError, KeyError, RuntimeError, tifffile.TiffFileError) as fault:
+        pictures = read_in_child(ending, [views[place] for place in product(rows, columns)])
+        stacked = pictures.astype(np.float32)
+    except (OSError, ValueError, TypeError) as fault:
         raise AppError(f"{path}: views cannot be read ({fault}); copy them again") from fault
-    return stacked.reshape(rows, columns, *stacked.shape[1:])
+    return stacked.reshape(len(rows), len(columns), *stacked.shape[1:])
 
 
 FORMATS = (
