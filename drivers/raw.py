@@ -3,7 +3,6 @@
 import hashlib
 import io
 import math
-import struct
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -79,18 +78,6 @@ RW2_PIXELS_PER_BLOCK = {
 """By raw format (0x2D) and bits (0x0A) of a Panasonic: pixels in a block of 16 bytes (LibRaw,
 panasonic_load_raw, panasonicC6_load_raw, panasonicC7_load_raw)."""
 
-_DAMAGED = (
-    tifffile.TiffFileError,
-    struct.error,
-    ValueError,
-    LookupError,
-    TypeError,
-    ArithmeticError,
-    AttributeError,
-    MemoryError,
-)
-"""What tifffile and rawpy raise for values in a damaged file that they did not expect."""
-
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
@@ -136,8 +123,8 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
     tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
     with hashed(data) as digest:
         mosaic, black_level_dn, white_level_dn, cfa = tags.pixels or decode_by_libraw(data)
-    if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
-        raise RawFrameError("it holds colour or floating-point pixels, not one mosaic of 16 bits")
+    if mosaic.dtype != np.uint16:
+        raise RawFrameError("it holds floating-point pixels, not one mosaic of 16 bits")
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
         raise RawFrameError(
             f"it has {_size(mosaic.shape)} pixels (y x) instead of {_size(expected_shape)}"
@@ -179,13 +166,21 @@ def decode_by_libraw(data: bytes) -> tuple[Array, Array, int, str]:
     """Return mosaic, black levels `(2, 2)`, white level and phase; raises `RawFrameError`."""
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
+            # Opened, not unpacked: LibRaw takes memory for what the file claims.
+            claimed = raw.sizes.raw_height, raw.sizes.raw_width
+            if 8 * len(data) < FEWEST_BITS_PER_PIXEL * math.prod(claimed):
+                raise RawFrameError(
+                    f"its {len(data)} bytes cannot hold {_size(claimed)} pixels (y x)"
+                )
             mosaic = raw.raw_image_visible.copy()
+            if mosaic.ndim != 2:
+                raise RawFrameError("it holds colour pixels, not one mosaic")
             black_level_dn, cfa = _read_levels_and_phase(raw)
             white_level_dn = int(raw.white_level)
-    except (rawpy.LibRawError, NotImplementedError, *_DAMAGED) as error:
+    except RawFrameError:
+        raise
+    except Exception as error:  # rawpy raises bare RuntimeErrors too, and what NumPy does
         raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
-    if 8 * len(data) < FEWEST_BITS_PER_PIXEL * mosaic.size:
-        raise RawFrameError(f"its {len(data)} bytes cannot hold {_size(mosaic.shape)} pixels (y x)")
     return mosaic, black_level_dn, white_level_dn, cfa
 
 
@@ -247,7 +242,7 @@ def _read_tiff(data: bytes) -> _TiffTags:
             metadata = {name: tags.valueof(tag) for name, tag in TOLD.items()}
             metadata |= {name: exif.get(key) for name, key in TOLD_IN_EXIF.items() if key in exif}
             pixels = read_in_place(data, tiff) if plain and missing <= 0 else None
-    except _DAMAGED as error:
+    except Exception as error:  # tifffile raises whatever it runs into in damaged tags
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")

@@ -5,7 +5,6 @@ A simulated clock counts what the devices take; bytes on a cable take none.
 
 from __future__ import annotations
 
-import io
 import statistics
 import time
 import tracemalloc
@@ -16,13 +15,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import rawpy
 from numpy.typing import NDArray
 
 from drivers.pixel_formats import BY_NAME, KERNELS, image_bytes, unpack
 from drivers.ptp import PtpSession, is_raw
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import RawFrame, decode_raw
+from drivers.raw import RawFrame, decode_by_libraw, decode_raw
 from drivers.stage import StageSettings
 from drivers.u3v import U3vCamera, open_u3v
 from drivers.usb import open_device
@@ -136,7 +134,7 @@ def picture_timing(shape: tuple[int, int] = LARGE_SHAPE, repeats: int = 9) -> Pi
         decoded = time.perf_counter()
         frame = None
         again = time.perf_counter()
-        alone: NDArray[np.uint16] | None = _by_rawpy(data)
+        alone: NDArray[np.uint16] | None = decode_by_libraw(data)[0]
         ended = time.perf_counter()
         alone = None
         rows.append((downloaded - started, decoded - downloaded, ended - again))
@@ -157,11 +155,6 @@ def picture_timing(shape: tuple[int, int] = LARGE_SHAPE, repeats: int = 9) -> Pi
     session.close()
     ratio = statistics.median(ratios[1:])
     return PictureTiming(size / 1e6, download_s, decode_s, rawpy_s, ratio, peak / size)
-
-
-def _by_rawpy(data: bytes) -> NDArray[np.uint16]:
-    with rawpy.imread(io.BytesIO(data)) as raw:
-        return raw.raw_image_visible.copy()
 
 
 SIZE_24MP = (4000, 6000)
