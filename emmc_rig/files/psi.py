@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -23,7 +22,7 @@ from emmc_rig.files.shards import (
 )
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, checksum_of
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"
@@ -45,6 +44,8 @@ class SavedPsi:
             self.size = weights.shape[3], weights.shape[5]
             self.binning = int(np.asarray(stored.attributes["binning"]))
             self.checksum = str(stored.attributes["sha256"])
+            if len(self.shape) != 6 or self.binning < 1:
+                raise SensingError(f"{path}: damaged (no shape of an imaging matrix); {AGAIN}")
 
     @property
     def frames_shape(self) -> tuple[int, int, int]:
@@ -56,14 +57,10 @@ class SavedPsi:
         """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
         with self._opened() as stored:
             camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
-            digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{camera}".encode())
-            for place in np.ndindex(self.shape[:3]):
-                plane = self._whole(weights[place])
-                digest.update(np.ascontiguousarray(plane).view(np.uint8).data)
+            planes = (self._whole(weights[place]) for place in np.ndindex(self.shape[:3]))
             colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
-            colour = self._whole(colour)
-            digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
-        if digest.hexdigest() != self.checksum:
+            checksum = checksum_of(self.binning, camera, planes, self._whole(colour))
+        if checksum != self.checksum:
             raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
 
     def load(self) -> ImagingMatrix:

@@ -8,8 +8,7 @@ pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per pixel.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +22,7 @@ from emmc_rig.model import kernels
 from emmc_rig.model.arguments import numbers_of, pair_of, path_of, required
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.reading import stored_arrays
 
@@ -30,6 +30,19 @@ Array = NDArray[np.floating]
 WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
 FORMAT = "emmc-rig imaging matrix 1"
+
+
+def checksum_of(binning: int, camera_json: str, planes: Iterable[Array], colour: NDArray) -> str:
+    """Return the SHA-256 of a Psi; planes, colour: as `view_planes` and `colour_map`.
+
+    A damaged file's text may hold what no UTF-8 is; it then has another checksum.
+    """
+    head = f"{FORMAT}|{binning}|{camera_json}"
+    digest = hashlib.sha256(head.encode(errors="surrogatepass"))
+    for plane in planes:
+        digest.update(np.ascontiguousarray(plane).view(np.uint8).data)
+    digest.update(np.ascontiguousarray(colour).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def rows_of_colours(light_field: Array) -> Array:
@@ -135,7 +148,7 @@ class ImagingMatrix:
     def _sensor(self) -> str:
         """Return the name of the colour filter tile, or how many colours a pixel sees."""
         if self.camera_json:
-            cfa = json.loads(self.camera_json)["sensor"]["cfa"]
+            cfa = parse_json(self.camera_json, "the camera of Psi", SensingError)["sensor"]["cfa"]
             return cfa if isinstance(cfa, str) else "custom colour filters"
         return "one colour a pixel" if self.colour is not None else "three colours a pixel"
 
@@ -399,10 +412,7 @@ class ImagingMatrix:
 
     def checksum(self) -> str:
         """Return the SHA-256 of weights, colours, binning and camera."""
-        digest = hashlib.sha256(f"{FORMAT}|{self.binning}|{self.camera_json}".encode())
-        for array in (*self.view_planes(), self.colour_map):
-            digest.update(np.ascontiguousarray(array).view(np.uint8).data)
-        return digest.hexdigest()
+        return checksum_of(self.binning, self.camera_json, self.view_planes(), self.colour_map)
 
     def save(self, path: str | Path) -> None:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
