@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings
 
@@ -50,10 +51,12 @@ def parse_camera(spec: str) -> CameraChoice:
     """
     if not spec.endswith((".yaml", ".yml")) or ":" in spec:
         kind, _, address = spec.partition(":")
-        return CameraChoice(kind, address, source=f"--camera {spec}")
+        return CameraChoice(kind, address, source=f"--camera {shown_path(spec)}")
     read = read_yaml(Path(spec), AppError)
     if not isinstance(read, dict) or not isinstance(read.get("kind"), str):
-        raise AppError(f"{spec}: expected settings of a camera with its kind, such as kind: mm")
+        raise AppError(
+            f"{shown_path(spec)}: expected settings of a camera with its kind, such as kind: mm"
+        )
     options = {str(key): value for key, value in read.items()}
     kind, address = options.pop("kind"), str(options.pop("address", ""))
-    return CameraChoice(kind, address, options, spec)
+    return CameraChoice(kind, address, options, shown_path(spec))

@@ -16,6 +16,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
 from emmc_rig.rig.hardware import NO_FLAWS, STAGE_AXES, Rig, open_camera, open_stage, simulated_rig
@@ -176,7 +177,9 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     if spec == SIMULATED:
         return _described(SIMULATED, imaged)
     if not spec.endswith((".yaml", ".yml")):
-        raise AppError(f"--rig {spec}: write simulated, or the name of a YAML file of devices")
+        raise AppError(
+            f"--rig {shown_path(spec)}: write simulated, or the name of a YAML file of devices"
+        )
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
         wired = validated(WiredRig, read, spec, AppError)

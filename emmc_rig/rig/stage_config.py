@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
 from drivers.apt import ACTUATORS
 from drivers.stage import StageSettings
 from emmc_rig.errors import AppError
-from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.json_text import shown_path
+from emmc_rig.model.reading import parse_yaml, read_yaml
 from emmc_rig.model.settings import Settings, explain
 from emmc_rig.rig.plugins import STAGES, plug_ins
 
@@ -135,12 +135,13 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
     `overrides` replace single settings. Raises AppError with one line.
     """
+    shown = shown_path(spec)
     protocol, colon, port = spec.partition(":")
     known = stage_protocols()
     chosen: dict[str, Any] = {}
     if protocol in PROTOCOLS:
         port, *options = port.split(",")
-        chosen = dict(_option(spec, one) for one in options)
+        chosen = dict(_option(shown, one) for one in options)
     if colon and protocol in known and (port or known[protocol] is PluginConfig):
         data: dict[str, Any] = {"protocol": protocol, "port": port} | chosen
         if protocol == "apt":
@@ -149,14 +150,14 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     elif spec.endswith((".yaml", ".yml")):
         read = read_yaml(Path(spec), AppError)
         if not isinstance(read, dict):
-            raise AppError(f"{spec}: expected a mapping of settings")
+            raise AppError(f"{shown}: expected a mapping of settings")
         data = dict(read)
     else:
         raise AppError(
-            f"--stage {spec}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
+            f"--stage {shown}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
             "zaber:/dev/ttyUSB0, or the name of a YAML file"
         )
-    return _validated(data | dict(overrides or {}), spec)
+    return _validated(data | dict(overrides or {}), shown)
 
 
 def _require_actuators(axes: Any, source: str) -> None:
@@ -172,11 +173,11 @@ def _require_actuators(axes: Any, source: str) -> None:
 
 
 def _option(spec: str, text: str) -> tuple[str, Any]:
-    """Return name and value of one `NAME=VALUE` behind a port."""
+    """Return name and value of one `NAME=VALUE` behind a port; raises AppError."""
     name, equals, value = text.partition("=")
     if not (equals and name and value):
         raise AppError(f"--stage {spec}: write NAME=VALUE behind the port, not {text!r}")
-    return name.strip(), yaml.safe_load(value)
+    return name.strip(), parse_yaml(value, f"--stage {spec}", AppError)
 
 
 def _validated(data: dict[str, Any], source: str) -> StageConfig:
@@ -190,7 +191,7 @@ def _validated(data: dict[str, Any], source: str) -> StageConfig:
     try:
         config: StageConfig = TypeAdapter(cls).validate_python(data)
     except ValidationError as fault:
-        raise AppError(f"{source}: {explain(fault, cls)}") from fault
+        raise AppError(" ".join(f"{source}: {explain(fault, cls)}".split())) from fault
     if isinstance(config, AptConfig):
         for axis, one in config.axes.items():
             if one.actuator not in ACTUATORS:
