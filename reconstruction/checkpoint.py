@@ -11,6 +11,7 @@ from typing import TypeVar
 import h5py
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import one_line, stored_arrays
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import Iteration, LearningState
@@ -51,8 +52,11 @@ def load_checkpoint(path: Path, kind: type[S], purpose: Mapping[str, object]) ->
     with stored_arrays(path, DictionaryError, "delete it and train anew") as stored:
         if stored.attributes.get("format") != FORMAT:
             raise DictionaryError(f"{path}: not a checkpoint of a training by this program")
-        found = json.loads(stored.text("purpose"))
-        history = tuple(Iteration(**done) for done in json.loads(stored.text("history")))
+        found, steps = (
+            parse_json(stored.text(name), f"{path}: {name}", DictionaryError)
+            for name in ("purpose", "history")
+        )
+        history = tuple(Iteration(**done) for done in steps)
         wanted = json.loads(json.dumps(purpose))
         differing = [k for k in wanted if found.get(k) != wanted[k]]
         if differing:

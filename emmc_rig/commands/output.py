@@ -40,7 +40,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from emmc_rig.errors import StoppedError
+from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.model.json_text import parse_json
 
 if TYPE_CHECKING:
     from reconstruction.result import Progress as SolverProgress
@@ -93,7 +94,7 @@ def give_result(out: Path | None = None, **facts: Any) -> None:
     if out is not None:
         metrics = out / "metrics.json"
         if metrics.is_file():
-            facts = {"metrics": json.loads(metrics.read_text(encoding="utf-8")), **facts}
+            facts = {"metrics": parse_json(metrics.read_bytes(), str(metrics), AppError), **facts}
         facts = {"out": str(out), **facts}
     emit("result", **facts)
 

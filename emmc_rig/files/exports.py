@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +16,7 @@ from emmc_rig.files.frames import FRAMES
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import fine_scene, open_scene
 from emmc_rig.model.errors import SceneError, nearest_of
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.model.reading import stored_arrays
 from simulators.scenes import SCENES
@@ -94,7 +94,7 @@ def _fits(values: NDArray, shape: tuple[int, ...]) -> bool:
 def _metrics(folder: Path) -> dict[str, object]:
     """Return metrics.json of a result; empty where it cannot be read."""
     with suppress(OSError, ValueError):
-        known = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+        known = parse_json((folder / METRICS).read_bytes(), METRICS, ValueError)
         if isinstance(known, dict):
             return known
     return {}

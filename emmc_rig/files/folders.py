@@ -25,6 +25,7 @@ from pathlib import Path, PurePosixPath
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.lock_file import TakenError, take_lock
+from emmc_rig.model.json_text import parse_json
 
 FILES = "files.json"
 PARTIAL = ".emmc-rig.partial"
@@ -58,12 +59,12 @@ class Listing:
         path = folder / FILES
         try:
             text = path.read_bytes().decode()
-            data = json.loads(text)
+            data = parse_json(text, FILES, ValueError)
             listing = cls(data["command"], data["files"])
             whole = listing.text() == text and all(map(_stays_inside, listing.files))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             whole = False
         if not whole:
             raise AppError(
@@ -392,7 +393,7 @@ def _undo(folder: Path) -> None:
     """Undo moves that were interrupted, so that the earlier result is whole; else do nothing."""
     partial = folder / PARTIAL
     try:
-        moves = json.loads((partial / MOVES).read_bytes())
+        moves = parse_json((partial / MOVES).read_bytes(), str(partial / MOVES), AppError)
     except FileNotFoundError:
         return
     for name, sha256 in moves["new"].items():

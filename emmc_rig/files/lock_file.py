@@ -17,6 +17,8 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from emmc_rig.model.json_text import parse_json
+
 TRIES, WAIT_S = 200, 0.01
 """A program that has just taken the lock needs a moment to write who it is."""
 
@@ -127,8 +129,8 @@ def _own_name(by_file: bool) -> bytes:
 def _holder(data: bytes) -> dict[str, object]:
     """Return who wrote a lock file; empty where it is not written yet."""
     try:
-        name = json.loads(data)
-    except (ValueError, RecursionError):
+        name = parse_json(data, "the lock", ValueError)
+    except ValueError:
         return {}
     return name if isinstance(name, dict) and {*name} >= {"command", "process", "host"} else {}
 

@@ -31,6 +31,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
@@ -394,8 +395,8 @@ async def _body(request: Request) -> dict[str, Any]:
         if len(data) > LONGEST_BODY:
             raise _RefusedError(413, f"more than {LONGEST_BODY} bytes")
     try:
-        values = json.loads(data or b"{}")
-    except (ValueError, RecursionError) as fault:
+        values = parse_json(data or b"{}", "the request", ValueError)
+    except ValueError as fault:
         raise _RefusedError(400, "not JSON") from fault
     if not isinstance(values, dict):
         raise _RefusedError(400, "send a JSON object")

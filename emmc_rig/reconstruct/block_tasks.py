@@ -33,6 +33,7 @@ from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.reconstruct.memory import task_bytes
 from emmc_rig.reconstruct.pool import Pool
@@ -131,7 +132,7 @@ def _write_json(path: Path, content: object) -> None:
 def _read_json(path: Path) -> dict[str, Any] | None:
     """Return what a file of a job says; None where it is missing or damaged."""
     try:
-        content = json.loads(path.read_bytes())
+        content = parse_json(path.read_bytes(), path.name, ValueError)
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) else None

@@ -12,6 +12,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.session.storage import Disk, read_whole
 
 Entry = dict[str, Any]
@@ -59,8 +60,8 @@ def _checked(line: bytes) -> bytes | None:
 
 def _decoded(body: bytes) -> Entry | None:
     try:
-        entry = json.loads(body + b"}")
-    except (ValueError, RecursionError):
+        entry = parse_json(body + b"}", "an entry", ValueError)
+    except ValueError:
         return None
     return entry if isinstance(entry, dict) and isinstance(entry.get("kind"), str) else None
 

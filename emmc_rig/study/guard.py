@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from emmc_rig.model.files import write_text
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.study.benchmarks.running import CFA, Asked, Show
 from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.methods import DEFAULT_METHOD
@@ -85,7 +86,8 @@ def measured_db(case: Capture) -> float:
 
 def stored_figures() -> dict[str, float]:
     """Return the stored PSNR of every case, by its key."""
-    return json.loads(resources.files("emmc_rig.study").joinpath(STORED).read_text())
+    data = resources.files("emmc_rig.study").joinpath(STORED).read_bytes()
+    return parse_json(data, STORED, ValueError)
 
 
 def guarded(chosen: Iterable[Capture], stored: Mapping[str, float]) -> Iterator[Row]:

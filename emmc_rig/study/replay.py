@@ -11,7 +11,6 @@ meanwhile: an upper bound.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Annotated, TypeVar
 import numpy as np
 import typer
 
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.reconstruct.pool import Cluster
 
 Result = TypeVar("Result")
@@ -114,7 +114,7 @@ def main(
     seconds: Annotated[float, typer.Option(help="that each replay sleeps at least", min=0.1)] = 4.0,
 ) -> None:
     """Print what 4, 16 and 64 workers would take, and what of it is Dask's scheduler."""
-    found = json.loads(metrics.read_text())
+    found = parse_json(metrics.read_bytes(), str(metrics), typer.BadParameter)
     if "block_cpu_seconds" not in found:
         typer.echo(f"{metrics}: states no blocks; reconstruct with --workers", err=True)
         raise typer.Exit(1)

@@ -24,6 +24,7 @@ from pydantic_core import to_jsonable_python
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.files.results import command_line, metrics_text, versions
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import number
 from emmc_rig.progress import Silent, Watcher
@@ -123,7 +124,7 @@ class Journal:
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
             try:
-                entry = json.loads(line)
+                entry = parse_json(line, path.name, ValueError)
                 self._results[entry["digest"]] = entry["result"]
             except (ValueError, KeyError, TypeError):
                 continue
@@ -329,7 +330,7 @@ def _measured_group(task: tuple[Sweep, Sequence]) -> tuple[list[dict], str | Non
 
 def plain(result: Mapping[str, object]) -> dict:
     """Return a result as read back from JSON: None for what is not finite, lists for tuples."""
-    return json.loads(metrics_text(result))
+    return parse_json(metrics_text(result), "a result", AppError)
 
 
 def described(point: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from emmc_rig.model.files import whole_file
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import one_line, stored_arrays
 from emmc_rig.model.settings import Settings, validated
 from reconstruction.errors import ReconstructionError
@@ -42,9 +43,9 @@ class NetworkWeights:
     def checksum(self) -> str:
         """Return the SHA-256 of architecture, arrays and provenance."""
         about = f"{FORMAT}|{self.architecture.model_dump_json()}|{self.provenance}"
-        digest = hashlib.sha256(about.encode())
+        digest = hashlib.sha256(about.encode(errors="surrogatepass"))
         for name in sorted(self.arrays):
-            digest.update(f"{name}{self.arrays[name].shape}".encode())
+            digest.update(f"{name}{self.arrays[name].shape}".encode(errors="surrogatepass"))
             digest.update(np.ascontiguousarray(self.arrays[name], np.float32).tobytes())
         return digest.hexdigest()
 
@@ -70,8 +71,10 @@ class NetworkWeights:
         with stored_arrays(path, ReconstructionError, REMEDY) as stored:
             if stored.attributes.get("format") != FORMAT:
                 raise ReconstructionError(f"{path}: no network of this program; {REMEDY}")
-            about = json.loads(str(stored.attributes["architecture"]))
-            names = json.loads(stored.text("names"))
+            about, names = (
+                parse_json(text, str(path), ReconstructionError)
+                for text in (str(stored.attributes["architecture"]), stored.text("names"))
+            )
             arrays = {name: stored.array(f"array{i}") for i, name in enumerate(names)}
             provenance, expected = stored.text("provenance"), stored.attributes["sha256"]
         architecture = validated(Architecture, about, str(path), ReconstructionError)

@@ -7,7 +7,6 @@ camera is one that has its frame in memory, so that the page alone is measured.
 from __future__ import annotations
 
 import http.client
-import json
 import os
 import statistics
 import subprocess
@@ -32,6 +31,7 @@ from emmc_rig.live.server import application, new_token, served
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
@@ -190,7 +190,9 @@ def _fetch(port: int, path: str, seconds: float) -> None:
     begin_s = time.monotonic() + WARM_UP_S
     while time.monotonic() < begin_s + seconds:
         line = events.readline()
-        state = json.loads(line.removeprefix(b"data: ")) if line.strip() else {"frame": frame}
+        if not line.strip():
+            continue
+        state = parse_json(line.removeprefix(b"data: "), "events", ValueError)
         if state["frame"] == frame:
             continue
         frame = state["frame"]

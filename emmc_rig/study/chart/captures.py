@@ -12,8 +12,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.errors import AppError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.sweep import check_size, digest_of
 from emmc_rig.study.trial import Capture
@@ -46,16 +48,14 @@ def kept_capture(capture: Capture, folder: Path) -> tuple[Path, str]:
 def read_frames(path: Path) -> tuple[ImagingMatrix, Frames]:
     """Read what a method gets: Psi and the frames, all their readings of one typical deviation."""
     psi = ImagingMatrix.load(path.with_suffix(".psi"))
-    with h5py.File(path, "r") as file:
-        readings, usable, sigma = (
-            np.asarray(file[name]) for name in ("readings", "usable", "noise_sigma")
-        )
+    with stored_arrays(path, AppError, "delete it, and it is made again") as stored:
+        readings, usable, sigma = map(stored.array, ("readings", "usable", "noise_sigma"))
     return psi, Frames(readings, np.full(readings.shape, sigma), usable.astype(bool))
 
 
 def read_truth(path: Path) -> tuple[Array, Array | None]:
     """Read the light field (v, u, y, x, c) and its disparity (y, x), None where not known."""
-    with h5py.File(path, "r") as file:
-        truth = np.asarray(file["truth"])
-        disparity = np.asarray(file["disparity_px"]) if "disparity_px" in file else None
+    with stored_arrays(path, AppError, "delete it, and it is made again") as stored:
+        truth = stored.array("truth")
+        disparity = stored.array("disparity_px") if "disparity_px" in stored else None
     return truth, disparity

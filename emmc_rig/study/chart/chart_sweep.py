@@ -23,6 +23,7 @@ from typing import IO
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.memory import forget_peak
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.captures import kept_capture
 from emmc_rig.study.chart.points import Point
@@ -150,7 +151,7 @@ class Worker:
         if line:
             if not self.lasting:
                 self.end()
-            return json.loads(line)
+            return parse_json(line, "the measuring process", AppError)
         code = process.wait()
         self.end()
         if late.is_set():

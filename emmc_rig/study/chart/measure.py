@@ -28,6 +28,7 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
@@ -198,7 +199,7 @@ def answered(job: dict) -> dict:
 def main() -> None:
     """Do the jobs on standard input until it ends."""
     for line in sys.stdin:
-        print(json.dumps(answered(json.loads(line))), flush=True)
+        print(json.dumps(answered(parse_json(line, "a job", AppError))), flush=True)
 
 
 if __name__ == "__main__":

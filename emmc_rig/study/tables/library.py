@@ -20,6 +20,7 @@ from pydantic import Field
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import digest_of
@@ -318,7 +319,7 @@ def trained_on(dictionary: Dictionary) -> list[str] | None:
     if dictionary.kind in TRAINING_FREE:
         return []
     try:
-        scenes = json.loads(dictionary.provenance)["scenes"]
+        scenes = parse_json(dictionary.provenance, "provenance", ValueError)["scenes"]
         names = [scene["name"] if isinstance(scene, dict) else scene for scene in scenes]
         return [Path(name).stem for name in names] or None
     except (ValueError, KeyError, TypeError):
