@@ -93,9 +93,9 @@ def decoder_calls(source):
     harmless = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            of_own = node.args and isinstance(node.args[0], ast.Call)
-            if full(node.func) == "json.loads" and of_own:
-                if full(node.args[0].func) == "json.dumps":
+            first = node.args[0] if node.args else None
+            if full(node.func) == "json.loads" and isinstance(first, ast.Call):
+                if full(first.func) == "json.dumps":
                     harmless.add(node.func)
             elif full(node.func) == "h5py.File" and [
                 one.value for one in node.args[1:2] if isinstance(one, ast.Constant)

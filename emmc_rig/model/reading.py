@@ -49,7 +49,10 @@ _FAULTS = (
 )
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_SafeLoader):
     """YAML's safe types; a key given twice is refused instead of overwritten."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -165,12 +168,12 @@ class StoredArrays:
         if found.nbytes > self._most_bytes:
             raise ValueError(f"'{name}' of {found.nbytes:.3g} bytes does not fit into its file")
         if found.chunks is not None:
-            self._check_chunks(name, found)
+            self._check_chunks(name, found, found.chunks)
         return found
 
-    def _check_chunks(self, name: str, found: h5py.Dataset) -> None:
+    def _check_chunks(self, name: str, found: h5py.Dataset, shape: tuple[int, ...]) -> None:
         """Raise ValueError where reading a chunk may take more memory than a data set may."""
-        chunk_bytes = math.prod(found.chunks) * found.dtype.itemsize
+        chunk_bytes = math.prod(shape) * found.dtype.itemsize
         if chunk_bytes > self._most_bytes:
             raise ValueError(
                 f"'{name}' has chunks of {chunk_bytes:.3g} bytes, which do not fit into its file"
