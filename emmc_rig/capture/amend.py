@@ -18,7 +18,6 @@ from emmc_rig.capture.plan import Plan, differences
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.model.reading import parse_yaml
 from emmc_rig.model.settings import validated
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
@@ -60,7 +59,7 @@ def amendment(
     """
     folder = session.folder.name
     place = str(session.folder)
-    before = validated(Plan, parse_yaml(session.plan_yaml, place, AppError), place, AppError)
+    before = validated(Plan, session.plan_data(), place, AppError)
     earlier = validated(Camera, session.camera, str(session.folder), CameraError)
     changes = differences(plan, before)
     if _plain(camera) != _plain(earlier) and not changes:

@@ -104,9 +104,7 @@ def wish_from_session(
 ) -> Wish:
     """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
     session = Session(folder)
-    plan = validated(
-        Plan, parse_yaml(session.plan_yaml, str(folder), AppError), str(folder), AppError
-    )
+    plan = validated(Plan, session.plan_data(), str(folder), AppError)
     camera = validated(Camera, session.camera, str(folder), CameraError)
     return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
 

@@ -82,10 +82,12 @@ def read_yaml(path: Path, error: type[Exception]) -> object:
     return parse_yaml(data, name, error)
 
 
-def parse_yaml(data: bytes | str, source: str, error: type[Exception]) -> object:
+def parse_yaml(
+    data: bytes | str, source: str, error: type[Exception], most_bytes: int = MOST_YAML_BYTES
+) -> object:
     """Return the content of YAML; raises `error` naming `source`."""
-    if len(data) > MOST_YAML_BYTES:
-        raise error(f"{source}: larger than {MOST_YAML_BYTES // 1_000_000} MB: not settings")
+    if len(data) > most_bytes:
+        raise error(f"{source}: larger than {most_bytes // 1_000_000} MB: not settings")
     try:
         text = data.decode("utf-8") if isinstance(data, bytes) else data
         _check_nesting(text)

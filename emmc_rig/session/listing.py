@@ -15,7 +15,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.reading import parse_yaml
+from emmc_rig.model.reading import read_yaml
 from emmc_rig.session.decisions import ended, metered
 from emmc_rig.session.exposure import shot_exposures
 from emmc_rig.session.journal import heads
@@ -121,8 +121,8 @@ def summary(folder: Path) -> Summary:
 def _camera_name(plan: Path) -> str:
     """Return which camera a plan is for, "" where it cannot be read."""
     try:
-        read = parse_yaml(plan.read_text(encoding="utf-8"), str(plan), AppError)
-    except (OSError, ValueError, AppError):
+        read = read_yaml(plan, AppError)
+    except AppError:
         return ""
     return str(read.get("camera", "")) if isinstance(read, dict) else ""
 
@@ -193,7 +193,7 @@ def _described(session: Session) -> dict[str, str]:
         "verdict": listed.verdict or "not reconstructed",
         "PSNR stated, dB": "" if listed.stated_db is None else f"{listed.stated_db:.2f}",
         **_flat(session.rig, "rig"),
-        **_flat(parse_yaml(session.plan_yaml, str(session.folder), AppError) or {}, "plan"),
+        **_flat(session.plan_data() or {}, "plan"),
     }
 
 

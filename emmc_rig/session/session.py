@@ -52,6 +52,7 @@ from emmc_rig.files.folders import (
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.json_text import parse_json
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.session.decisions import metered, spared_shots, wanted_db
 from emmc_rig.session.journal import Entry, Journal, encode_line
 from emmc_rig.session.planned import PlannedFrame
@@ -230,6 +231,13 @@ class Session:
     def plan_yaml(self) -> str:
         """The plan as the user wrote it, the last time."""
         return self.holding(PLAN).decode()
+
+    def plan_data(self) -> object:
+        """Return the plan as plain data; raises AppError.
+
+        It may be larger than files of settings, which 0.2 took up to 16 MB.
+        """
+        return parse_yaml(self.plan_yaml, str(self.folder), AppError, most_bytes=16_000_000)
 
     @cached_property
     def camera(self) -> dict[str, Any]:
