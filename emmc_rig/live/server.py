@@ -26,11 +26,13 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.live.connections import Connections
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
 
@@ -247,6 +249,8 @@ def application(
                 response = PlainTextResponse(f"{refusal}\n", refusal.status)
             except ERRORS as fault:
                 response = PlainTextResponse(f"{fault}\n", 400)
+            except ClientDisconnect:
+                response = Response(status_code=400)  # who asked has gone, and hears nothing
             response.headers.update(HEADERS)
             return response
 
@@ -291,7 +295,8 @@ def application(
         if read_only:
             raise _RefusedError(403, f"read-only: {to_act} to act")
         origin = request.headers.get("origin")
-        if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
+        page_origin = f"{request.url.scheme}://{request.headers.get('host')}"
+        if origin not in (None, page_origin):
             raise _RefusedError(403, f"not from this page but from {origin}")
         name = request.path_params["action"]
         if name not in page.actions:
@@ -347,6 +352,7 @@ class Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 app,
+                http="h11",
                 log_level="warning",
                 access_log=False,
                 lifespan="off",
@@ -355,11 +361,22 @@ class Server(uvicorn.Server):
             )
         )
         self._close = app.state.close
+        self._accepting: list[Connections] = []
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Accept connections at these sockets: see `emmc_rig.live.connections`."""
+        await super().startup(sockets=[])
+        self._accepting = [Connections(one, self._connection) for one in sockets or []]
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End what is pushed, then what else is under way."""
         self._close()
+        for one in self._accepting:
+            one.close()
         await super().shutdown(sockets)
+
+    def _connection(self) -> H11Protocol:
+        return H11Protocol(self.config, self.server_state, self.lifespan.state)
 
 
 @contextmanager
