@@ -99,6 +99,17 @@ class StreamingCamera(Camera, Protocol):
         ...
 
 
+class StoppableCamera(Camera, Protocol):
+    """A camera that can break off an exposure."""
+
+    def stop_exposure(self) -> bool:
+        """Break off the exposure under way; False where this camera cannot. Any thread may call.
+
+        Whoever waits for the frame gets an `ExposureStoppedError`, half a second later at most.
+        """
+        ...
+
+
 class TriggeredCamera(Camera, Protocol):
     """A camera that begins an exposure at an edge on a line."""
 

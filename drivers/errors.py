@@ -420,6 +420,14 @@ class CaptureError(DriverError):
         self.reason = reason
 
 
+class ExposureStoppedError(DriverError):
+    """An exposure was broken off because somebody asked for it."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(f"{camera}: the exposure was broken off; take the frame again")
+        self.camera = camera
+
+
 class DownloadError(DriverError):
     """A picture is on the card but could not be fetched whole."""
 

@@ -27,6 +27,7 @@ from drivers.errors import (
     CardFullError,
     DownloadError,
     DriverError,
+    ExposureStoppedError,
     PtpFormatError,
     PtpRefusedError,
     UsbStalledError,
@@ -140,6 +141,7 @@ class PtpSession:
         self._transaction = 0
         self._broken = False
         self._owed = False
+        self._stop_wanted = threading.Event()
         self._closed = False
         try:
             self._open()
@@ -250,11 +252,16 @@ class PtpSession:
         with self.lock:
             self._forget_events()
             seen = set(self.handles()) if self.body.on_card else set()
+            self._stop_wanted.clear()
             self.body.release()
             self._owed = True
             taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
             self._owed = False
             return taken
+
+    def stop_capture(self) -> None:
+        """Let the capture under way, if any, raise `ExposureStoppedError`; any thread may call."""
+        self._stop_wanted.set()
 
     def next_event(self, timeout_s: float) -> Message | None:
         """Return what came through the pipe of events next, None when nothing did in time."""
@@ -350,6 +357,11 @@ class PtpSession:
         others: list[tuple[int, ObjectInfo]] = []
         done = False
         while (now_s := clock.now_s()) < deadline_s and not (found and (done or not all_of_it)):
+            if self._stop_wanted.is_set() and now_s < exposed_s:
+                # Device Reset Request: the camera becomes idle (USB Still Image Capture, 5.2.3).
+                self._transport.reset()
+                self._open()
+                raise ExposureStoppedError(self.name)
             event = self.body.event(min(settings.event_poll_s, deadline_s - now_s))
             if event is None and clock.now_s() < exposed_s:
                 continue
@@ -607,6 +619,13 @@ class PtpCamera(ShapeFromFrames):
             host_time_s=arrived_s,
             metadata={**frame.metadata, "name": taken.info.name},
         )
+
+    def stop_exposure(self) -> bool:
+        """See `drivers.camera.StoppableCamera`; of Canon's and Sony's own releases none can."""
+        if not isinstance(self.session.body, StandardBody):
+            return False
+        self.session.stop_capture()
+        return True
 
     def close(self) -> None:
         """End the session and let go of the camera; closing twice is allowed."""

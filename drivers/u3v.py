@@ -236,6 +236,11 @@ class U3vCamera:
                     frame = replace(frame, exposure_s=None, gain=None)
                 yield replace(frame, metadata={**frame.metadata, "frames_lost": str(lost)})
 
+    def stop_exposure(self) -> bool:
+        """See `drivers.camera.StoppableCamera`."""
+        self._stream.stop_wanted.set()
+        return True
+
     def close(self) -> None:
         """Stop an acquisition and let go of the camera; closing twice is allowed."""
         if self._acquiring:

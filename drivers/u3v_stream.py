@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import array
 import math
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from drivers import u3v_codec as codec
 from drivers.clock import Clock
 from drivers.errors import (
     CameraDescriptionError,
+    ExposureStoppedError,
     FrameLostError,
     U3vFormatError,
     UsbStalledError,
@@ -94,6 +96,7 @@ class U3vStream:
         self._buffers: dict[int, array.array[int]] = {}
         self._frame = bytearray()
         self._next_leader: bytes | None = None
+        self.stop_wanted = threading.Event()
 
     def start(self) -> StreamSizes:
         """Empty the endpoint, agree on sizes with the camera, enable the stream."""
@@ -137,8 +140,9 @@ class U3vStream:
         """Return the next frame's leader, payload and trailer in one, waiting `wait_s` at most.
 
         Raises `FrameLostError` for a frame that does not come whole, after which the next may be
-        received.
+        received; `ExposureStoppedError` soon after `stop_wanted` is set.
         """
+        self.stop_wanted.clear()
         leader = self._leader(self._clock.now_s() + wait_s)
         size = codec.packet_size(leader)
         self._frame[:size] = leader[:size]
@@ -232,6 +236,8 @@ class U3vStream:
             try:
                 count = self._pipe.read_into(buffer, min(left_s, SLICE_S))
             except UsbTimeoutError:
+                if self.stop_wanted.is_set():
+                    raise ExposureStoppedError(self._device.name) from None
                 continue
             except UsbStalledError as error:
                 self._pipe.clear_halt()

@@ -524,7 +524,7 @@ class PtpUsbFunction(UsbFunction):
         if request in (CANCEL_REQUEST, DEVICE_RESET):
             self._clear()
             if request == DEVICE_RESET:
-                self.camera.session = 0
+                self.camera.power_up()
             return b""
         if request == DEVICE_STATUS:
             return struct.pack("<HH", 4, Code.OK)

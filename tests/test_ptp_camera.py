@@ -12,6 +12,7 @@ from drivers.errors import (
     CaptureError,
     CardFullError,
     DownloadError,
+    ExposureStoppedError,
     PtpFormatError,
     PtpRefusedError,
     RawFrameError,
@@ -109,6 +110,28 @@ def test_the_exposure_takes_its_time(bench):
     before_s = bench.clock.now_s()
     camera.snap()
     assert 8.0 <= bench.clock.now_s() - before_s < 9.0
+
+
+def test_an_exposure_that_is_broken_off_is_over_at_once_and_the_next_is_a_new_one(
+    bench, monkeypatch
+):
+    camera = bench.open()
+    camera.set_exposure_s(30.0)
+    before_s, pass_time = bench.clock.now_s(), bench.clock.sleep
+
+    def sleep(duration_s):
+        pass_time(duration_s)
+        if bench.clock.now_s() - before_s > 3:
+            assert camera.stop_exposure()
+
+    monkeypatch.setattr(bench.clock, "sleep", sleep)
+    with pytest.raises(ExposureStoppedError):
+        camera.snap()
+    assert 3 < bench.clock.now_s() - before_s < 4
+    monkeypatch.setattr(bench.clock, "sleep", pass_time)
+    camera.set_exposure_s(0.1)
+    bench.snap_is_good(camera)
+    assert bench.clock.now_s() - before_s < 8
 
 
 def test_a_camera_that_keeps_its_own_exposure_is_taken_at_its_word(bench):

@@ -19,6 +19,7 @@ from drivers.errors import (
     CameraDescriptionError,
     CameraSettingError,
     DriverError,
+    ExposureStoppedError,
     FrameLostError,
     RawFrameError,
     U3vBusyError,
@@ -174,6 +175,25 @@ def test_a_stream_numbers_its_frames_and_stops_when_closed(bench):
     stream.close()
     assert not bench.simulator.streaming
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+def test_a_stream_is_broken_off_in_the_middle_of_a_long_exposure(bench, monkeypatch):
+    camera = bench.open()
+    camera.set_exposure_s(10.0)
+    stream, before_s, pass_time = camera.stream(), bench.clock.now_s(), bench.clock.sleep
+
+    def sleep(duration_s):
+        pass_time(duration_s)
+        if bench.clock.now_s() - before_s > 3:
+            assert camera.stop_exposure()
+
+    monkeypatch.setattr(bench.clock, "sleep", sleep)
+    with pytest.raises(ExposureStoppedError):
+        next(stream)
+    assert 3 < bench.clock.now_s() - before_s < 5
+    assert not bench.simulator.streaming
+    camera.set_exposure_s(0.01)
+    assert next(camera.stream()).exposure_s == pytest.approx(0.01)
 
 
 def test_a_stream_that_fails_stops_the_camera(bench, faults):
