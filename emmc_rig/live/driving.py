@@ -36,7 +36,7 @@ class Driving:
         self.begun = 0
         self._idle = threading.Event()
         self._idle.set()
-        self._ending = threading.Event()
+        self._ending, self._closed = threading.Event(), threading.Event()
         self._stop_wanted = threading.Event()
         self._stop_sent = threading.Event()
         self._stopped_by_hand = False
@@ -62,6 +62,7 @@ class Driving:
         self._ending.set()
         if self._threads[0].ident is not None:
             self.stop()
+            self._closed.set()
             for thread in self._threads:
                 thread.join(PATIENCE_S)
 
@@ -101,7 +102,7 @@ class Driving:
     def _stop_when_wanted(self) -> None:
         while True:
             if not self._stop_wanted.wait(POLL_S):
-                if self._ending.is_set():
+                if self._closed.is_set():  # not before the last stop was sent
                     return
                 continue
             self._stop_wanted.clear()
