@@ -18,7 +18,12 @@ import pytest
 from programs import exit_code
 
 from drivers.camera import CameraIdentity
-from drivers.errors import PositionMismatchError, RawFrameError, TransportTimeoutError
+from drivers.errors import (
+    ExposureStoppedError,
+    PositionMismatchError,
+    RawFrameError,
+    TransportTimeoutError,
+)
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -414,6 +419,134 @@ def test_an_exposure_beyond_the_camera_is_said_to_be():
         watch.auto_expose()
         reported = until(watch, lambda state: state["trouble"]["setting"])
         assert "no better exposure" in reported["trouble"]["setting"]
+
+
+def test_in_the_dark_an_exposure_climbs_to_4_s_and_comes_back_and_says_what_to_do():
+    asked_s = []
+
+    class Asked(FakeCamera):
+        exposure_limits_s = (0.001, 60.0)
+
+        def set_exposure_s(self, exposure_s):
+            asked_s.append(exposure_s)
+            self.exposure_s = exposure_s
+
+    camera = Asked()
+    camera.light = 0.0
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.auto_expose()
+        dark = until(watch, lambda state: state["trouble"]["setting"])
+        assert "dark at 4 s too: light the lamp" in dark["trouble"]["setting"]
+        until(watch, lambda state: state["settings"]["exposure_s"] == 0.01)
+        assert max(asked_s) == 4.0
+        camera.light = 2.0
+        lit = until(watch, lambda state: not state["trouble"]["setting"])
+        assert "lamp" not in str([lit["hint"], lit["steps"]])
+
+
+def test_an_exposure_beyond_4_s_is_offered_and_not_taken_unasked():
+    camera = FakeCamera()
+    camera.exposure_limits_s = (0.001, 60.0)
+    camera.set_exposure_s = lambda exposure_s: setattr(camera, "exposure_s", exposure_s)
+    camera.light = 0.8 / 30 / 20
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.auto_expose()
+        offered = until(watch, lambda state: state["hint"] and "values" in state["hint"])
+        assert camera.exposure_s <= 4.0
+        assert offered["hint"]["label"] == "expose for 20 s"
+        step = next(one for one in offered["steps"] if one["name"] == "exposure")
+        assert step["label"] == "expose for 20 s"
+        watch.auto_expose(**offered["hint"]["values"])
+        done = until(watch, lambda state: max(state["figures"]["brightest"].values()) > 0.7)
+        assert done["settings"]["exposure_s"] == pytest.approx(20, rel=0.1)
+
+
+class PatientCamera(FakeCamera):
+    """Exposures beyond 4 s take until they are stopped, or ended by `ready`."""
+
+    exposure_limits_s = (0.001, 1000.0)
+
+    def __init__(self, stops=True):
+        super().__init__()
+        self.stops, self.ready, self.stopped = stops, threading.Event(), threading.Event()
+
+    def set_exposure_s(self, exposure_s):
+        self.exposure_s = exposure_s
+
+    def snap(self):
+        while self.exposure_s > 4 and not self.ready.is_set():
+            if self.stopped.wait(0.01):
+                self.stopped.clear()
+                raise ExposureStoppedError("the camera")
+        return super().snap()
+
+    def stop_exposure(self):
+        if self.stops:
+            self.stopped.set()
+        return self.stops
+
+
+def test_a_long_exposure_is_counted_down_and_cancelled(monkeypatch):
+    monkeypatch.setattr(watch_module, "COUNT_S", 0.05)
+    camera = PatientCamera()
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.set_exposure_s(900.0)
+        first = until(watch, lambda state: state["exposing"])
+        assert first["exposing"]["exposure_s"] == 900
+        until(watch, lambda state: 899 < state["exposing"]["left_s"] < 899.9)
+        watch.cancel()
+        after = until(watch, lambda state: state["frame"] > first["frame"] + 1)
+        assert after["settings"]["exposure_s"] == 0.01
+        assert after["trouble"]["camera"] == ""
+        until(watch, lambda state: state["exposing"] is None)
+
+
+def test_what_is_set_during_a_long_exposure_holds_at_once_and_so_does_the_end(monkeypatch):
+    monkeypatch.setattr(watch_module, "COUNT_S", 0.05)
+    camera = PatientCamera()
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.set_exposure_s(900.0)
+        until(watch, lambda state: state["exposing"])
+        watch.auto_expose()
+        until(watch, lambda state: 0.7 < max(state["figures"]["brightest"].values()) < 0.9)
+        watch.set_exposure_s(900.0)
+        until(watch, lambda state: state["exposing"])
+        begun_s = time.monotonic()
+    assert time.monotonic() - begun_s < 5
+
+
+def test_a_camera_that_cannot_break_off_says_how_long_it_takes(monkeypatch):
+    monkeypatch.setattr(watch_module, "COUNT_S", 0.05)
+    camera = PatientCamera(stops=False)
+    with watching(camera) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.set_exposure_s(900.0)
+        until(watch, lambda state: state["exposing"])
+        with pytest.raises(AppError, match=r"ends its exposure before .*: \d+ s"):
+            watch.cancel()
+        camera.ready.set()
+        until(watch, lambda state: state["settings"]["exposure_s"] == 0.01)
+
+
+def test_an_earlier_picture_is_not_judged_once_the_stage_has_moved():
+    camera, stage = FakeCamera(), SlowStage()
+    camera.light = 0.0
+    with watching(camera, stage) as watch:
+        until(watch, lambda state: state["hint"] and "lamp" in state["hint"]["text"])
+        watch.jog("mask_x", 1.0)
+        assert stage.moving.wait(PATIENCE_S)
+        until(watch, lambda state: state["hint"] is None)
+        camera.fault = RawFrameError("no picture since")
+        until(watch, lambda state: state["trouble"]["camera"])
+        watch.stop()
+        assert until(watch, lambda state: not state["busy"])["hint"] is None
+        camera.light, camera.fault = 1.0, None
+        lit = until(watch, lambda state: not state["trouble"]["camera"] and state["figures"])
+        assert "lamp" not in str(lit["hint"])
 
 
 @contextmanager

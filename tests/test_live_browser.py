@@ -4,6 +4,7 @@ import re
 
 import pytest
 from browsers import MARKS, complaints, open_browser
+from test_live import PatientCamera
 
 from emmc_rig.capture.control import Control
 from emmc_rig.files.cameras import find_camera
@@ -290,3 +291,24 @@ def test_a_lost_connection_says_so_and_what_to_do(browser, tmp_path):
     browser.execute_script("act('pause')")
     wait(browser, lambda: "pause: the program does not answer" in text(browser, "trouble"))
     browser.get_log("browser")
+
+
+def test_a_long_exposure_is_counted_down_where_the_picture_is_and_cancelled(browser):
+    watch = Watch(PatientCamera())
+    watch.start()
+    try:
+        with served(application(SetupPage(watch), TOKEN)) as port:
+            browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
+            wait(browser, lambda: frame_number(browser) > 0)
+            before = frame_number(browser)
+            field = browser.find_element(By.ID, "exposure")
+            field.clear()
+            field.send_keys("35000", Keys.ENTER)
+            shown = re.compile(r"exposing, 3[2-5] s left of 35")
+            wait(browser, lambda: shown.fullmatch(text(browser, "exposing-text")))
+            click(browser, "#cancel")
+            wait(browser, lambda: frame_number(browser) > before + 1)
+            wait(browser, lambda: not browser.find_element(By.ID, "exposing").is_displayed())
+            assert complaints(browser) == []
+    finally:
+        watch.close()

@@ -91,18 +91,19 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
 
             # The page is dark, and says what to do about it; so do its steps.
             wait(lambda: "away from the centre" in text("#hint"))
-            click("#steps li:nth-child(2) button")
-            wait(lambda: done(2))
-            click("#steps li:nth-child(3) button")
+            assert "centre the mask first" in text("#steps li:nth-child(2)")
             click("#steps li:nth-child(1) button")
             wait(lambda: done(1))
+            click("#steps li:nth-child(3) button")
+            click("#steps li:nth-child(2) button")
+            wait(lambda: done(2))
             wait(lambda: done(3))
             assert re.search(r"rotation -?\d\.\d\d . \d\.\d\d", text("#steps li:nth-child(3)"))
             pictured(driver, "live")
             click("#targets button:nth-child(1)")
             assert "by hand" in text("#steps li:nth-child(4)")
-            click("#steps li:nth-child(1) button") if not done(1) else None
-            wait(lambda: done(1))
+            click("#steps li:nth-child(2) button") if not done(2) else None
+            wait(lambda: done(2))
             click("#steps li:nth-child(5) button")
             wait(lambda: "+  - exposure_s: " in text("#diff"))
             click("#save")

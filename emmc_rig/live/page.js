@@ -32,6 +32,9 @@ async function show() {
 function draw() {
   const { figures, settings } = state;
   drawHint();
+  const exposing = state.exposing;
+  $("exposing").hidden = !exposing;
+  if (exposing) write("exposing-text", `exposing, ${Math.ceil(exposing.left_s)} s left of ${Number(exposing.exposure_s.toPrecision(3))}`);
   write("camera", `${settings.camera}, ${settings.shape[0]}x${settings.shape[1]} ${settings.cfa}`);
   for (const one of document.querySelectorAll(".acts")) one.disabled = state.read_only;
   write("frame", state.frame ? `frame ${state.frame}` : "waiting for the first frame");
@@ -76,7 +79,7 @@ function drawHint() {
   $("hint").hidden = !hint && !state.stopped;
   write("hint-text", [state.stopped ? "Stopped by hand." : "", hint?.text || ""].filter(Boolean).join(" "));
   $("hint-do").hidden = !hint?.action;
-  write("hint-do", ACTIONS[hint?.action] || "");
+  write("hint-do", hint?.label || ACTIONS[hint?.action] || "");
   $("hint-do").disabled = state.read_only || state.busy !== "";
 }
 
@@ -93,7 +96,7 @@ function drawSteps() {
   state.steps.forEach((step, i) => {
     const [, words, press] = parent.children[i].children;
     const look = step.look && state.targets.includes(step.look);
-    const label = look ? "look at the " + step.look : LABELS[step.action] || "";
+    const label = look ? "look at the " + step.look : step.label || LABELS[step.action] || "";
     if (words.textContent !== step.text) words.textContent = step.text;
     if (press.textContent !== label) press.textContent = label;
     press.hidden = !label;
@@ -106,7 +109,7 @@ function doStep(i) {
   const step = state.steps[i];
   if (step.action === "preview") openSave();
   else if (step.action === "autofocus") act("autofocus", { span_um: 1000 });
-  else if (step.action) act(step.action);
+  else if (step.action) act(step.action, step.values);
   else if (step.look) act("look", { target: step.look });
 }
 
@@ -283,8 +286,8 @@ for (const [id, send] of [
   });
 }
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
-$("hint-do").addEventListener("click", () => act(state.hint.action));
-for (const name of ["home", "centre", "stop", "autoexpose", "refocus"])
+$("hint-do").addEventListener("click", () => act(state.hint.action, state.hint.values));
+for (const name of ["home", "centre", "stop", "autoexpose", "refocus", "cancel"])
   $(name).addEventListener("click", () => act(name));
 
 $("save-form").addEventListener("submit", async (event) => {

@@ -10,6 +10,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.live.field_pictures import field_pictures
 from emmc_rig.live.picture import KINDS, View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite, number_of
+from emmc_rig.live.steps import LONGEST_UNASKED_S
 from emmc_rig.live.watch import Watch
 
 
@@ -20,7 +21,7 @@ class SetupPage:
     """
 
     files = ("page.html", "page.js", *COMMON_FILES)
-    urgent = frozenset({"stop"})
+    urgent = frozenset({"stop", "cancel"})
 
     def __init__(self, watch: Watch, following: str = "") -> None:
         self._watch = watch
@@ -31,7 +32,8 @@ class SetupPage:
         self.actions: dict[str, Action] = {
             "exposure": lambda seconds: watch.set_exposure_s(finite(seconds)),
             "gain": lambda factor: watch.set_gain(finite(factor)),
-            "autoexpose": watch.auto_expose,
+            "autoexpose": lambda longest_s=LONGEST_UNASKED_S: watch.auto_expose(finite(longest_s)),
+            "cancel": watch.cancel,
             "jog": lambda axis, distance_um: watch.jog(str(axis), finite(distance_um)),
             "go": lambda axis, place_um: watch.go(str(axis), finite(place_um)),
             "home": lambda: watch.home(),

@@ -1,4 +1,4 @@
-"""The steps from an unpacked box to a plan: expose, centre the mask, align it, focus, save."""
+"""The steps from an unpacked box to a plan: centre the mask, expose, align it, focus, save."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from emmc_rig.live.save import Found
 
 WANTED_LEVELS = (0.7, 0.9)
 """Of white, where the brightest readings come."""
+WANTED_LEVEL = 0.8
 LOW_LEVEL = 0.35
 """Of white, from which on an exposure will do."""
+LONGEST_UNASKED_S = 4.0
+"""Exposure of one frame that an automatic exposure takes without being asked for more."""
 AWAY_UM = 5.0
 """From where an axis centres the mask or opens the aperture, it is not there."""
 ALIGNED_DEG = 0.1
@@ -27,15 +30,16 @@ def steps(
     has_focus: bool,
     found: Found,
     takes: Sequence[str],
+    hint: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:
     """Return for every step its name, whether it is done, what to say, and the action that does it.
 
     figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
-    mask or opens the aperture; None: not homed. takes: what can be saved.
+    mask or opens the aperture; None: not homed. takes: what can be saved. hint: what to do next.
     """
     return [
-        _exposure(figures),
         _centre(off_um),
+        _exposure(figures, hint),
         _align(mask, found),
         _focus(has_focus, found),
         {
@@ -49,7 +53,7 @@ def steps(
     ]
 
 
-def _exposure(figures: Mapping[str, Any] | None) -> dict[str, Any]:
+def _exposure(figures: Mapping[str, Any] | None, hint: Mapping[str, Any] | None) -> dict[str, Any]:
     if figures is None:
         return {"name": "exposure", "done": False, "text": "no frame yet", "action": ""}
     level, saturated = max(figures["brightest"].values()), figures["saturated"]
@@ -57,7 +61,32 @@ def _exposure(figures: Mapping[str, Any] | None) -> dict[str, Any]:
     text = f"the brightest readings reach {100 * level:.0f} % of white"
     if saturated > 0.001:
         text += f", {100 * saturated:.1f} % are saturated"
-    return {"name": "exposure", "done": done, "text": text, "action": "" if done else "autoexpose"}
+    step = {"name": "exposure", "done": done, "text": text, "action": "" if done else "autoexpose"}
+    if hint is not None and hint["action"] == "centre":
+        return step | {"text": "the picture is dark: centre the mask first", "action": ""}
+    if hint is not None and "values" in hint:
+        return step | {name: hint[name] for name in ("values", "label")}
+    return step
+
+
+def exposure_hint(level: float, exposure_s: float, longest_s: float) -> dict[str, Any]:
+    """Return what to do about a picture that is not dark, and too dim to go on with.
+
+    level: its brightest reading, of white. longest_s: that the camera offers.
+    """
+    text = f"The brightest reading is {100 * level:.1f} % of white"
+    needed_s = exposure_s * WANTED_LEVEL / level
+    if needed_s <= LONGEST_UNASKED_S:
+        return {"text": f"{text}.", "action": "autoexpose"}
+    text += f": {needed_s:.2g} s are needed"
+    if needed_s > longest_s:
+        return {
+            "text": f"{text}, the camera offers {longest_s:g} s: give it more light.",
+            "action": "",
+        }
+    # What is not known to a few percent may take a little longer.
+    values, label = {"longest_s": 1.5 * needed_s}, f"expose for {needed_s:.2g} s"
+    return {"text": f"{text}.", "action": "autoexpose", "values": values, "label": label}
 
 
 def _centre(off_um: Mapping[str, float | None]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.camera import Camera
-from drivers.errors import DriverError
+from drivers.errors import DriverError, ExposureStoppedError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.errors import AppError
@@ -29,7 +29,16 @@ from emmc_rig.live.driving import Driving
 from emmc_rig.live.focus import FocusMeter, Sharpness, sharpness
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.save import Files, Found
-from emmc_rig.live.steps import AWAY_UM, NO_FOCUS, WANTED_LEVELS, steps
+from emmc_rig.live.steps import (
+    AWAY_UM,
+    LONGEST_UNASKED_S,
+    LOW_LEVEL,
+    NO_FOCUS,
+    WANTED_LEVEL,
+    WANTED_LEVELS,
+    exposure_hint,
+    steps,
+)
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
 from emmc_rig.pages.frame_view import frame_figures, histogram, thinned
@@ -51,9 +60,12 @@ LEAST_LIKENESS = 0.3
 """Of a frame and the reference, below which their shift is not shown."""
 SEEK_S = 10.0
 """Between two searches for a mask that is not seen while nothing changes: each takes seconds."""
+DARK = "the picture is dark"
 AT_SHOT_UM = 2.0
 """From where a shot has the mask, it still stands there."""
-WANTED_LEVEL = 0.8
+LONG_S = 1.0
+"""An exposure that takes longer is counted down, and broken off for what is set meanwhile."""
+COUNT_S = 0.5
 EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
 
 
@@ -61,13 +73,14 @@ EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
 class Shown:
     """A frame with its number, and when it came (monotonic clock).
 
-    still: no axis moved since the frame before was asked for: one may be on its way meanwhile.
+    moves: how many moves the stage had made; None: it moved since this frame was asked for, or
+    since the one before where a camera streams, and one may be on its way meanwhile.
     """
 
     number: int
     frame: RawFrame
     at_s: float
-    still: bool
+    moves: int | None
 
 
 class Watch:
@@ -102,7 +115,9 @@ class Watch:
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
         self._focus = FocusMeter()
-        self._exposing = 0
+        self._exposing, self._dimmest_s, self._longest_s = 0, 0.0, LONGEST_UNASKED_S
+        self._unexposed = ""
+        self._exposed_s: tuple[float, float] | None = None
         self._seek_at_s = 0.0
         self._gauge: MaskGauge | None = None
         self._drawn, self._latency_s = 0, 0.0
@@ -116,6 +131,7 @@ class Watch:
             "busy": "",
             "stopped": False,
             "trouble": {"camera": "", "setting": "", "stage": "", "light field": ""},
+            "exposing": None,
             "reference": False,
             "targets": list(targets),
             "centre_um": self._centre_um,
@@ -128,7 +144,11 @@ class Watch:
         self._ending = threading.Event()
         self._wishes: Queue[Callable[[], object]] = Queue()
         self._driving = None if stage is None else Driving(stage, self._publish)
-        threads = {"live camera": self._take, "live levels": self._each(self._show_levels)}
+        threads = {
+            "live camera": self._take,
+            "live levels": self._each(self._show_levels),
+            "live countdown": self._count_down,
+        }
         if design is not None:
             threads["live mask"] = self._each(self._show_mask)
         if light_field is not None:
@@ -189,16 +209,67 @@ class Watch:
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Let the frames that follow be exposed for so long."""
-        self._exposing = 0
+        self._exposing, self._unexposed = 0, ""
         self._wishes.put(lambda: self._camera.set_exposure_s(exposure_s))
 
     def set_gain(self, gain: float) -> None:
         """Let the frames that follow have this gain."""
         self._wishes.put(lambda: self._camera.set_gain(gain))
 
-    def auto_expose(self) -> None:
-        """Let exposures follow until the brightest thousandth lies at WANTED_LEVEL of white."""
-        self._exposing = EXPOSURE_TRIES
+    def auto_expose(self, longest_s: float = LONGEST_UNASKED_S) -> None:
+        """Let exposures follow until the brightest thousandth lies at WANTED_LEVEL of white.
+
+        None of them takes more than `longest_s`; a picture that stays dark is not exposed on.
+        """
+        exposure_s, (shortest_s, _) = self._exposure_s, self._state["settings"]["exposure_limits_s"]
+        self._longest_s = max(longest_s, shortest_s)
+        self._dimmest_s = min(exposure_s, self._longest_s)
+        if self._dimmest_s < exposure_s:
+            self.set_exposure_s(self._dimmest_s)
+        self._exposing, self._unexposed = EXPOSURE_TRIES, ""
+
+    def cancel(self) -> None:
+        """Break off a long exposure, and go on as before it, LONGEST_UNASKED_S at most.
+
+        Raises AppError where this camera has to finish it first.
+        """
+        newest = self.newest()
+        before_s = LONGEST_UNASKED_S if newest is None else newest.frame.exposure_s
+        shortest_s, longest_s = self._state["settings"]["exposure_limits_s"]
+        under_way = self._exposed_s
+        self._exposing = 0
+        if shortest_s < longest_s:
+            chosen_s = min(before_s or LONGEST_UNASKED_S, self._exposure_s, LONGEST_UNASKED_S)
+            self.set_exposure_s(max(chosen_s, shortest_s))
+        if under_way is not None and not self._break_off():
+            left_s = sum(under_way) - time.monotonic()
+            raise AppError(f"this camera ends its exposure before it does anything: {left_s:.0f} s")
+
+    @property
+    def _exposure_s(self) -> float:
+        return self._state["settings"]["exposure_s"]
+
+    def _break_off(self) -> bool:
+        """Let the camera break off its exposure; False where it cannot."""
+        stop = getattr(self._camera, "stop_exposure", None)
+        return stop is not None and stop()
+
+    def _count_down(self) -> None:
+        """Show how long the exposure under way still takes, and break it off for a new setting."""
+        while not self._ending.wait(COUNT_S):
+            if (under_way := self._exposed_s) is None:
+                if self._state["exposing"] is not None:
+                    self._publish(exposing=None)
+                continue
+            began_s, exposure_s = under_way
+            left_s = began_s + exposure_s - time.monotonic()
+            if not self._wishes.empty() and left_s > LONG_S:
+                self._break_off()
+            # A camera that has its frames at once is not counted down.
+            elif time.monotonic() - began_s >= COUNT_S or self._state["exposing"] is not None:
+                left = {"exposure_s": exposure_s, "left_s": max(0.0, left_s)}
+                self._publish(exposing=left)
+        self._break_off()
 
     def look_at(self, target: str) -> None:
         """Let a simulated bench show the scene or the whiteboard; raises AppError."""
@@ -283,7 +354,7 @@ class Watch:
 
     def preview(self, what: list[str]) -> dict[str, str]:
         """Return what saving some of exposure, centre, mask and focus would change, as a diff."""
-        exposure_s = self._state["settings"]["exposure_s"]
+        exposure_s = self._exposure_s
         zero_um = None
         place = self._found.mask
         if place is not None and place.offset_um is not None and not place.ambiguity:
@@ -316,6 +387,13 @@ class Watch:
         """Something else will be seen: look for the mask again, compare with no older picture."""
         self._focus.forget()
         self._seek_at_s = 0.0
+        self._forget_unexposed()
+
+    def _forget_unexposed(self) -> None:
+        """Say no more why an automatic exposure ended: it was of another picture."""
+        if self._unexposed and self._state["trouble"]["setting"] == self._unexposed:
+            self._publish(setting="")
+        self._unexposed = ""
 
     def _publish(self, **parts: Any) -> None:
         """Replace parts of the state, by name, and wake who waits for it."""
@@ -326,23 +404,30 @@ class Watch:
                 else:
                     self._state[name] = value
             self._state["hint"] = self._hint()
-            self._state["steps"] = self._steps()
+            self._state["steps"] = self._steps(self._state["hint"])
             self._state["version"] += 1
             self._news.notify_all()
         for listener in self._listeners:
             listener()
 
-    def _hint(self) -> dict[str, str] | None:
-        """Return what to do next, in words, and the action that does it ("": a person's)."""
-        figures = self._state["figures"]
-        if figures is None:
-            return None
-        away = [
+    def _away(self) -> list[str]:
+        """Return the axes that stand elsewhere than centred, or not homed."""
+        return [
             axis
             for axis, place_um in self._centre_um.items()
             if self._driving is not None
             and abs((self._driving.position_um(axis) or np.inf) - place_um) > AWAY_UM
         ]
+
+    def _hint(self) -> dict[str, Any] | None:
+        """Return what to do next, in words, and the action that does it ("": a person's).
+
+        None: nothing, or the picture is from before the present place of the stage.
+        """
+        figures = self._state["figures"]
+        if figures is None or figures["moves"] is None or figures["moves"] != self._moved():
+            return None
+        away = self._away()
         level = max(figures["brightest"].values())
         if figures["dark"] and away:
             return {
@@ -354,13 +439,12 @@ class Watch:
         if figures["saturated"] > 0.001:
             return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
         if level < WANTED_LEVELS[0] / 4:
-            return {
-                "text": f"The brightest reading is {100 * level:.1f} % of white.",
-                "action": "autoexpose",
-            }
+            exposure_s = figures["exposure_s"] or self._exposure_s
+            longest_s = self._state["settings"]["exposure_limits_s"][1]
+            return exposure_hint(level, exposure_s, longest_s)
         return None
 
-    def _steps(self) -> list[dict[str, Any]]:
+    def _steps(self, hint: Mapping[str, Any] | None) -> list[dict[str, Any]]:
         """Return the steps from an unpacked box to a plan: see `emmc_rig.live.steps`."""
         figures, mask = self._state["figures"], self._state["mask"]
         places = (
@@ -373,7 +457,7 @@ class Watch:
             for axis, at in places.items()
             if axis in self._centre_um
         }
-        return steps(figures, mask, off_um, FOCUS in places, self._found, self._files.takes)
+        return steps(figures, mask, off_um, FOCUS in places, self._found, self._files.takes, hint)
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera
@@ -388,7 +472,7 @@ class Watch:
         }
 
     def _take(self) -> None:
-        stream, stood = None, False
+        stream, stood, streams = None, None, hasattr(self._camera, "stream")
         while not self._ending.is_set():
             started_s = time.monotonic()
             with self._news:
@@ -401,17 +485,25 @@ class Watch:
                 if not watched:
                     self._ending.wait(POLL_S)
                     continue
-                if stream is None and hasattr(self._camera, "stream"):
+                if stream is None and streams:
                     stream = self._camera.stream()  # pyright: ignore[reportAttributeAccessIssue]
                 moved = self._moved()
-                frame = next(stream) if stream is not None else self._camera.snap()
-                stands = moved is not None and moved == self._moved()
+                if self._exposure_s > LONG_S:
+                    self._exposed_s = time.monotonic(), self._exposure_s
+                try:
+                    frame = next(stream) if stream is not None else self._camera.snap()
+                finally:
+                    self._exposed_s = None
+                moves = moved if moved == self._moved() else None
+                still = moves if moves == stood or not streams else None
                 with self._news:
                     number = self._shown.number + 1 if self._shown is not None else 1
-                    self._shown = Shown(number, frame, time.monotonic(), stood and stands)
-                stood = stands
+                    self._shown = Shown(number, frame, time.monotonic(), still)
+                stood = moves
                 self._publish(frame=number, camera="")
                 self._ending.wait(max(0.0, FASTEST_S - (time.monotonic() - started_s)))
+            except ExposureStoppedError:
+                stream = None
             except (DriverError, StopIteration, ValueError) as fault:
                 stream = None
                 self._publish(camera=str(fault) or "the camera sends no more frames")
@@ -440,7 +532,7 @@ class Watch:
                 self._publish(setting=str(fault))
         if done:
             self._seek_at_s = 0.0
-            self._publish(settings=self._read_settings(), setting="")
+            self._publish(settings=self._read_settings(), setting=self._unexposed)
 
     def _each(self, work: Callable[[Shown], None]) -> Callable[[], None]:
         """Return a thread's work: `work` on the newest frame, again when there is a newer one."""
@@ -477,20 +569,31 @@ class Watch:
                 "brightest": figures.brightest,
                 "saturated": float(saturated),
                 "dark": is_dark(frame),
+                "moves": newest.moves,
                 "histogram": {name: row.tolist() for name, row in histogram(some).items()},
                 "focus": self._focus.add(frame, time.monotonic()),
                 "shift": _shift(frame, reference),
                 "exposure_s": frame.exposure_s,
             }
         )
-        if self._exposing:
-            self._expose_better(frame, max(figures.brightest.values()), float(saturated))
+        level, dark = max(figures.brightest.values()), is_dark(frame)
+        if self._exposing and newest.moves is not None:
+            self._expose_better(frame, level, float(saturated), dark)
+        elif not dark and level >= LOW_LEVEL and saturated <= 0.001:
+            self._forget_unexposed()
 
-    def _expose_better(self, frame: RawFrame, level: float, saturated: float) -> None:
+    def _give_up_exposing(self, why: str) -> None:
+        self._exposing, self._unexposed = 0, why
+        self._publish(setting=why)
+
+    def _expose_better(self, frame: RawFrame, level: float, saturated: float, dark: bool) -> None:
         """Choose the next exposure by a frame that was taken at the present one."""
-        settings = self._state["settings"]
-        exposure_s = settings["exposure_s"]
+        settings, exposure_s = self._state["settings"], self._exposure_s
         if frame.exposure_s and abs(frame.exposure_s / exposure_s - 1) > 0.05:
+            return
+        if dark and (away := self._away()):
+            where = f"{', '.join(away)} away from the centre"
+            self._give_up_exposing(f"{DARK}, {where}: centre the mask first")
             return
         low, high = WANTED_LEVELS
         self._exposing -= 1
@@ -500,21 +603,30 @@ class Watch:
         factor = 1 / LARGEST_STEP if level >= 1 else WANTED_LEVEL / max(level, 1e-6)
         factor = min(max(factor, 1 / LARGEST_STEP), LARGEST_STEP)
         shortest_s, longest_s = settings["exposure_limits_s"]
-        chosen_s = min(max(exposure_s * factor, shortest_s), longest_s)
-        if chosen_s == exposure_s:
-            self._exposing = 0
-            self._publish(setting=f"no better exposure within {shortest_s:g} to {longest_s:g} s")
+        chosen_s = min(max(exposure_s * factor, shortest_s), longest_s, self._longest_s)
+        if abs(chosen_s / exposure_s - 1) < 0.01:
+            if dark:
+                why = f"dark at {exposure_s:g} s too: light the lamp, open the aperture"
+            elif chosen_s > 0.99 * self._longest_s and chosen_s < 0.99 * longest_s:
+                why = ""  # the hint says how long an exposure is needed
+            else:
+                why = f"no better exposure within {shortest_s:g} to {longest_s:g} s"
+            self._give_up_exposing(why)
+            if dark:
+                self._wishes.put(lambda: self._camera.set_exposure_s(self._dimmest_s))
             return
         self._wishes.put(lambda: self._camera.set_exposure_s(chosen_s))
 
     def _show_mask(self, newest: Shown) -> None:
         assert self._design is not None
-        if time.monotonic() < self._seek_at_s or not newest.still:
+        if time.monotonic() < self._seek_at_s or newest.moves is None:
             self._ending.wait(POLL_S)
             return
         if is_dark(newest.frame):
-            self._publish(mask={"place": None, "why": "the picture is dark"})
+            self._publish(mask={"place": None, "why": DARK})
             return
+        if self._state["mask"] == {"place": None, "why": DARK}:
+            self._publish(mask=None)  # what is measured now takes seconds
         try:
             if self._gauge is None:
                 self._gauge = MaskGauge(self._design, newest.frame.mosaic.shape)
@@ -540,7 +652,7 @@ class Watch:
 
     def _show_light_field(self, newest: Shown) -> None:
         assert self.light_field is not None
-        if not newest.still:
+        if newest.moves is None:
             self._ending.wait(POLL_S)
             return
         try:
