@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -21,6 +21,7 @@ from scipy.sparse.linalg import spsolve
 from calibration.boards import Board
 from calibration.placement import Placement
 from calibration.shadow import Shadow, ShadowMask
+from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 SPLITS = 2

@@ -15,8 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 FINE_PX, COARSE_PX = 2.0, 4.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
@@ -21,6 +21,7 @@ from calibration.errors import CalibrationError
 from calibration.placement import SCALARS, Placement
 from calibration.repeats import Repeats, repeats_of
 from emmc_rig.model.camera import Camera, Plate, draw_plates
+from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 Pixels = NDArray[np.int64]

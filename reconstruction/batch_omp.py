@@ -17,9 +17,10 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import njit
 from reconstruction.errors import DictionaryError
 
 Array = NDArray[np.float32]

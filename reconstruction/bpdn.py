@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.settings import Settings
 from reconstruction import bpdn_kernels as kernels
 from reconstruction.errors import ReconstructionError

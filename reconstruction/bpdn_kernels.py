@@ -11,7 +11,8 @@ Kernels release the interpreter's lock, so that patches are solved in threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from emmc_rig.model.compiling import njit
 
 NONE = -1
 BINS = 256

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import njit
 from reconstruction.kernels import Data, Steps, fit_rows, mix, pull_row
 
 

@@ -17,9 +17,10 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
 NO_SHARE = np.zeros((0, 0), dtype=np.float32)

@@ -20,10 +20,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.settings import Settings
 from reconstruction.batch_omp import NO_ATOM, Array, bands, batch_omp

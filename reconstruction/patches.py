@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
 

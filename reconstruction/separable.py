@@ -18,10 +18,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.settings import Settings
 from reconstruction.batch_omp import Array, bands
 from reconstruction.dictionary import Dictionary

@@ -17,13 +17,13 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.geometry import centred_grid
 from simulators.flaws import (
     EVEN_BOARD,

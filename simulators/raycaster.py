@@ -22,8 +22,9 @@ Textures are (side, side, 4) RGBA in [0, 1], side a power of two.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+
+from emmc_rig.model.compiling import njit
 
 _QUOTED_VIEWS, _QUOTED_WIDTH_PX = 5, 256
 _START_D = 1.0
@@ -197,7 +198,7 @@ def _windows(
     return of_cards, of_balls
 
 
-_compiled = numba.njit(
+_compiled = njit(
     nogil=True,
     cache=True,
     error_model="numpy",

@@ -12,11 +12,12 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
+from emmc_rig.model.compiling import njit
 from emmc_rig.pages.frame_view import BAYER, srgb_codes
 
 Kind = Literal["mosaic", "colour"]

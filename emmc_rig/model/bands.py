@@ -14,7 +14,9 @@ from functools import cache, wraps
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
+
+from emmc_rig.model.compiling import njit
 
 _inside = threading.local()
 """Set in a thread that works on a band: what it calls runs in that thread alone."""

@@ -10,9 +10,9 @@ loops then run along x.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from emmc_rig.model.bands import row_kernel
+from emmc_rig.model.compiling import njit
 
 
 @njit(cache=True, fastmath=True)

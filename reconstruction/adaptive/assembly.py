@@ -13,10 +13,11 @@ from math import floor
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]

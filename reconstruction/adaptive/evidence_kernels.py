@@ -12,7 +12,8 @@ from __future__ import annotations
 from math import log, sqrt
 
 import numpy as np
-from numba import njit
+
+from emmc_rig.model.compiling import njit
 
 LANES = 64
 TERMS = 4

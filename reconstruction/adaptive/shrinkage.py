@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
 
 Array = NDArray[np.floating]

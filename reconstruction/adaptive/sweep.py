@@ -19,10 +19,10 @@ from math import floor
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, cubic
 from reconstruction.adaptive.labels import compatibility, posteriors

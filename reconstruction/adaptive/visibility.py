@@ -9,10 +9,10 @@ from __future__ import annotations
 from math import floor
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
+from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 REACH = 0.75

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import rows_of_colours
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures, median_s, start_timings

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures

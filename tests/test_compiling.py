@@ -1,0 +1,123 @@
+"""Machine code kept on the disk: it is never older than a source that it was made of."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from emmc_rig.model import compiling
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
+RENDER = """
+import numpy as np
+from reconstruction.adaptive import rays
+out = np.zeros((1, 1, 4, 6, 1), np.float32)
+texture = np.arange(192, dtype=np.float32).reshape(1, 12, 16)
+rays._render(np.full((1, 1, 4, 6), 0.3, np.float32), texture, 4, 0, 4, out)
+kept = rays._render.stats.cache_hits
+print(out.sum(), sum(kept.values()), rays._render.stats.cache_path)
+"""
+
+
+@pytest.fixture
+def copied(tmp_path, monkeypatch):
+    """The packages, copied to where a test may change them, without machine code."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    source = tmp_path / "source"
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return source
+
+
+def run(source, program=RENDER):
+    """Return what a program prints in a new process: here a sum, 1 if kept code ran, its folder."""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=source, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    total, kept, folder = done.stdout.split()
+    return float(total), int(kept), Path(folder)
+
+
+def edit(file, old, new):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_a_helper_changed_in_another_file_changes_what_kernels_compute(copied, monkeypatch):
+    before, kept, _ = run(copied)
+    assert kept == 0
+    assert run(copied)[:2] == (before, 1)
+    edit(copied / "reconstruction/adaptive/assembly.py", "* t * t + 1.0", "* t * t + 1.3")
+    after = run(copied)[0]
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(copied / "empty"))
+    anew, kept, folder = run(copied)
+    assert kept == 0
+    assert copied / "empty" in folder.parents
+    assert after == anew != before
+
+
+def test_a_constant_changed_in_a_file_imported_through_others_changes_the_state(tmp_path):
+    package = tmp_path / "plugin"
+    package.mkdir()
+    for name, text in {
+        "__init__": "",
+        "kernels": "from plugin import rules\nfrom plugin.other import (\n    ONE,\n)\n",
+        "rules": "import plugin.level\n",
+        "other": "from .level import ONE\nfrom emmc_rig.model import bands\n",
+        "level": "ONE = 1\n",
+        "beside": "ONE = 1\n",
+    }.items():
+        (package / f"{name}.py").write_text(text)
+
+    def state():
+        compiling._read.cache_clear()
+        return compiling._state(package / "kernels.py")
+
+    before = state()
+    assert before[0] == "plugin.kernels"
+    (package / "beside.py").write_text("ONE = 2\n")
+    assert state() == before
+    (package / "level.py").write_text("ONE = 2\n")
+    assert state() != before
+    imported = compiling._read(package / "other.py", tmp_path)[1]
+    assert Path(compiling.__file__).with_name("bands.py") in imported
+
+
+def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_code(copied):
+    blocked = copied / "reconstruction/adaptive/__pycache__"
+    blocked.mkdir(exist_ok=True)
+    (blocked / "kernels").write_text("no folder")
+    before, _, folder = run(copied)
+    assert copied.parent / "home" in folder.parents
+    assert run(copied)[:2] == (before, 1)
+
+
+def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
+    file = tmp_path / "kernels.py"
+    file.write_text("ONE = 1\n")
+    for name, days in (("old", 31), ("recent", 29)):
+        folder = tmp_path / "__pycache__" / "kernels" / name
+        folder.mkdir(parents=True)
+        os.utime(folder, (time.time() - days * 86400,) * 2)
+    mine = compiling._folder(file, "")
+    assert mine is not None
+    assert {path.name for path in mine.parent.iterdir()} == {"recent", mine.name}
+
+
+def test_every_kernel_whose_file_imports_others_of_the_project_is_compiled_with_its_sources():
+    plain = re.compile(r"^from numba import .*\bn?jit\b|\bnumba\.n?jit\b", re.MULTILINE)
+    project = re.compile(rf"^(from|import) +({'|'.join(PACKAGES)})\b", re.MULTILINE)
+    own = ROOT / "emmc_rig/model/compiling.py"
+    for name in PACKAGES:
+        for file in sorted(set((ROOT / name).rglob("*.py")) - {own}):
+            text = file.read_text()
+            assert not (plain.search(text) and project.search(text)), file
