@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, wraps
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,17 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
     wait(at_work)
     for band in at_work:
         band.result()
+
+
+def summed_in_bands(work: Callable[[int, int, int], None], rows: int, reach_rows: float) -> None:
+    """Call work(sums, first, last + 1) for bands of rows that add to one of two sums, 0 or 1.
+
+    A row adds at most reach_rows away, so that bands of the same sum never meet. What is added, and
+    in which order, depends on no number of threads, as rounding otherwise would.
+    """
+    apart = ceil(2 * reach_rows) + 1
+    bands = max(2, rows // apart // 2 * 2)
+    in_bands(lambda band, first, last: work(band % 2, first, last), rows, bands)
 
 
 def row_kernel(

@@ -13,10 +13,9 @@ from math import floor
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -301,7 +300,7 @@ class Layout:
     """Where the readings of Psi see a texture (c, y, x) of `shape`.
 
     boxes: (reading, 4), first row and column, height and width; height 0: rays. starts:
-    (reading + 1,), where each reading's cells begin.
+    (reading + 1,), where each reading's cells begin. reach_rows: see `reach_rows`.
     """
 
     psi: ImagingMatrix
@@ -309,6 +308,7 @@ class Layout:
     boxes: NDArray[np.int32]
     starts: NDArray[np.int64]
     cells: NDArray[np.float32]
+    reach_rows: float
 
     def _rows(self, first: int, last: int) -> tuple[Any, ...]:
         psi = self.psi
@@ -339,20 +339,24 @@ class Layout:
     def returned(self, frames: Array) -> Array:
         """Return the adjoint of `read`, (c, y, x)."""
         frames = np.ascontiguousarray(frames, dtype=np.float32)
-        rows = frames.shape[1]
-        # Bands of rows reach the same texture: each adds to its own.
-        textures = np.zeros(
-            (min(rows, get_num_threads()), int(np.prod(self.shape))), dtype=np.float32
-        )
+        sums = np.zeros((2, int(np.prod(self.shape))), dtype=np.float32)
 
-        def work(band: int, first: int, last: int) -> None:
-            _return(*[*self._rows(first, last), frames, textures[band]])
+        def work(which: int, first: int, last: int) -> None:
+            _return(*[*self._rows(first, last), frames, sums[which]])
 
-        in_bands(work, rows)
-        total = textures[0]
-        for other in textures[1:]:
-            total += other
-        return total.reshape(self.shape)
+        summed_in_bands(work, frames.shape[1], self.reach_rows)
+        sums[0] += sums[1]
+        return sums[0].reshape(self.shape)
+
+
+def reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
+    """Return how many rows of pixels away from its own a pixel's taps lie, at most.
+
+    disparity: (v, u, y, x).
+    """
+    steps = np.abs(np.arange(len(disparity)) - len(disparity) // 2)
+    furthest = float((np.abs(disparity).max(axis=(1, 2, 3)) * steps).max())
+    return (furthest + TAPS / 2) / psi.binning
 
 
 def laid_out(
@@ -396,4 +400,4 @@ def laid_out(
         )
 
     in_bands(lay, psi.frames_shape[1])
-    return Layout(psi, shape, boxes, starts, cells)
+    return Layout(psi, shape, boxes, starts, cells, reach_rows(psi, disparity))

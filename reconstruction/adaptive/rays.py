@@ -14,13 +14,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out
+from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out, reach_rows
 
 Array = NDArray[np.floating]
 
@@ -184,19 +183,15 @@ class Surfaces:
         return frames
 
     def _back(self, frames: Array) -> Array:
-        rows = self.psi.frames_shape[1]
         frames = np.ascontiguousarray(frames, dtype=np.float32)
-        # Bands of rows reach the same texture: each adds to its own.
-        textures = [
-            np.zeros(self.texture_shape, dtype=np.float32)
-            for _ in range(min(rows, get_num_threads()))
-        ]
+        sums = np.zeros((2, *self.texture_shape), dtype=np.float32)
 
-        def work(band: int, first: int, last: int) -> None:
-            _follow(*[*self._rays(first, last), True, textures[band], frames])
+        def work(which: int, first: int, last: int) -> None:
+            _follow(*[*self._rays(first, last), True, sums[which], frames])
 
-        in_bands(work, rows, len(textures))
-        return sum(textures[1:], start=textures[0])
+        summed_in_bands(work, frames.shape[1], reach_rows(self.psi, self.disparity))
+        sums[0] += sums[1]
+        return sums[0]
 
     def forward(self, texture: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of a texture (c, y, x)."""

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
 
@@ -295,20 +294,17 @@ def denoised(
     begins = (*picture.shape[:2], picture.shape[2] - SIDE + 1)
     analysed = np.empty((*begins, SIDE), dtype=np.float32)
     in_bands(lambda _, top, end: _rows_analysed(opponent, top, end, analysed), picture.shape[1])
-    # Blocks of two bands overlap: each adds to its own sums.
-    bands = min(len(rows), get_num_threads())
-    totals = np.zeros((bands, *analysed.shape), dtype=np.float32)
-    weights = np.zeros((bands, *begins), dtype=np.float32)
+    totals = np.zeros((2, *analysed.shape), dtype=np.float32)
+    weights = np.zeros((2, *begins), dtype=np.float32)
     unlike = np.float32(ALIKE * sigma**2)
 
-    def work(band: int, begin: int, end: int) -> None:
-        added = totals[band], weights[band]
+    def work(which: int, begin: int, end: int) -> None:
+        added = totals[which], weights[which]
         _shrink(analysed, spare, SIDE, cuts, unlike, reach, rows[begin:end], columns, *added)
 
-    in_bands(work, len(rows), bands)
-    for more in range(1, bands):
-        totals[0] += totals[more]
-        weights[0] += weights[more]
+    summed_in_bands(work, len(rows), (reach + SIDE / 2) / step)
+    totals[0] += totals[1]
+    weights[0] += weights[1]
     total = np.zeros(picture.shape, dtype=np.float32)
     in_bands(lambda _, top, end: _rows_synthesised(totals[0], top, end, total), picture.shape[1])
     mean = total / np.stack([_spread(part, picture.shape[2]) for part in weights[0]])
