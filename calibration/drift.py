@@ -31,6 +31,7 @@ from calibration.parametric import Stages
 from calibration.placement import Placement
 from calibration.registration import correlated
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
@@ -353,6 +354,7 @@ def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> flo
     return float(np.sqrt(np.mean(moved_x**2 + moved_y**2))) / pixel_um
 
 
+@one_blas_thread()
 def find_drift(
     taken: Captures,
     mask: ShadowMask,

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from threadpoolctl import threadpool_limits
 
 from calibration.boards import Board
 from calibration.errors import CalibrationError
@@ -32,6 +31,7 @@ from calibration.placement import (
 from calibration.registration import register
 from calibration.shadow import OF_VIEW, Shadow, ShadowMask
 from calibration.view_errors import bias_covariance
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings
 
@@ -269,7 +269,7 @@ def _posterior(
     return loss + 0.5 * float(np.sum(prior * (placement.vector() - centre) ** 2))
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # its threads wait on those of the kernels
+@one_blas_thread()
 def fit_placement(
     boards: Sequence[Board],
     camera: Camera,

@@ -64,6 +64,7 @@ from calibration.whiteboard import (
     lamps_needed,
     measure_psi,
 )
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
@@ -103,6 +104,7 @@ class Outcome:
         return self.calibrations[self.chosen]
 
 
+@one_blas_thread()
 def calibrate(
     camera: Camera,
     design: ImagingMatrix | PsiLayout,

@@ -17,6 +17,7 @@ from calibration.boards import Board
 from calibration.errors import CalibrationError
 from calibration.placement import Placement
 from calibration.shadow import Shadow, ShadowMask
+from emmc_rig.model.blas import one_blas_thread
 
 Array = NDArray[np.floating]
 FEWEST = 8
@@ -124,6 +125,7 @@ class StageMap:
         ]
 
 
+@one_blas_thread()
 def stage_map(
     commanded_um: Sequence[tuple[float, float]],
     came_from: Sequence[tuple[int, int]],

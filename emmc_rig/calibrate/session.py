@@ -19,6 +19,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
 from emmc_rig.model.arguments import path_of
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
@@ -199,6 +200,7 @@ def calibrate_into(
     return calibration
 
 
+@one_blas_thread()
 def _calibrated(
     session: Session, route: str, sensor: bool, stage: bool, watcher: Watcher, empty: NewArray
 ) -> SessionCalibration:

@@ -32,6 +32,7 @@ from emmc_rig.calibrate.settings import ROUTES, CalibrateSettings
 from emmc_rig.calibrate.stored import REPORT, outcome_figures, save_outcome
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
@@ -57,6 +58,7 @@ class Run:
     stage: StageMap | None
 
 
+@one_blas_thread()
 def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None) -> Run:
     """Capture the whiteboards that the route needs from the simulated bench, and calibrate."""
     watcher = watcher or Silent()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, create_model
 
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -97,6 +98,7 @@ def find_method(name: str) -> Method:
     raise ReconstructionError(f"no method '{name}': {nearest_of(name, METHODS)}")
 
 
+@one_blas_thread()
 def reconstruct(
     name: str,
     psi: ImagingMatrix,

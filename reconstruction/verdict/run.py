@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs, checked_noise
@@ -28,6 +29,7 @@ FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
 
 
+@one_blas_thread()
 def reconstruct_judged(
     name: str,
     psi: ImagingMatrix,
