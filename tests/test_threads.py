@@ -1,0 +1,103 @@
+"""What is computed is the same to the last bit with any number of threads."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+from reconstruction.methods import METHODS
+
+BEGIN = """
+import hashlib, json, sys
+import cv2, numba, numpy as np
+from threadpoolctl import threadpool_limits
+import emmc_rig as emmc
+
+def digests(*values):
+    return [hashlib.sha256(np.asarray(value).tobytes()).hexdigest()[:12] for value in values]
+
+def for_each_number_of_threads(call):
+    found = {}
+    for threads in (1, 2, 3, 8):
+        numba.set_num_threads(threads)
+        cv2.setNumThreads(threads)
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(threads)
+        with threadpool_limits(threads):
+            found[threads] = call()
+    return found
+"""
+METHOD = """
+from reconstruction.methods import MethodSettings
+
+camera = emmc.camera("scenario-ii-cfa", 2)
+psi = camera.psi((32, 40))
+frames = camera.expose(emmc.scene("deep-occlusions", size=(32, 40)), seed=0, psi=psi)
+SLOW = "dict-ista", "dict-fista"
+slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})
+
+def solved(method):
+    result = emmc.reconstruct(psi, frames, method, settings=slow if method in SLOW else None)
+    maps = [result.maps[name] for name in sorted(result.maps)]
+    stated = result.metrics()
+    stated = {name: value for name, value in stated.items() if "seconds" not in name}
+    return [*digests(result.light_field, *maps), repr(stated)]
+
+print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
+"""
+ROUTES = """
+from emmc_rig.calibrate.bench import BenchTruth
+from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.calibrate.simulated import run_calibration
+from emmc_rig.model.camera import Camera
+
+camera = Camera.model_validate_json(sys.argv[1])
+
+def calibrated():
+    truth = BenchTruth(rays_per_view=64)
+    run = run_calibration(CalibrateSettings("small", camera, (32, 40), truth=truth))
+    stated = {name: value for name, value in run.metrics.items() if "seconds" not in name}
+    return {"stated": repr(stated)} | {
+        name: digests(one.psi.weights, one.deviation) for name, one in
+        run.outcome.calibrations.items()
+    }
+
+print(json.dumps(for_each_number_of_threads(calibrated)))
+"""
+
+
+def printed(program, *arguments):
+    """Return what a program prints that may set up to eight threads, of BLAS too."""
+    eight = {"NUMBA_NUM_THREADS": "8", "OPENBLAS_NUM_THREADS": "8"}
+    done = subprocess.run(
+        [sys.executable, "-c", BEGIN + program, *arguments],
+        capture_output=True, text=True, env={**os.environ, **eight},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def differing(found):
+    """Return which numbers of threads gave something else than one thread."""
+    return [threads for threads, value in found.items() if value != found["1"]]
+
+
+def test_every_method_gives_the_same_light_field_maps_and_figures_with_any_number_of_threads():
+    methods = [name for name in METHODS if name != "unrolled" or find_spec("torch")]
+    found = printed(METHOD, *methods)
+    assert sorted(found) == sorted(methods)
+    assert {name: differing(of) for name, of in found.items() if differing(of)} == {}
+
+
+def test_every_route_of_calibration_gives_the_same_psi_with_any_number_of_threads():
+    camera = {
+        "title": "small",
+        "views": [3, 3],
+        "lens": {"aperture_cell_mm": 8.0},
+        "sensor": {"cfa": "rggb"},
+        "masks": {"code": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}},
+    }
+    found = printed(ROUTES, json.dumps(camera))
+    assert set(found["1"]) == {"stated", "parametric", "mixed", "free", "combined"}
+    assert differing(found) == []
