@@ -107,7 +107,8 @@ def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
     for name, days in (("old", 31), ("recent", 29)):
         folder = tmp_path / "__pycache__" / "kernels" / name
         folder.mkdir(parents=True)
-        os.utime(folder, (time.time() - days * 86400,) * 2)
+        then = time.time() - days * 86400
+        os.utime(folder, (then, then))
     mine = compiling._folder(file, "")
     assert mine is not None
     assert {path.name for path in mine.parent.iterdir()} == {"recent", mine.name}

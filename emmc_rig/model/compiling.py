@@ -22,12 +22,14 @@ from typing import Any
 
 import llvmlite
 import numba
+from numba.core import config
 
 _PROJECT = Path(__file__).parents[2]
 _PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
 _IMPORT = re.compile(r"^from +([\w.]+) +import +(\([^)]*\)|.*)|^import +([\w.]+)", re.MULTILINE)
 _UNUSED_DAYS = 30
 """Machine code that no process has loaded for so long is removed: its sources have changed."""
+_numba: Any = config
 _placing = threading.Lock()
 
 
@@ -44,11 +46,11 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
         if folder is None:
             return numba.njit(*arguments, **options)(kernel)
         with _placing:  # Numba reads the folder once, here, and offers no other way to choose it
-            before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+            before, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
             try:
                 return numba.njit(*arguments, cache=True, **options)(kernel)
             finally:
-                numba.config.CACHE_DIR = before
+                _numba.CACHE_DIR = before
 
     return compiled
 
@@ -56,7 +58,7 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
 def _user_folder() -> str:
     """Return the folder that NUMBA_CACHE_DIR names, or an empty text."""
     with _placing:
-        return numba.config.CACHE_DIR
+        return _numba.CACHE_DIR
 
 
 @cache
