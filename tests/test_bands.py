@@ -2,12 +2,13 @@
 
 import os
 import threading
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from numba import get_num_threads
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_bands, summed_in_bands
 
 pytestmark = pytest.mark.skipif(get_num_threads() < 2, reason="needs two threads")
 
@@ -64,3 +65,14 @@ def test_a_forked_process_has_threads_of_its_own():
     if child == 0:
         os._exit(0 if (rows_done(8)[0] == 1).all() else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 48, 97])
+@pytest.mark.parametrize("reach", [0.5, 3, 11])
+def test_bands_that_add_to_the_same_sum_are_farther_apart_than_they_reach(rows, reach):
+    calls = []
+    summed_in_bands(lambda *call: calls.append(call), rows, reach)
+    assert sorted(row for _, first, last in calls for row in range(first, last)) == [*range(rows)]
+    for which in (0, 1):
+        mine = sorted(call for call in calls if call[0] == which)
+        assert all(after[1] - before[2] >= 2 * reach for before, after in pairwise(mine))

@@ -6,6 +6,9 @@ import subprocess
 import sys
 from importlib.util import find_spec
 
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from emmc_rig.model.blas import one_blas_thread
 from reconstruction.methods import METHODS
 
 BEGIN = """
@@ -101,3 +104,18 @@ def test_every_route_of_calibration_gives_the_same_psi_with_any_number_of_thread
     found = printed(ROUTES, json.dumps(camera))
     assert set(found["1"]) == {"stated", "parametric", "mixed", "free", "combined"}
     assert differing(found) == []
+
+
+def blas_threads():
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_blas_keeps_one_thread_until_the_last_of_overlapping_calls_ends():
+    with threadpool_limits(2, "blas"):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert blas_threads() == {1}
+        second.__exit__(None, None, None)
+        assert blas_threads() == {2}
