@@ -20,6 +20,12 @@ import emmc_rig as emmc
 def digests(*values):
     return [hashlib.sha256(np.asarray(value).tobytes()).hexdigest()[:12] for value in values]
 
+def without_times(stated):
+    if not isinstance(stated, dict):
+        return stated
+    kept = {name: without_times(value) for name, value in stated.items()}
+    return {name: value for name, value in kept.items() if "seconds" not in name}
+
 def for_each_number_of_threads(call):
     found = {}
     for threads in (1, 2, 3, 8):
@@ -43,8 +49,7 @@ slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})
 def solved(method):
     result = emmc.reconstruct(psi, frames, method, settings=slow if method in SLOW else None)
     maps = [result.maps[name] for name in sorted(result.maps)]
-    stated = result.metrics()
-    stated = {name: value for name, value in stated.items() if "seconds" not in name}
+    stated = without_times(result.metrics())
     return [*digests(result.light_field, *maps), repr(stated)]
 
 print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
