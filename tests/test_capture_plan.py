@@ -237,7 +237,7 @@ def test_darks_of_the_shots_come_after_the_scene_is_metered_and_before_the_first
     first_shot = min(place for name, place in places.items() if name.startswith("shot-"))
     for frame in darks:
         assert places[frame.id] < first_shot
-        assert frame.exposure_s is not None or places[meter] < places[frame.id]
+        assert frame.exposure_s is not None or places[str(meter)] < places[frame.id]
 
 
 @pytest.mark.parametrize("name", list(shipped_cameras()))

@@ -75,6 +75,7 @@ def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and
     turned, stretched = place.rotation_deg + 0.7, place.scale - 0.9965
     assert abs(turned) < min(0.1, 4 * place.rotation_deviation_deg)
     assert abs(stretched) < min(1e-3, 4 * place.scale_deviation)
+    assert place.offset_um is not None
     assert np.abs(np.subtract(place.offset_um, (11.0, -7.0))).max() < 1.5
     assert bool(place.ambiguity) == (name == "dual-mask-sinusoids")
 
@@ -108,6 +109,7 @@ def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
     camera = with_pattern(kind="tile", cells=RANDOM[:8, :8].tolist())
     place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=offset_um))
     period_um = 8 * CELL_UM
+    assert place.offset_um is not None
     off_um = np.subtract(place.offset_um, offset_um)
     assert np.abs(off_um - period_um * np.round(off_um / period_um)).max() < 1.5
     assert np.abs(place.offset_um).max() < period_um / 2 + 1.5

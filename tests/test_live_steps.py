@@ -121,6 +121,7 @@ def test_the_place_of_a_mask_that_repeats_is_not_written(tmp_path):
         rig.camera, rig.stage, rig.attendant.place, (), centre_um, camera, None, Files(None, path)
     ) as watch:
         unique = found().mask
+        assert unique is not None
         for place in (unique, replace(unique, ambiguity="it repeats")):
             watch._found = Found(mask=place)
             assert ("zero_um" in watch.preview(["centre"])["diff"]) == (place is unique)

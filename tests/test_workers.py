@@ -114,7 +114,7 @@ def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others
 def test_a_capture_of_one_block_comes_out_as_without_workers(place):
     (place / "none.yaml").write_text(yaml.safe_dump({"tv": BLOCKS["tv"]}))
     here(place, "shared", settings="none.yaml", method="adaptive-fast")
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)  # pyright: ignore
     with result_folder(place / "one", "reconstruct") as new:
         settings = load_settings(place / "none.yaml")
         reconstruct_folder(place / "frames", new, "adaptive-fast", settings=settings)

@@ -52,7 +52,7 @@ def export(
         bars.begin("write")
         known[form].write(folder, opened)
         files = [path for path in folder.rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files)
+        written = sum(path.stat().st_size for path in files)
         write_metrics(
             folder,
             {
@@ -60,9 +60,9 @@ def export(
                 "format": form,
                 "keeps": known[form].keeps,
                 "shape": list(opened.light_field.shape),
-                "bytes": size,
+                "bytes": written,
             },
         )
         shown = files[0].relative_to(folder) if len(files) == 1 else None
-    tell(f"wrote {out / shown if shown else out}, {shown_bytes(size)} in {len(files)} file(s)")
+    tell(f"wrote {out / shown if shown else out}, {shown_bytes(written)} in {len(files)} file(s)")
     give_result(out)
