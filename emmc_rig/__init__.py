@@ -16,16 +16,14 @@ mend are of the classes in `ERRORS`, each one line that says what to do.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from emmc_rig.version import __version__
 
 if TYPE_CHECKING:
-    from emmc_rig.calibrate.session import calibrate
-    from emmc_rig.capture.command import capture
+    from emmc_rig.acquisition.command import capture
+    from emmc_rig.bench.rig_config import rig
     from emmc_rig.errors import ERRORS
     from emmc_rig.files.cameras import find_camera as camera
     from emmc_rig.files.scenes import Scene
@@ -33,25 +31,25 @@ if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
-    from emmc_rig.reconstruct.inputs import open_frames
-    from emmc_rig.reconstruct.result import Result
-    from emmc_rig.reconstruct.solve import reconstruct
-    from emmc_rig.rig.rig_config import rig
+    from emmc_rig.processing.inputs import open_frames
+    from emmc_rig.processing.reconstructing import reconstruct
+    from emmc_rig.processing.result import Result
+    from emmc_rig.processing.session_calibration import calibrate
     from emmc_rig.session.session import Session
 
 _HOME = {
-    "calibrate": "emmc_rig.calibrate.session:calibrate",
+    "calibrate": "emmc_rig.processing.session_calibration:calibrate",
     "camera": "emmc_rig.files.cameras:find_camera",
-    "capture": "emmc_rig.capture.command:capture",
-    "rig": "emmc_rig.rig.rig_config:rig",
+    "capture": "emmc_rig.acquisition.command:capture",
+    "rig": "emmc_rig.bench.rig_config:rig",
     "scene": "emmc_rig.files.scenes:open_scene",
-    "open_frames": "emmc_rig.reconstruct.inputs:open_frames",
-    "reconstruct": "emmc_rig.reconstruct.solve:reconstruct",
+    "open_frames": "emmc_rig.processing.inputs:open_frames",
+    "reconstruct": "emmc_rig.processing.reconstructing:reconstruct",
     "Camera": "emmc_rig.model.camera:Camera",
     "ERRORS": "emmc_rig.errors:ERRORS",
     "Frames": "emmc_rig.model.frames:Frames",
     "Psi": "emmc_rig.model.sensing:ImagingMatrix",
-    "Result": "emmc_rig.reconstruct.result:Result",
+    "Result": "emmc_rig.processing.result:Result",
     "Scene": "emmc_rig.files.scenes:Scene",
     "Session": "emmc_rig.session.session:Session",
 }
@@ -76,17 +74,6 @@ __all__ = [
 ]
 
 
-class _PublicModule(ModuleType):
-    """The package as a module in which a public name is never its folder of the same name.
-
-    Importing `emmc_rig.capture.plan` would bind `emmc_rig.capture` to the folder.
-    """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _HOME and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -98,6 +85,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-sys.modules[__name__].__class__ = _PublicModule

@@ -18,7 +18,8 @@ from calibration.whiteboard import (
     lamps_needed,
     measure_psi,
 )
-from emmc_rig.capture.direct import capture_shots, capture_whiteboards, whiteboard_exposures
+from emmc_rig.acquisition.direct import capture_shots, capture_whiteboards, whiteboard_exposures
+from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
@@ -36,7 +37,6 @@ from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.rig.hardware import simulated_rig
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.missed import missed_readings

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from capture_rigs import begun, plan_and_camera, still_rig
 
-from emmc_rig.capture import writer
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition import writer
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session import journal, lock, session, storage
 from emmc_rig.session.lock import held

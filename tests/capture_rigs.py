@@ -12,9 +12,9 @@ import yaml
 
 from drivers.camera import CameraIdentity, RawFileCamera
 from drivers.dng import encode_dng
-from emmc_rig.capture.command import Wish, new_session, planned_frames
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.rig.hardware import Rig
+from emmc_rig.acquisition.command import Wish, new_session, planned_frames
+from emmc_rig.acquisition.plan import Plan, planned_camera
+from emmc_rig.bench.hardware import Rig
 from simulators.clock import ManualClock
 from simulators.still import StillStage
 

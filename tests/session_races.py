@@ -17,10 +17,10 @@ import typer
 from capture_rigs import still_rig
 
 from emmc_rig import cli
-from emmc_rig.calibrate import session as calibrate_session
-from emmc_rig.capture import command
+from emmc_rig.acquisition import command
 from emmc_rig.errors import AppError
 from emmc_rig.pages import session_sheet
+from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import export, prune
 from emmc_rig.session.readings import whiteboards
 

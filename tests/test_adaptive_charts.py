@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from emmc_rig.capture.plan import planned_camera
-from emmc_rig.capture.until import refuse_without_choice
+from emmc_rig.acquisition.plan import planned_camera
+from emmc_rig.acquisition.until import refuse_without_choice
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.progress import Silent
 from emmc_rig.session.session import Session

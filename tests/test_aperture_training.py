@@ -12,8 +12,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import camera_file, find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import load_camera
-from emmc_rig.progress import Silent
-from emmc_rig.reconstruct.aperture_training import (
+from emmc_rig.processing.aperture_training import (
     PATCH_PX,
     ApertureTraining,
     Moments,
@@ -22,7 +21,8 @@ from emmc_rig.reconstruct.aperture_training import (
     patch_moments,
     train_aperture,
 )
-from emmc_rig.reconstruct.solve import reconstruct
+from emmc_rig.processing.reconstructing import reconstruct
+from emmc_rig.progress import Silent
 
 VIEWS = 25
 
@@ -101,7 +101,7 @@ def test_one_view_of_no_noise_is_known_and_nothing_else_of_independent_views():
 
 
 def test_the_command_writes_a_camera_that_other_commands_take(run, monkeypatch, tmp_path):
-    from emmc_rig.reconstruct import aperture_training
+    from emmc_rig.processing import aperture_training
 
     monkeypatch.setattr(aperture_training, "ApertureTraining", partial(ApertureTraining, worlds=2))
     code, out, err = run("train", "--aperture", "--out", "a.yaml", "--seed", 1)
@@ -197,7 +197,7 @@ def test_the_shipped_aperture_is_better_where_neither_worlds_nor_a_linear_decode
 
 
 def test_the_folder_of_the_new_file_is_made_as_for_other_trainings(run, monkeypatch, tmp_path):
-    from emmc_rig.reconstruct import aperture_training
+    from emmc_rig.processing import aperture_training
 
     monkeypatch.setattr(aperture_training, "ApertureTraining", partial(ApertureTraining, worlds=1))
     assert run("train", "--aperture", "--out", "made/a.yaml")[0] == 0

@@ -12,17 +12,17 @@ import emmc_rig as emmc
 from calibration.drift import DriftSettings
 from calibration.placement import SCALARS
 from calibration.planning import DARK_FRAMES, REFERENCE_FRAMES
-from emmc_rig.calibrate.bench import BenchTruth, StageFaults, WhiteboardBench
-from emmc_rig.calibrate.comparison import in_three_colours, true_error
-from emmc_rig.calibrate.drift import run_drift
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.calibrate.simulated import run_calibrate, run_calibration
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.results import save_frames
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
+from emmc_rig.processing.bench import BenchTruth, StageFaults, WhiteboardBench
+from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.comparison import in_three_colours, true_error
+from emmc_rig.processing.session_drift import run_drift
+from emmc_rig.processing.simulated import run_calibrate, run_calibration
 from emmc_rig.progress import Silent
 from emmc_rig.study.checks.check_sweep import CHECKS, run_checks
 from emmc_rig.study.checks.effects import psnr_cost_db

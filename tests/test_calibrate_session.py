@@ -8,12 +8,12 @@ import pytest
 import yaml
 from programs import exit_code
 
-from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
-from emmc_rig.capture.plan import load_plan
+from emmc_rig.acquisition.plan import load_plan
+from emmc_rig.bench.hardware import NO_FLAWS
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.rig.hardware import NO_FLAWS
+from emmc_rig.processing.bench import BenchTruth, WhiteboardBench
 from emmc_rig.session.readings import camera_of, session_readings
 from emmc_rig.session.session import Session
 from simulators.bench import MountingErrors

@@ -92,7 +92,7 @@ def camera_kind(request):
 @pytest.fixture
 def camera(camera_kind, request, tmp_path):
     if camera_kind == "hardware":
-        from emmc_rig.rig.hardware import open_camera
+        from emmc_rig.bench.hardware import open_camera
 
         opened: Camera = open_camera(request.config.getoption("--camera"))
     else:

@@ -15,6 +15,8 @@ from drivers.dng import encode_dng
 from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from drivers.folder import FolderCamera
 from drivers.raw import decode_raw
+from emmc_rig.bench import hardware
+from emmc_rig.bench.hardware import open_camera, scene_simulator
 from emmc_rig.commands import device_cameras
 from emmc_rig.commands.device_cameras import register, save_frame
 from emmc_rig.errors import AppError, WrongUsageError
@@ -25,8 +27,6 @@ from emmc_rig.pages.frame_view import (
     preview,
     white_balance,
 )
-from emmc_rig.rig import hardware
-from emmc_rig.rig.hardware import open_camera, scene_simulator
 from emmc_rig.study.benchmarks.devices import picture_timing
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction

@@ -17,8 +17,8 @@ from capture_rigs import begun, plan_and_camera, still_rig, wish_for
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from drivers.raw import decode_raw
-from emmc_rig.capture.checks import check, figures
-from emmc_rig.capture.command import (
+from emmc_rig.acquisition.checks import check, figures
+from emmc_rig.acquisition.command import (
     begun_session,
     disk_faults_named,
     estimated,
@@ -27,15 +27,15 @@ from emmc_rig.capture.command import (
     refuse_other_camera,
     refuse_small_disk,
 )
-from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.plan import Checks, Retries
-from emmc_rig.capture.retries import GaveUpError, Mending, mending
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.control import Control, interruptible
+from emmc_rig.acquisition.plan import Checks, Retries
+from emmc_rig.acquisition.retries import GaveUpError, Mending, mending
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.rig.hardware import simulated_rig
-from emmc_rig.rig.registration import registered
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify

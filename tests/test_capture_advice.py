@@ -27,10 +27,10 @@ import emmc_rig
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from emmc_rig import cli
-from emmc_rig.capture import command, sequencer
-from emmc_rig.capture.checks import SaturatedError
-from emmc_rig.capture.retries import HOPELESS
-from emmc_rig.rig.rig_config import AskingAttendant, opened_rig
+from emmc_rig.acquisition import command, sequencer
+from emmc_rig.acquisition.checks import SaturatedError
+from emmc_rig.acquisition.retries import HOPELESS
+from emmc_rig.bench.rig_config import AskingAttendant, opened_rig
 from emmc_rig.session import session as session_module
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import whiteboards

@@ -9,13 +9,13 @@ from capture_rigs import begun, still_rig
 
 import emmc_rig as emmc
 from drivers.errors import DriverError
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.estimate import Exposures, Pace, known_exposures, last_session
-from emmc_rig.capture.events import EventWatcher
-from emmc_rig.capture.metering import first_meterings
-from emmc_rig.capture.plan import Suspender, load_plan
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.suspend import suspended_by
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.estimate import Exposures, Pace, known_exposures, last_session
+from emmc_rig.acquisition.events import EventWatcher
+from emmc_rig.acquisition.metering import first_meterings
+from emmc_rig.acquisition.plan import Suspender, load_plan
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.suspend import suspended_by
 from emmc_rig.errors import AppError
 from simulators.disk import SimulatedDisk
 

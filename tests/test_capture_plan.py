@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.capture.estimate import Pace
-from emmc_rig.capture.expand import expand, exposures_s, fittings
-from emmc_rig.capture.new_plan import new_plan
-from emmc_rig.capture.order import ordered, travel_um
-from emmc_rig.capture.plan import (
+from emmc_rig.acquisition.estimate import Pace
+from emmc_rig.acquisition.expand import expand, exposures_s, fittings
+from emmc_rig.acquisition.new_plan import new_plan
+from emmc_rig.acquisition.order import ordered, travel_um
+from emmc_rig.acquisition.plan import (
     Boards,
     Darks,
     OpenBoard,

@@ -5,7 +5,7 @@ import pytest
 
 from drivers.dng import encode_dng
 from drivers.folder import FolderCamera, Recorded
-from emmc_rig.capture.replay import matched, missing_words
+from emmc_rig.acquisition.replay import matched, missing_words
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 

@@ -18,12 +18,12 @@ from programs import program
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
+from emmc_rig.processing import block_tasks
+from emmc_rig.processing import pool as pools
+from emmc_rig.processing.block_tasks import BlockTask, Capture
+from emmc_rig.processing.pool import WorkersError, opened_pool
+from emmc_rig.processing.reconstructing import reconstruct_folder
 from emmc_rig.progress import Silent
-from emmc_rig.reconstruct import block_tasks
-from emmc_rig.reconstruct import pool as pools
-from emmc_rig.reconstruct.block_tasks import BlockTask, Capture
-from emmc_rig.reconstruct.pool import WorkersError, opened_pool
-from emmc_rig.reconstruct.solve import reconstruct_folder
 from emmc_rig.study.stability import sweeping
 from emmc_rig.study.stability.fault_sweep import stability_settings
 from emmc_rig.study.stability.sweeping import run_stability

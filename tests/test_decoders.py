@@ -20,15 +20,15 @@ from hypothesis import strategies as st
 from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
 from drivers.raw import decode_raw
+from emmc_rig.bench.camera_config import parse_camera
+from emmc_rig.bench.rig_config import ImagedRig, rig_description
+from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import SavedPsi, ShardedPsi, save_shards
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.rig.camera_config import parse_camera
-from emmc_rig.rig.rig_config import ImagedRig, rig_description
-from emmc_rig.rig.stage_config import parse_stage
 
 ROOT = Path(__file__).parents[1]
 READING, CHILD, RAW = "emmc_rig/model/reading.py", "emmc_rig/files/child.py", "drivers/raw.py"

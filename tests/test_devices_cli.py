@@ -21,9 +21,9 @@ from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
+from emmc_rig.bench.hardware import SIMULATED_SCALES, open_stage, probe_port
+from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
-from emmc_rig.rig.hardware import SIMULATED_SCALES, open_stage, probe_port
-from emmc_rig.rig.stage_config import parse_stage
 from simulators.apt import Z825, AptController
 from simulators.grbl import BENCH_AXES, GrblController
 from simulators.wire import PtyServer

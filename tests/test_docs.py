@@ -14,8 +14,8 @@ from placed import files_of, listed
 from programs import program
 
 from emmc_rig import cli
-from emmc_rig.calibrate import session as calibrate_session
 from emmc_rig.commands.options import SIZE_VARIABLE
+from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import readings
 
 ROOT = Path(__file__).parents[1]

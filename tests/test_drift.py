@@ -31,9 +31,9 @@ from calibration.evidence import (
 from calibration.parametric import psi_at
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
+from emmc_rig.processing.bench import BenchTruth, WhiteboardBench
 from simulators.bench import MountingErrors
 from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
 

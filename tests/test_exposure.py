@@ -8,16 +8,16 @@ import pytest
 from capture_rigs import begun, plan_and_camera, wish_for
 
 from drivers.errors import CameraSettingError
-from emmc_rig.capture.amend import amendment
-from emmc_rig.capture.command import _frozen, planned_frames
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.metering import BRACKET_STEP, asked_of_scene
-from emmc_rig.capture.plan import Metering
-from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.command import _frozen, planned_frames
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.metering import BRACKET_STEP, asked_of_scene
+from emmc_rig.acquisition.plan import Metering
+from emmc_rig.acquisition.retries import GaveUpError
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.rig.hardware import simulated_rig
 from emmc_rig.session.decisions import metered
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
 from emmc_rig.session.verify import verify

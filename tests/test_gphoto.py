@@ -24,9 +24,9 @@ from drivers.errors import (
 from drivers.gphoto import GphotoCamera, seconds_of
 from drivers.ptp_canon import EosOperation
 from drivers.ptp_codec import Property
+from emmc_rig.bench.hardware import open_camera
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
-from emmc_rig.rig.hardware import open_camera
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction
 from simulators.ptp_canon import EosCameraSimulator

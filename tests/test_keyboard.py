@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.acquisition.keyboard import pressed_keys
 
 PATIENCE_S = 5.0
 

@@ -25,6 +25,7 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.raw import RawFrame
+from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
@@ -36,7 +37,6 @@ from emmc_rig.live.server import application
 from emmc_rig.live.server import served as serving
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
-from emmc_rig.rig.hardware import simulated_rig
 
 BLACK, WHITE = 256, 4095
 PATIENCE_S = 60.0

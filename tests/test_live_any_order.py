@@ -13,13 +13,13 @@ import pytest
 import yaml
 from test_live import PATIENCE_S, until, watching
 
+from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.save import Files
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.steps import LONGEST_UNASKED_S
-from emmc_rig.rig.hardware import simulated_rig
 from simulators.clock import ManualClock
 
 DESIGN, SIZE, FOCUS_UM = "rgbw-bayer-1shot", (32, 48), 9000.0

@@ -6,7 +6,8 @@ import pytest
 from browsers import MARKS, complaints, open_browser
 from test_live import PatientCamera
 
-from emmc_rig.capture.control import Control
+from emmc_rig.acquisition.control import Control
+from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.light_field import LiveLightField
@@ -16,7 +17,6 @@ from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.pages.page import source
-from emmc_rig.rig.hardware import simulated_rig
 from simulators.bench import MountingErrors
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")

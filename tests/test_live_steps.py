@@ -7,6 +7,8 @@ import pytest
 import yaml
 from test_live import until, watching
 
+from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.replaced import replace_text
@@ -15,8 +17,6 @@ from emmc_rig.files.yaml_edit import with_values
 from emmc_rig.live.alignment import MaskPlace
 from emmc_rig.live.autofocus import FocusFound, peak
 from emmc_rig.live.save import Files, Found
-from emmc_rig.rig.hardware import simulated_rig
-from emmc_rig.rig.rig_config import ImagedRig, rig_description
 from simulators.bench import MountingErrors
 
 RIG_YAML = """# the bench in room 12

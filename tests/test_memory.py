@@ -16,8 +16,8 @@ from pools import held_bytes
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.reconstruct.memory import Ceiling, task_bytes
-from emmc_rig.reconstruct.pool import Processes, WorkersError
+from emmc_rig.processing.memory import Ceiling, task_bytes
+from emmc_rig.processing.pool import Processes, WorkersError
 from reconstruction.methods import BlockSettings
 from reconstruction.tiles import Grid
 

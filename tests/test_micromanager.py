@@ -40,10 +40,10 @@ from drivers.micromanager import (
 )
 from drivers.raw import decode_raw
 from drivers.unicore import load_rig
+from emmc_rig.bench.hardware import open_camera, open_stage, simulated_rig
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.rig.hardware import open_camera, open_stage, simulated_rig
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb

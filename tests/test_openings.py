@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from calibration.openings import parts, views_open, window_place_um
-from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.processing.bench import BenchTruth, Setting, WhiteboardBench
 
 CAMERA = find_camera("rgbw-bayer-1shot")
 

@@ -17,13 +17,13 @@ from calibration.placement import SCALARS, designed_placement, labels
 from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.calibrate.bench import (
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.processing.bench import (
     ORDINARY_BENCH,
     BenchTruth,
     Setting,
     WhiteboardBench,
 )
-from emmc_rig.model.camera import build_imaging_matrix
 from simulators.bench import MountingErrors
 
 SIZE = (44, 60)

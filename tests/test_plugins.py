@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import LimitExceededError
+from emmc_rig.bench.hardware import open_camera, open_stage
 from emmc_rig.errors import AppError
-from emmc_rig.rig.hardware import open_camera, open_stage
 
 EXAMPLE = Path(__file__).parents[1] / "docs/example_plugin"
 PROGRAM = "from emmc_rig.cli import main; main()"

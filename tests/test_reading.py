@@ -18,7 +18,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from emmc_rig.capture.plan import Plan
+from emmc_rig.acquisition.plan import Plan
+from emmc_rig.bench.rig_config import RealRig
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError, SceneError, SensingError
@@ -28,7 +29,6 @@ from emmc_rig.model.masks import Picture
 from emmc_rig.model.reading import parse_yaml, read_yaml, stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import validated
-from emmc_rig.rig.rig_config import RealRig
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import DictionaryError
 from reconstruction.methods import MethodSettings

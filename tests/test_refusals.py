@@ -9,9 +9,9 @@ from moved_mask import CAMERA
 
 from calibration.errors import CalibrationError
 from calibration.routes import calibrate
-from emmc_rig.calibrate.bench import BenchTruth, Setting, WhiteboardBench
-from emmc_rig.calibrate.board_plan import STAGE_KINDS_UM, held_out_settings
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.processing.bench import BenchTruth, Setting, WhiteboardBench
+from emmc_rig.processing.board_plan import STAGE_KINDS_UM, held_out_settings
 from simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)

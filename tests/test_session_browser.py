@@ -5,7 +5,7 @@ import shutil
 import pytest
 from capture_rigs import begun, still_rig
 
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.pages.session_sheet import write_sheet
 from emmc_rig.session.session import REPORT
 from emmc_rig.session.storage import SYSTEM_DISK

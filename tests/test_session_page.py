@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 import emmc_rig as emmc
-from emmc_rig.capture.command import capture_session
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.sequencer import ALL_TAKEN
+from emmc_rig.acquisition.command import capture_session
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served

@@ -10,14 +10,20 @@ import yaml
 from capture_rigs import begun
 
 from drivers.errors import DriverError
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.acquisition.plan import Plan, planned_camera
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.bench.hardware import NO_FLAWS, open_camera, simulated_rig
+from emmc_rig.bench.rig_config import (
+    SIMULATED,
+    AskingAttendant,
+    ImagedRig,
+    RealRig,
+    rig_description,
+)
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.rig.hardware import NO_FLAWS, open_camera, simulated_rig
-from emmc_rig.rig.rig_config import SIMULATED, AskingAttendant, ImagedRig, RealRig, rig_description
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame, frame_file
 from emmc_rig.session.readings import session_readings, whiteboards

@@ -11,9 +11,9 @@ import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
 
-from emmc_rig.capture.checks import figures
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.acquisition.checks import figures
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet

@@ -16,10 +16,10 @@ import pytest
 from capture_rigs import PLAN_YAML, SIZE, begun, frame_bytes, plan_and_camera, still_rig
 
 from drivers.raw import RawFrame
-from emmc_rig.capture.amend import amendment
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.lock import held

@@ -15,11 +15,11 @@ from drivers.errors import ScaleError, SpeedLimitError
 from drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
 from drivers.stage import StageSettings
 from drivers.zaber import ZaberStage
+from emmc_rig.bench.hardware import STAGE_AXES, open_stage, simulated_rig
+from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.commands.stage_scale import measure, scale_settings, shadow_reader
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.rig.hardware import STAGE_AXES, open_stage, simulated_rig
-from emmc_rig.rig.stage_config import parse_stage
 from simulators.clock import ManualClock
 from simulators.grbl import BENCH_AXES, GrblController
 from simulators.wire import PtyServer

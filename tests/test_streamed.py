@@ -9,9 +9,9 @@ from programs import exit_code
 
 import emmc_rig as emmc
 from calibration import frames
-from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.study.checks.streamed import check_streamed, drawn_session
 
 NAME, SIZE = "rgbw-bayer-1shot", (48, 64)

@@ -55,9 +55,9 @@ def solved(method):
 print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
 """
 ROUTES = """
-from emmc_rig.calibrate.bench import BenchTruth
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.calibrate.simulated import run_calibration
+from emmc_rig.processing.bench import BenchTruth
+from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.simulated import run_calibration
 from emmc_rig.model.camera import Camera
 
 camera = Camera.model_validate_json(sys.argv[1])

@@ -14,8 +14,8 @@ import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
-from emmc_rig.reconstruct import training as train
-from emmc_rig.reconstruct.training import checkpoint_path, draw_atoms, find_sources
+from emmc_rig.processing import training as train
+from emmc_rig.processing.training import checkpoint_path, draw_atoms, find_sources
 from reconstruction.dictionary import Dictionary
 from simulators.scenes import SCENES
 

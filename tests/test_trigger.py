@@ -16,12 +16,12 @@ from drivers.errors import (
     StalledError,
 )
 from drivers.stage import StageSettings
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
+from emmc_rig.bench.trigger import SimulatedTrigger, check_trigger
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.rig.hardware import simulated_rig
-from emmc_rig.rig.rig_config import ImagedRig, opened_rig, rig_description
-from emmc_rig.rig.trigger import SimulatedTrigger, check_trigger
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.study.benchmarks.devices import (
     EXPOSURE_S,

@@ -37,7 +37,7 @@ from drivers.u3v import UNZIPPED_LIMIT, decode_u3v, list_u3v, open_u3v
 from drivers.u3v_control import BUSY_LIMIT_S, READ_ATTEMPTS
 from drivers.u3v_stream import plan_sizes
 from drivers.usb import TRANSFER_BYTES
-from emmc_rig.rig.hardware import open_camera
+from emmc_rig.bench.hardware import open_camera
 from simulators import u3v as simulation
 from simulators.clock import ManualClock
 from simulators.u3v import U3vCameraSimulator

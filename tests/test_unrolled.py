@@ -164,9 +164,9 @@ def test_random_worlds_are_the_seeds_and_have_parallax():
 @pytest.fixture
 def training(torch, tmp_path, monkeypatch):
     """Make a short training of a small network."""
-    from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
+    from emmc_rig.processing.network_training import NetworkTraining, train_network
 
-    module = sys.modules["emmc_rig.reconstruct.network_training"]
+    module = sys.modules["emmc_rig.processing.network_training"]
     monkeypatch.setattr(module, "WORLD_SIZE", (24, 32))
     monkeypatch.setattr(module, "WORLDS", 2)
     small = SMALL.model_copy(update={"views": (5, 5)})
@@ -219,7 +219,7 @@ def test_a_network_learns_from_scenes_and_says_from_which(training, two_scenes):
 
 
 def test_a_crop_of_a_scene_is_what_the_network_sees(torch, two_scenes):
-    from emmc_rig.reconstruct import network_training as module
+    from emmc_rig.processing import network_training as module
 
     training = module.NetworkTraining(
         Path("n.h5"), ("conventional",), Architecture(), 1, scenes=two_scenes[1:], crop=20
@@ -234,7 +234,7 @@ def test_a_crop_of_a_scene_is_what_the_network_sees(torch, two_scenes):
 
 
 def test_a_colour_blind_camera_learns_grey(torch):
-    from emmc_rig.reconstruct import network_training as module
+    from emmc_rig.processing import network_training as module
 
     for name, grey in (("coded-aperture-random", True), ("rgbw-mono", False)):
         training = module.NetworkTraining(Path("n.h5"), (name,), Architecture(), 1, crop=20)
@@ -255,7 +255,7 @@ def test_scenes_that_cannot_be_learned_from_are_refused(training, changed, says)
 
 
 def test_a_scene_smaller_than_a_crop_is_refused(torch, two_scenes, tmp_path):
-    from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
+    from emmc_rig.processing.network_training import NetworkTraining, train_network
 
     large = NetworkTraining(
         tmp_path / "n.h5", ("rgbw-mono",), Architecture(), 1, scenes=two_scenes, crop=48

@@ -13,10 +13,10 @@ import yaml
 from capture_rigs import begun, still_rig
 from programs import program
 
-from emmc_rig.capture.assessment import assessed, stated_psnr_db
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.until import Until
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.assessment import assessed, stated_psnr_db
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.until import Until
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet

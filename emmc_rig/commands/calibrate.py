@@ -103,13 +103,13 @@ def calibrate(
     ] = None,
 ) -> None:
     """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
-    from emmc_rig.calibrate.bench import BenchTruth
-    from emmc_rig.calibrate.board_plan import write_plan
-    from emmc_rig.calibrate.settings import CalibrateSettings
-    from emmc_rig.calibrate.simulated import run_calibrate
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
+    from emmc_rig.processing.bench import BenchTruth
+    from emmc_rig.processing.board_plan import write_plan
+    from emmc_rig.processing.calibration_settings import CalibrateSettings
+    from emmc_rig.processing.simulated import run_calibrate
 
     if drift is not None:
         if known is None:
@@ -189,8 +189,8 @@ def _tell_findings(metrics: dict) -> None:
 
 
 def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, stage: bool) -> None:
-    from emmc_rig.calibrate.session import calibrate_into
     from emmc_rig.files.folders import result_folder
+    from emmc_rig.processing.session_calibration import calibrate_into
     from emmc_rig.session.session import CALIBRATION, Session
 
     captured, place = Session(path), path / CALIBRATION
@@ -215,8 +215,8 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, s
 
 
 def _judge_drift(known: Path, frames: Path, out: Path) -> None:
-    from emmc_rig.calibrate.drift import run_drift
     from emmc_rig.files.folders import result_folder
+    from emmc_rig.processing.session_drift import run_drift
 
     with result_folder(out, "calibrate --drift") as folder, shown_progress("fit the drift"):
         metrics = run_drift(known, frames, folder)

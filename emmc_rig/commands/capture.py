@@ -19,9 +19,9 @@ from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import ERRORS, AppError
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.control import Control
-    from emmc_rig.capture.events import Event
-    from emmc_rig.capture.watcher import CaptureWatcher
+    from emmc_rig.acquisition.control import Control
+    from emmc_rig.acquisition.events import Event
+    from emmc_rig.acquisition.watcher import CaptureWatcher
 
 OptionalPath = Path | None
 
@@ -78,7 +78,7 @@ def capture(
     ] = None,
 ) -> None:
     """Run a plan on the rig; run it again to go on where it stopped. Ctrl-C: after this frame."""
-    from emmc_rig.capture.plan import schema_text
+    from emmc_rig.acquisition.plan import schema_text
 
     if schema:
         tell(schema_text().removesuffix("\n"))
@@ -88,9 +88,9 @@ def capture(
         return
     if plan is None:
         raise typer.BadParameter("name a plan, or write one with --new CAMERA")
+    from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
     from emmc_rig.files.results import parse_psnr, parse_size
     from emmc_rig.model.settings import validated
-    from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 
     given: dict[str, Any] = {} if rays is None else {"rays": rays}
     if flaws is not None:
@@ -109,8 +109,8 @@ def capture(
 
 
 def _write_plan(name: str, path: Path) -> None:
-    from emmc_rig.capture.command import write_new
-    from emmc_rig.capture.new_plan import new_plan
+    from emmc_rig.acquisition.command import write_new
+    from emmc_rig.acquisition.new_plan import new_plan
     from emmc_rig.files.cameras import find_camera
 
     write_new(path, new_plan(name, find_camera(name)))
@@ -125,10 +125,10 @@ def _run(
     out: Path | None,
     page: Literal["shows", "steers"] | None,
 ) -> None:
-    from emmc_rig.capture.command import asked_folder, capture_session
-    from emmc_rig.capture.control import Control
-    from emmc_rig.capture.estimate import Estimate
-    from emmc_rig.capture.events import EventWatcher
+    from emmc_rig.acquisition.command import asked_folder, capture_session
+    from emmc_rig.acquisition.control import Control
+    from emmc_rig.acquisition.estimate import Estimate
+    from emmc_rig.acquisition.events import EventWatcher
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.session.decisions import decided_words, ended

@@ -16,10 +16,10 @@ from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from drivers.raw import RawFrame
-from emmc_rig.capture.checks import Figures
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.keyboard import pressed_keys
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.keyboard import pressed_keys
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.pages.frame_view import histogram, histogram_text, thinned

@@ -71,9 +71,9 @@ def conform(
 
 def _suites(device: str) -> list[str]:
     """Return which suites a name asks for; raises AppError for one that names nothing."""
+    from emmc_rig.bench.hardware import camera_kinds
+    from emmc_rig.bench.stage_config import stage_protocols
     from emmc_rig.model.reading import read_yaml
-    from emmc_rig.rig.hardware import camera_kinds
-    from emmc_rig.rig.stage_config import stage_protocols
 
     if device.endswith((".yaml", ".yml")):
         read = read_yaml(Path(device), AppError)

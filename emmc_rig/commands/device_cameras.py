@@ -14,7 +14,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from emmc_rig.capture.keyboard import pressed_keys
+from emmc_rig.acquisition.keyboard import pressed_keys
 from emmc_rig.commands.output import (
     Quiet,
     give_result,
@@ -53,8 +53,8 @@ OutFolder = Annotated[Path, typer.Option("--out", help="folder to save frames in
 
 
 def open_camera(spec: str) -> Camera:
-    """Open a camera by name; `emmc_rig.rig.hardware` takes a second to load."""
-    from emmc_rig.rig.hardware import open_camera as opened
+    """Open a camera by name; `emmc_rig.bench.hardware` takes a second to load."""
+    from emmc_rig.bench.hardware import open_camera as opened
 
     return opened(spec)
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emmc_rig.capture.signals import ENDING, handled, signals_interrupt
+from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
@@ -55,8 +55,8 @@ def list_devices(rig: RigOption = None) -> None:
     from drivers.ports import holder_of, list_serial_ports
 
     if rig is not None:
-        from emmc_rig.rig.hardware import simulated_bus
-        from emmc_rig.rig.stage_config import PROTOCOLS
+        from emmc_rig.bench.hardware import simulated_bus
+        from emmc_rig.bench.stage_config import PROTOCOLS
 
         simulated_protocol(rig)
         _list_cameras(simulated_bus(SYSTEM_CLOCK))
@@ -113,7 +113,7 @@ def probe(
 ) -> None:
     """Ask ports what answers there; nothing moves."""
     from drivers.ports import list_serial_ports
-    from emmc_rig.rig.hardware import probe_port, probe_simulated
+    from emmc_rig.bench.hardware import probe_port, probe_simulated
 
     # Silence in all protocols but one is what a probe expects.
     logging.getLogger("drivers").setLevel(logging.ERROR)
@@ -195,8 +195,8 @@ def serve(
 ) -> None:
     """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
     from drivers.clock import SYSTEM_CLOCK
+    from emmc_rig.bench.hardware import SIMULATED_SCALES, simulated_firmware
     from emmc_rig.files.folders import refuse_inside_session
-    from emmc_rig.rig.hardware import SIMULATED_SCALES, simulated_firmware
     from simulators.wire import PtyServer, TcpServer
 
     if link is not None:
@@ -301,7 +301,7 @@ def bench(
 def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
     from drivers.errors import DriverError
-    from emmc_rig.rig.hardware import open_stage
+    from emmc_rig.bench.hardware import open_stage
 
     if (stage is None) == (rig is None):
         raise typer.BadParameter("say which stage: either --stage or --rig simulated")

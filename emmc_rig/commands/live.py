@@ -125,11 +125,11 @@ def _watch(
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
     from drivers.errors import UsbNotFoundError
-    from emmc_rig.capture.plan import load_plan
+    from emmc_rig.acquisition.plan import load_plan
+    from emmc_rig.bench.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
-    from emmc_rig.rig.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
 
     described, scale = find_camera(design), _scale(psi)
     files = Files(plan, None if rig is None or rig == SIMULATED else Path(rig))
@@ -137,8 +137,8 @@ def _watch(
         load_plan(plan)
     with ExitStack() as stack:
         if rig is not None:
+            from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
             from emmc_rig.files.results import parse_size
-            from emmc_rig.rig.rig_config import ImagedRig, opened_rig, rig_description
 
             imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
             opened = stack.enter_context(

@@ -12,7 +12,7 @@ from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 
 if TYPE_CHECKING:
-    from emmc_rig.reconstruct.captures import Request
+    from emmc_rig.processing.captures import Request
 
 
 def reconstruct(
@@ -76,9 +76,9 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.reconstruct.captures import Request, reconstruct_captures
-    from emmc_rig.reconstruct.inputs import load_settings
-    from emmc_rig.reconstruct.memory import parse_memory
+    from emmc_rig.processing.captures import Request, reconstruct_captures
+    from emmc_rig.processing.inputs import load_settings
+    from emmc_rig.processing.memory import parse_memory
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
@@ -94,7 +94,7 @@ def reconstruct(
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget and --want choose the method and its settings")
         from emmc_rig.advice.recommend import advice_for
-        from emmc_rig.reconstruct.inputs import open_frames
+        from emmc_rig.processing.inputs import open_frames
 
         advice = advice_for(*open_frames(frames[0], psi), budget, want)
         method, why = advice.method, advice.why

@@ -16,7 +16,7 @@ from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
     from drivers.stage import Stage
-    from emmc_rig.rig.stage_config import StageConfig
+    from emmc_rig.bench.stage_config import StageConfig
 
 SMALLEST_COUNT = 100
 APPROACH_SHARE = 0.05
@@ -58,10 +58,10 @@ def scale(
     from calibration.errors import CalibrationError
     from calibration.stage_scale import fit_step_length
     from drivers.errors import DriverError
-    from emmc_rig.capture.signals import signals_interrupt
+    from emmc_rig.acquisition.signals import signals_interrupt
+    from emmc_rig.bench.hardware import open_camera, open_stage
+    from emmc_rig.bench.stage_config import parse_stage
     from emmc_rig.files.folders import refuse_inside_session
-    from emmc_rig.rig.hardware import open_camera, open_stage
-    from emmc_rig.rig.stage_config import parse_stage
 
     if counts < SMALLEST_COUNT:
         raise AppError(f"{counts} counts are too few to measure: move at least {SMALLEST_COUNT}")

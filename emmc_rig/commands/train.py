@@ -79,8 +79,8 @@ def train(
             scenes or [], leave_out or [],
         )  # fmt: skip
         return
-    from emmc_rig.reconstruct.training import picture_path, train_settings
-    from emmc_rig.reconstruct.training import train as run
+    from emmc_rig.processing.training import picture_path, train_settings
+    from emmc_rig.processing.training import train as run
 
     size, grid = parse_size(patch, "--patch", "9x9"), parse_size(views, "--views", "5x5")
     assert size is not None
@@ -114,7 +114,7 @@ def _train_network(
     leave_out: list[str],
 ) -> None:
     from emmc_rig.files.results import parse_size
-    from emmc_rig.reconstruct.network_training import NetworkTraining, train_network
+    from emmc_rig.processing.network_training import NetworkTraining, train_network
     from reconstruction.unrolled.weights import Architecture
 
     architecture = Architecture(views=parse_size(views, "--views", "5x5") or (5, 5))
@@ -135,7 +135,7 @@ def _train_network(
 
 
 def _train_aperture(out: Path, cameras: list[str], seed: int) -> None:
-    from emmc_rig.reconstruct.aperture_training import ApertureTraining, train_aperture
+    from emmc_rig.processing.aperture_training import ApertureTraining, train_aperture
 
     if len(cameras) > 1:
         raise typer.BadParameter("--aperture learns the masks of one --camera")

@@ -44,7 +44,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[NamedStage]:
 @pytest.fixture
 def camera(request: pytest.FixtureRequest) -> Iterator[Camera]:
     """The camera of that name."""
-    from emmc_rig.rig.hardware import open_camera
+    from emmc_rig.bench.hardware import open_camera
 
     with closing(open_camera(_device(request))) as opened:
         yield opened

@@ -32,7 +32,7 @@ class NamedStage:
 
     def make_stage(self, **settings: Any) -> Stage:
         """Open the stage; one opened before is closed first."""
-        from emmc_rig.rig.hardware import open_stage
+        from emmc_rig.bench.hardware import open_stage
 
         self.close()
         self._stage = open_stage(self._spec, settings=settings)

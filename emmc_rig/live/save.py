@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from emmc_rig.capture.plan import Plan, load_plan
+from emmc_rig.acquisition.plan import Plan, load_plan
+from emmc_rig.bench.rig_config import SIMULATED, RealRig, WiredRig
 from emmc_rig.errors import AppError
 from emmc_rig.files.replaced import replace_text
 from emmc_rig.files.yaml_edit import Key, with_values
@@ -15,7 +16,6 @@ from emmc_rig.live.alignment import MaskPlace
 from emmc_rig.live.autofocus import FocusFound
 from emmc_rig.model.reading import parse_yaml, read_yaml
 from emmc_rig.model.settings import validated
-from emmc_rig.rig.rig_config import SIMULATED, RealRig, WiredRig
 
 
 @dataclass(frozen=True)

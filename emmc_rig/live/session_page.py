@@ -11,12 +11,12 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
-from emmc_rig.capture.assessment import METHOD, stated_psnr_db
-from emmc_rig.capture.checks import Figures
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.events import Event, EventWatcher
-from emmc_rig.capture.until import light_field_so_far
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.assessment import METHOD, stated_psnr_db
+from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.events import Event, EventWatcher
+from emmc_rig.acquisition.until import light_field_so_far
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.live.field_pictures import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture

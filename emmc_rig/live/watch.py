@@ -22,6 +22,8 @@ from drivers.camera import Camera
 from drivers.errors import DriverError, ExposureStoppedError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
+from emmc_rig.bench.hardware import FOCUS
+from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge, is_dark
 from emmc_rig.live.autofocus import focused
@@ -42,8 +44,6 @@ from emmc_rig.live.steps import (
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
 from emmc_rig.pages.frame_view import frame_figures, histogram, thinned
-from emmc_rig.rig.hardware import FOCUS
-from emmc_rig.rig.registration import registered
 
 IDLE_S = 10.0
 """Without anybody who asks for this long, no frame is taken."""

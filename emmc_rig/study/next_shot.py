@@ -19,19 +19,19 @@ import yaml
 from pydantic import TypeAdapter
 
 from calibration.shadow import shadow_mask
-from emmc_rig.calibrate.bench import WhiteboardBench
-from emmc_rig.calibrate.board_plan import capture_plan, parametric_plan, plan_light
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.capture.assessment import METHOD, Assessment, assessed
-from emmc_rig.capture.command import Wish, run_capture
-from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.assessment import METHOD, Assessment, assessed
+from emmc_rig.acquisition.command import Wish, run_capture
+from emmc_rig.acquisition.plan import Plan, PlannedShot, planned_camera
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.processing.bench import WhiteboardBench
+from emmc_rig.processing.board_plan import capture_plan, parametric_plan, plan_light
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.progress import Watcher
-from emmc_rig.rig.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.session.lock import held
 from emmc_rig.session.readings import Scale, scaled_readings, session_scale
 from emmc_rig.session.session import Session

@@ -21,7 +21,7 @@ import numpy as np
 import typer
 
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.reconstruct.pool import Cluster
+from emmc_rig.processing.pool import Cluster
 
 Result = TypeVar("Result")
 WORKERS = (4, 16, 64)

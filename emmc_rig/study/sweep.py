@@ -27,8 +27,8 @@ from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
 from emmc_rig.pages.page import number
+from emmc_rig.processing.pool import Pool
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.reconstruct.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.methods import METHODS
 

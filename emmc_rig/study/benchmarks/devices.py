@@ -25,13 +25,13 @@ from drivers.stage import StageSettings
 from drivers.u3v import U3vCamera, open_u3v
 from drivers.usb import open_device
 from drivers.zaber import ZaberStage
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.order import ordered
-from emmc_rig.capture.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.rig.hardware import open_simulated, simulated_rig
-from emmc_rig.rig.stage_config import PROTOCOLS
-from emmc_rig.rig.trigger import LINE_LATENCY_S, SimulatedTrigger
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.order import ordered
+from emmc_rig.acquisition.plan import Plan, PlannedShot, planned_camera
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.bench.hardware import open_simulated, simulated_rig
+from emmc_rig.bench.stage_config import PROTOCOLS
+from emmc_rig.bench.trigger import LINE_LATENCY_S, SimulatedTrigger
 from emmc_rig.session.session import Frozen, Session
 from emmc_rig.study.benchmarks.timing import Figures, median_s
 from simulators.clock import ManualClock

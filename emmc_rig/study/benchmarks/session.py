@@ -22,15 +22,15 @@ import numpy as np
 from drivers.clock import SYSTEM_CLOCK
 from drivers.dng import encode_dng
 from drivers.raw import RawFrame, decode_raw
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.watcher import CaptureWatcher
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.plan import Plan, planned_camera
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hardware import STAGE_AXES, Rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.files.results import shown_bytes
 from emmc_rig.pages.timeline import overlap, run_entries
-from emmc_rig.rig.hardware import STAGE_AXES, Rig
 from emmc_rig.session.journal import encode_line
 from emmc_rig.session.listing import summary
 from emmc_rig.session.planned import PlannedFrame

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from calibration.boards import as_readings
 from calibration.sensor import Pair, characterise
 from calibration.stage_map import locate
-from emmc_rig.calibrate.bench import (
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.processing.bench import (
     Setting,
     StageFaults,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.comparison import true_parameters
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.calibrate.simulated import measured_stage, run_calibration
-from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.comparison import true_parameters
+from emmc_rig.processing.simulated import measured_stage, run_calibration
 from emmc_rig.progress import Silent
 from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from pydantic_core import to_jsonable_python
 
-from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.progress import Watcher
 from emmc_rig.study.checks.bench import check_few, check_psi, check_sensor, check_stage
 from emmc_rig.study.checks.effects import check_effect, effects

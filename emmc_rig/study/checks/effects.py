@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import emmc_rig as emmc
-from emmc_rig.calibrate.bench import BenchTruth
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.calibrate.simulated import run_calibration
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.processing.bench import BenchTruth
+from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.simulated import run_calibration
 from emmc_rig.study.checks.rows import COVERED, COVERED_TWICE, Row, covered, target_row
 from emmc_rig.study.checks.scenes import BUILT_IN, captured_scene
 from simulators.effects import EFFECTS, ORDINARY, TOGETHER, flawed

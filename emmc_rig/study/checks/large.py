@@ -12,11 +12,11 @@ from calibration.boards import Board
 from calibration.fit import fit_placement
 from calibration.parametric import coefficient_planes
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.calibrate.board_plan import soft_design
-from emmc_rig.calibrate.settings import CalibrateSettings
 from emmc_rig.errors import AppError
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.camera import psi_layout
+from emmc_rig.processing.board_plan import soft_design
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.study.checks.rows import Row, target_row
 
 Array = NDArray[np.floating]

@@ -18,22 +18,22 @@ from calibration.residuals import ResidualCheck, check_residuals
 from calibration.routes import calibrate
 from calibration.shadow import Shadow, shadow_mask
 from calibration.whiteboard import Calibration
-from emmc_rig.calibrate.bench import (
+from emmc_rig.files.scenes import fine_scene
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.processing.bench import (
     BenchTruth,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.board_plan import (
+from emmc_rig.processing.board_plan import (
     few_settings,
     free_settings,
     held_out_settings,
     parametric_plan,
     plan_light,
 )
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.files.scenes import fine_scene
-from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.study.checks.rows import Row, target_row
 from reconstruction.tv import TVSettings, reconstruct_tv
 

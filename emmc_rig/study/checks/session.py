@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import emmc_rig as emmc
-from emmc_rig.calibrate.bench import BenchTruth, WhiteboardBench
-from emmc_rig.calibrate.board_plan import PLAN, write_plan
-from emmc_rig.calibrate.comparison import coverage, stated_error, true_error
-from emmc_rig.calibrate.settings import CalibrateSettings
+from emmc_rig.bench.hardware import NO_FLAWS
+from emmc_rig.bench.rig_config import APERTURE_FACTOR, PIXEL_FACTOR
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.rig.hardware import NO_FLAWS
-from emmc_rig.rig.rig_config import APERTURE_FACTOR, PIXEL_FACTOR
+from emmc_rig.processing.bench import BenchTruth, WhiteboardBench
+from emmc_rig.processing.board_plan import PLAN, write_plan
+from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.comparison import coverage, stated_error, true_error
 from emmc_rig.session.readings import session_readings
 from emmc_rig.study.checks.bench import STATED_TRUE
 from emmc_rig.study.checks.effects import LARGEST_COST_DB, TRUE_ERROR, psnr_cost_db

@@ -23,12 +23,13 @@ from calibration.placement import (
 from calibration.planning import REFERENCE_FRAMES, Kind, reading_variance
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import measure_psi
-from emmc_rig.calibrate.bench import (
+from emmc_rig.model.camera import build_imaging_matrix, psi_layout
+from emmc_rig.processing.bench import (
     ORDINARY_BENCH,
     Setting,
     WhiteboardBench,
 )
-from emmc_rig.calibrate.board_plan import (
+from emmc_rig.processing.board_plan import (
     few_settings,
     free_route_error,
     free_settings,
@@ -36,8 +37,7 @@ from emmc_rig.calibrate.board_plan import (
     plan_light,
     soft_design,
 )
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.model.camera import build_imaging_matrix, psi_layout
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.study.checks.rows import Row, target_row
 
 Array = NDArray[np.floating]

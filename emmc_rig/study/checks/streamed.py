@@ -19,14 +19,14 @@ from calibration.shadow import Shadow, shadow_mask
 from calibration.whiteboard import LAMP_COLOURS
 from drivers.dng import encode_dng
 from drivers.raw import decode_raw
-from emmc_rig.calibrate.bench import BOARD_LEVEL, FRAME_S
-from emmc_rig.calibrate.board_plan import capture_plan, soft_design
-from emmc_rig.calibrate.settings import CalibrateSettings
-from emmc_rig.capture.expand import expand
+from emmc_rig.acquisition.expand import expand
 from emmc_rig.errors import AppError
 from emmc_rig.files.frames import PSI
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.model.camera import psi_layout
+from emmc_rig.processing.bench import BOARD_LEVEL, FRAME_S
+from emmc_rig.processing.board_plan import capture_plan, soft_design
+from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.session.frame_file import frame_file
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Frozen, Session

@@ -20,8 +20,8 @@ from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import colours_of
 from emmc_rig.pages.page import Section, provenance_section
+from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruct.pool import opened_pool
 from emmc_rig.study.stability.curves import Curve, break_row, curves
 from emmc_rig.study.stability.fault_sweep import (
     StabilitySettings,

@@ -1,0 +1,480 @@
+"""`emmc-rig capture`: a plan becomes a session; run it again, and the session goes on.
+
+Whoever calls holds the session meanwhile (`emmc_rig.session.lock.held`), from before it is read.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drivers.folder import FolderCamera, Recorded
+from emmc_rig.acquisition.amend import Amendment, amendment
+from emmc_rig.acquisition.control import Control, interruptible
+from emmc_rig.acquisition.estimate import (
+    Estimate,
+    Exposures,
+    known_exposures,
+    last_session,
+    pace_of,
+)
+from emmc_rig.acquisition.events import EventWatcher, OnEvent
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.metering import first_meterings
+from emmc_rig.acquisition.order import ordered
+from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
+from emmc_rig.acquisition.preflight import refuse_impossible
+from emmc_rig.acquisition.replay import missing_words, replaying, there
+from emmc_rig.acquisition.retries import GaveUpError
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.suspend import Suspend, suspended_by
+from emmc_rig.acquisition.until import Until, refuse_without_choice
+from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
+from emmc_rig.bench.hardware import Rig
+from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
+from emmc_rig.bench.rig_config import rig as choose_rig
+from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
+from emmc_rig.files.replaced import replace_text
+from emmc_rig.files.results import command_line, shown_bytes, versions
+from emmc_rig.model.arguments import NAMES, path_of, required
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import parse_yaml
+from emmc_rig.model.settings import validated
+from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
+from emmc_rig.session.lock import held
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import (
+    HEADER,
+    JOURNAL,
+    Frozen,
+    Session,
+    wall_time,
+)
+from emmc_rig.session.storage import SYSTEM_DISK, Disk
+
+DISK_RESERVE_BYTES = 100_000_000
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What to capture and where to; rig: see `emmc_rig.bench.rig_config`, None on resuming alike.
+
+    until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
+    """
+
+    plan_path: Path
+    plan: Plan
+    plan_yaml: str
+    camera: Camera
+    out: Path
+    rig: Mapping[str, Any]
+    until_db: float | None = None
+
+
+def session_folder(plan_path: Path) -> Path:
+    """Return the folder of a plan's session unless another is named."""
+    return plan_path.with_name(f"{plan_path.stem}-session")
+
+
+def asked_folder(plan: Path, out: Path | None) -> Path:
+    """Return the folder of the session that a plan or session, and --out, name."""
+    return out or (plan if is_session(plan) else session_folder(plan))
+
+
+def wish_from_plan(
+    plan_path: Path, out: Path, rig: Mapping[str, Any], until_db: float | None = None
+) -> Wish:
+    """Return what a plan file asks for; raises AppError."""
+    plan = load_plan(plan_path)
+    camera = planned_camera(plan, plan_path.parent)
+    text = plan_path.read_text(encoding="utf-8")
+    return Wish(plan_path, plan, text, camera, out, rig, until_db)
+
+
+def wish_from_session(
+    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
+) -> Wish:
+    """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
+    session = Session(folder)
+    plan = validated(Plan, session.plan_data(), str(folder), AppError)
+    camera = validated(Camera, session.camera, str(folder), CameraError)
+    return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
+
+
+def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
+    """Return every frame of a wish in the order of the capture."""
+    return ordered(
+        expand(wish.plan, wish.camera, rig.window_um, rig.window_side_um), wish.plan.order
+    )
+
+
+def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
+    """Return the frames that going on may take; another target asks for spared shots again."""
+    other_target = wish.until_db not in (None, session.target_db)
+    frames = session.frames if other_target else session.needed
+    return tuple(frame for frame in frames if frame.id not in session.stored)
+
+
+def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
+    """Return the session that the wish goes on with; None where it is to be begun.
+
+    Raises AppError when the folder is in the way, or frames were taken by another rig.
+    """
+    if is_session(wish.out):
+        session = Session(wish.out, disk)
+        if session.stored and json.loads(json.dumps(dict(wish.rig))) != session.rig:
+            raise AppError(
+                f"session {session.folder.name} was begun with another rig: "
+                f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
+            )
+        return session
+    if (wish.out / HEADER).is_file():
+        raise AppError(
+            f"{wish.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
+        )
+    if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
+        raise AppError(f"--out {wish.out}: holds something else than a session; name another --out")
+    refuse_inside_session(wish.out)
+    return None
+
+
+def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK) -> Session:
+    """Begin the wish's session; raises AppError where it cannot be made."""
+    about = {
+        "title": wish.plan.title or wish.plan_path.stem,
+        "created": wall_time(),
+        "command": command_line(),
+        "versions": versions(),
+        **({} if wish.until_db is None else {"until_db": wish.until_db}),
+    }
+    return Session.create(wish.out, _frozen(wish, frames), about, disk)
+
+
+def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
+    camera = wish.camera.model_dump(mode="json")
+    return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
+
+
+def estimated(
+    frames: tuple[PlannedFrame, ...],
+    plan: Plan,
+    rig: Rig,
+    session: Session | None = None,
+    earlier: Session | None = None,
+) -> Estimate:
+    """Return what frames will take; earlier: another session of the same stage and camera."""
+    meterings = {} if session is None else first_meterings(session)
+    entries = [] if session is None else session.journal.entries
+    known = known_exposures(Exposures(plan, earlier), meterings, entries)
+    return pace_of(rig, plan).estimate(frames, known)
+
+
+def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
+    """Raise AppError when the frames will not fit."""
+    above = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
+    free = disk.free_bytes(above)
+    lacking = expected.bytes + DISK_RESERVE_BYTES - free
+    if lacking > 0:
+        raise AppError(
+            f"{out}: {expected.frames} frames need about {shown_bytes(expected.bytes)}, and "
+            f"{shown_bytes(DISK_RESERVE_BYTES)} stay reserved: {shown_bytes(lacking)} more than "
+            f"the {shown_bytes(free)} that are free; make room, or name another --out"
+        )
+
+
+def refuse_other_camera(session: Session, rig: Rig) -> None:
+    """Raise AppError when the session was begun with another camera body or frame size."""
+    run = next((entry for entry in session.journal.entries if entry["kind"] == "run"), None)
+    if run is None or not session.stored:
+        return
+    then, now = run["camera"], rig.camera.identity
+    if then["serial"] != now.serial or then["shape"] != list(rig.camera.shape):
+        raise AppError(
+            f"session {session.folder.name} was begun with camera {then['model']} "
+            f"{then['serial']} of {then['shape'][0]}x{then['shape'][1]} pixels, this is "
+            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: connect "
+            "that one, or name another --out"
+        )
+
+
+@contextmanager
+def disk_faults_named(session: Session) -> Iterator[None]:
+    """Turn what the disk raises into one line."""
+    try:
+        yield
+    except OSError as fault:
+        why = {
+            errno.ENOSPC: "the disk is full; make room",
+            errno.EDQUOT: "the disk quota is spent; make room",
+            errno.EROFS: "the disk is read-only; make it writable",
+            errno.EACCES: "this user may not write there; change that",
+        }.get(fault.errno or 0, f"{fault.strerror or fault}; mend that")
+        raise AppError(
+            f"{session.folder}: {why}, then run the same command to go on; "
+            f"{len(session.stored)} of {len(session.needed)} frames are safe"
+        ) from fault
+
+
+@contextmanager
+def way_on_named(wish: Wish, session: Session) -> Iterator[None]:
+    """Say with a fault how to go on; a session without a frame goes, for there is nothing to keep.
+
+    A fault of the plan's is mended in the plan, which may hold for a session that has begun.
+    """
+    try:
+        yield
+    except BaseException as fault:
+        kept = len(session.stored)
+        if not kept:
+            session.forget()
+        if not isinstance(fault, GaveUpError):
+            raise
+        if not is_session(session.folder):
+            way = "nothing was captured; mend it, then run the same command"
+        elif is_session(wish.plan_path):
+            way = (
+                f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
+                f"the plan that you edited: emmc-rig capture COPY.yaml --out {wish.out}"
+            )
+        else:
+            way = f"{kept} frames are kept: mend it, then run the same command"
+        raise AppError(f"{fault}; {way}") from fault
+
+
+def run_capture(
+    wish: Wish,
+    watcher: CaptureWatcher,
+    ask: Ask,
+    agreed: Callable[[Estimate], bool] = lambda expected: True,
+    control: Control | None = None,
+    suspend: Suspend | None = None,
+) -> tuple[Session, RunEnd] | None:
+    """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
+
+    agreed: gets what it will take, once nothing speaks against it. Raises AppError or a
+    `DriverError`.
+    """
+    control = control or Control()
+    if wish.until_db is not None:
+        refuse_without_choice(wish.plan, wish.camera)
+    with ExitStack() as open_things:
+        session = begun_session(wish)
+        rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
+        planned = planned_frames(wish, rig)
+        edit = None
+        if session is None:
+            frames = tuple(frame for frame in planned if not frame.is_optional)
+        elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
+            watcher.tell(edit.words(len(session.stored)))
+            frames = tuple(
+                frame
+                for frame in edit.frames
+                if frame.id not in session.stored and not frame.is_optional
+            )
+        else:
+            frames = still_possible(wish, session)
+        recording: Mapping[str, Recorded] | None = None
+        if isinstance(rig.camera, FolderCamera):
+            folder = rig.camera.folder
+            rig, recording = replaying(rig, planned)
+            if words := missing_words(folder, frames, recording):
+                watcher.tell(words)
+        refuse_impossible(rig, frames)
+        details = getattr(rig.camera, "details", dict)
+        suspended = suspended_by(wish.plan.suspend, details, suspend)
+        if session is not None:
+            refuse_other_camera(session, rig)
+        earlier = last_session(wish.out, wish.rig)
+        expected = estimated(frames, wish.plan, rig, session, earlier)
+        refuse_small_disk(wish.out, expected)
+        if not agreed(expected):
+            return None
+        if session is None:
+            session = new_session(wish, planned)
+            open_things.enter_context(held(session.folder))
+        exposures = Exposures(wish.plan, earlier)
+        with interruptible(control, watcher.tell):
+            while True:
+                with disk_faults_named(session):
+                    if edit is not None:
+                        session = session.amend(_frozen(wish, edit.frames), edit.changes)
+                    with way_on_named(wish, session):
+                        if wish.until_db not in (None, session.target_db):
+                            session.note("until", target_db=wish.until_db, wall=wall_time())
+                        control.preview = partial(_edit_words, wish, session, rig)
+                        choose = None if recording is None else there(session, recording)
+                        if session.target_db is not None:
+                            choose = Until(session, watcher)
+                        run = Sequencer(
+                            session,
+                            wish.plan,
+                            rig,
+                            watcher,
+                            control,
+                            choose,
+                            exposures=exposures,
+                            suspended=suspended,
+                        ).run()
+                text, control.edited = control.edited, None
+                if text is None:
+                    return session, run
+                edit = None
+                try:
+                    wish, edit = edited_plan(wish, session, rig, text)
+                except AppError as fault:
+                    watcher.tell(f"the plan stays as it was: {fault}")
+
+
+def edited_plan(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
+    """Write an edited plan in place of the wish's, and return what follows for its session.
+
+    Raises AppError, nothing written, for a plan that the session or the rig contradicts, and where
+    the file was changed meanwhile.
+    """
+    other, edit = _edit(wish, session, rig, text)
+    refuse_impossible(
+        rig, tuple(f for f in (edit.frames if edit else ()) if f.id not in session.stored)
+    )
+    if not is_session(wish.plan_path):
+        replace_text(wish.plan_path, wish.plan_yaml, text)
+    return other, edit
+
+
+def _edit(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
+    source = "the edited plan"
+    plan = validated(Plan, parse_yaml(text, source, AppError), source, AppError)
+    camera = planned_camera(plan, wish.plan_path.parent)
+    other = replace(wish, plan=plan, plan_yaml=text, camera=camera)
+    edit = amendment(session, plan, camera, wish.rig, planned_frames(other, rig))
+    return other, edit
+
+
+def _edit_words(wish: Wish, session: Session, rig: Rig, text: str) -> str:
+    """Return what an edited plan changes, in words; raises AppError where it cannot hold."""
+    _, edit = _edit(wish, session, rig, text)
+    return "nothing changes" if edit is None else edit.words(len(session.stored))
+
+
+def asked_for(
+    plan: Path, folder: Path, rig: Mapping[str, Any] | None, until_db: float | None
+) -> Wish:
+    """Return what a plan file asks for, or what a session was begun for; raises AppError.
+
+    folder: of the session. rig: see `rig_description`; a session has its own, and an edited plan
+    for a session that is there keeps it.
+    """
+    if is_session(plan):
+        return wish_from_session(plan, rig, until_db, folder)
+    if rig is None and is_session(folder):
+        rig = Session(folder).rig
+    if rig is None:
+        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+    return wish_from_plan(plan, folder, rig, until_db)
+
+
+def capture_session(
+    plan: Path,
+    rig: Mapping[str, Any] | None,
+    out: Path | None,
+    until_db: float | None,
+    watcher: CaptureWatcher,
+    ask: Ask,
+    agreed: Callable[[Estimate], bool] = lambda expected: True,
+    control: Control | None = None,
+    suspend: Suspend | None = None,
+) -> tuple[Session, RunEnd] | None:
+    """Capture what is missing of a plan or session, and write the session's report.
+
+    See `asked_for` and `run_capture`. None where `agreed` says no. Raises StoppedError when
+    somebody stopped it: what was captured is kept, and the same call goes on.
+    """
+    if not plan.exists():
+        raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
+    folder = asked_folder(plan, out)
+    go_on = f"go on with: emmc-rig capture {folder}"
+    with held(folder):
+        wish = asked_for(plan, folder, rig, until_db)
+        try:
+            captured = run_capture(wish, watcher, ask, agreed, control, suspend)
+        except KeyboardInterrupt as stop:
+            begun = is_session(folder)
+            kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
+            raise StoppedError(f"stopped at once; {kept}") from stop
+        if captured is None:
+            return None
+        session, outcome = captured
+        try:
+            write_sheet(session, session.folder, quick_pictures(session))
+        except AppError as fault:
+            watcher.tell(f"no report: {fault}")
+    watcher.ended(session, outcome)
+    if not outcome.complete:
+        raise StoppedError(
+            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
+            f"{go_on}"
+        )
+    return captured
+
+
+def ask_at_prompt(what: str) -> None:
+    """Ask a person to do something at the bench, and wait until Enter is pressed."""
+    input(f"please {what}, then press Enter ")
+
+
+def capture(
+    plan: str | Path,
+    rig: RigChoice | str | Path | None = None,
+    *,
+    out: str | Path | None = None,
+    until_db: float | None = None,
+    watcher: CaptureWatcher | None = None,
+    on_event: OnEvent | None = None,
+    suspend: Suspend | None = None,
+    ask: Ask = ask_at_prompt,
+) -> Session:
+    """Run a plan on a rig and return its session; run again, it goes on where it stopped.
+
+    Args:
+        plan: a plan (YAML), or the folder of a session to go on with.
+        rig: what `emmc_rig.rig` returns, or what it takes; a session has its own.
+        out: folder of the session (default: PLAN-session beside the plan).
+        until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
+        watcher: gets what is captured.
+        on_event: is called with each `emmc_rig.acquisition.events.Event`, as `frame.written` or
+            `shot.done`; one that raises is not called again.
+        suspend: is asked before each frame, returns why the capture has to wait, "" to go on.
+        ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
+
+    Raises:
+        AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
+        DriverError: what a device says.
+        ArgumentError: a plan or rig of another type.
+    """
+    takes = "a plan's YAML file, or the folder of a session to go on with"
+    plan = path_of(plan, "plan", takes)
+    if isinstance(rig, NAMES):
+        rig = choose_rig(rig)
+    elif rig is not None:
+        required(rig, RigChoice, "rig", 'what emmc_rig.rig returns, or its name, as "simulated"')
+    description = None if rig is None else rig.description
+    folder = None if out is None else path_of(out, "out", "the folder of the new session")
+    watching = watcher or CaptureWatcher()
+    if on_event is not None:
+        watching = EventWatcher(on_event, watching)
+    captured = capture_session(plan, description, folder, until_db, watching, ask, suspend=suspend)
+    assert captured is not None  # nobody is asked whether to agree
+    return captured[0]
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a new file; raises AppError when one of that name is there, or it cannot be."""
+    with new_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -1,0 +1,100 @@
+"""How a running capture is paused, resumed and stopped: from another thread, a key or a signal."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from emmc_rig.acquisition.signals import ENDING, handled
+
+PAUSE_POLL_S = 0.05
+
+
+class Control:
+    """What somebody wants of a capture; any thread or signal handler may ask for it.
+
+    The sequencer looks between frames. Plain flags: a lock could be held by the very code that a
+    signal interrupts.
+
+    stays: at the end the capture waits until it is stopped, so that frames may be taken again.
+    preview: set by the capture; takes the text of an edited plan, and says what it changes.
+    edited: the text of an edited plan that is to hold from the next frame on.
+    """
+
+    def __init__(self, stays: bool = False) -> None:
+        self.paused = False
+        self.stopping = False
+        self.stays = stays
+        self.preview: Callable[[str], str] | None = None
+        self.edited: str | None = None
+        self._again: list[str] = []
+
+    @property
+    def ending(self) -> bool:
+        """Whether the present run is to end: for good, or to go on by an edited plan."""
+        return self.stopping or self.edited is not None
+
+    def take_again(self, ids: Iterable[str]) -> None:
+        """Take these frames once more."""
+        self._again += ids
+
+    @property
+    def again(self) -> bool:
+        """Whether frames are to be taken once more."""
+        return bool(self._again)
+
+    def pop_again(self) -> list[str]:
+        """Return the frames to take once more, and forget them."""
+        ids, self._again = self._again, []
+        return list(dict.fromkeys(ids))
+
+    def pause(self) -> None:
+        """Begin no further frame until `resume`."""
+        self.paused = True
+
+    def resume(self) -> None:
+        """Go on."""
+        self.paused = False
+
+    def stop(self) -> None:
+        """End after the present frame, paused or not."""
+        self.stopping = True
+
+    def wait(self) -> None:
+        """Let a moment pass in which nothing is to be done."""
+        time.sleep(PAUSE_POLL_S)
+
+
+@contextmanager
+def interruptible(control: Control, say: Callable[[str], None]) -> Iterator[None]:
+    """Let Ctrl-C stop after the present frame, and the second one, SIGTERM or SIGHUP now.
+
+    "Now" raises `KeyboardInterrupt` in the main thread. Elsewhere than there nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not control.stopping:
+            control.stop()
+            say("stopping after this frame; Ctrl-C again stops now")
+            return
+        raise KeyboardInterrupt
+
+    with handled(interrupt, ("SIGINT", *ENDING)):
+        yield
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold signals back while the bench is made safe."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with handled(signal.SIG_IGN, ("SIGINT", *ENDING)):
+        yield

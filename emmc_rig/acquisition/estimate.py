@@ -1,0 +1,197 @@
+"""How long a capture takes and how much it writes: before it begins, and while it runs.
+
+Exposures that are metered are known once their metering frame is taken; until then they are those
+of the last session of the same stage and camera, or a guess, and it is said how many.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from drivers.stage import needs_approach
+from emmc_rig.acquisition.metering import metered_exposure_s
+from emmc_rig.acquisition.order import APPROACH_UM
+from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.bench.hardware import Rig
+from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
+from emmc_rig.session.decisions import metered
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import JOURNAL, Session
+
+USUAL_SPEED_UM_S = 2000.0
+DOWNLOAD_BYTES_PER_S = 40e6
+FILE_OVERHEAD_BYTES = 4096
+JOURNAL_BYTES_PER_FRAME = 1500
+EXCHANGES_S = 0.15
+"""Commands to the camera and the stage that a frame needs, and what a camera takes to be ready."""
+MOVE_S = 0.2
+"""A move's acceleration, polling and settling."""
+LEARNT_FROM = 9
+"""The last frames whose median cost counts: one that had to wait for something is no rule."""
+ANY_LIMITS = (0.0, float("inf"))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Seconds by what they are spent on, and bytes on the disk.
+
+    by_hand: how often somebody must change something at the bench; his time is not reckoned with.
+    guessed: frames whose exposure nobody knows yet.
+    """
+
+    frames: int
+    moving_s: float
+    exposing_s: float
+    downloading_s: float
+    bytes: int
+    by_hand: int
+    guessed: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Total, without what is done by hand."""
+        return self.moving_s + self.exposing_s + self.downloading_s
+
+
+class Exposures:
+    """By what frames will be exposed, as far as it is known.
+
+    earlier: a session of the same devices, whose exposures hold until these are metered.
+    """
+
+    def __init__(self, plan: Plan, earlier: Session | None = None) -> None:
+        self._level = (plan.whiteboards or Boards()).level
+        self._earlier: dict[tuple[str, str], float] = {}
+        for frame in () if earlier is None else earlier.frames:
+            entry = earlier.stored.get(frame.id) if earlier is not None else None
+            if entry is not None and frame.kind in ("reference", "shot"):
+                key = (frame.kind, frame.bench.lamp)
+                self._earlier.setdefault(key, float(entry["exposure_s"]))
+
+    def seconds(
+        self, frame: PlannedFrame, meterings: Mapping[str, Entry], decided: Entry | None
+    ) -> float | None:
+        """Return a frame's exposure; None where nothing determines it.
+
+        meterings: journal lines of metering frames. decided: what metering of the scene asks for.
+        """
+        if frame.exposure_s is not None:
+            return frame.exposure_s
+        shot = str(frame.bench.shot)
+        if frame.is_exposed_as_shots:
+            if decided is not None and shot in decided["exposures_s"]:
+                return decided["exposures_s"][shot] * frame.light
+            earlier_s = self._earlier.get(
+                ("shot", "white" if frame.kind == "dark" else frame.bench.lamp)
+            )
+        else:
+            entry = meterings.get(frame.metered_by or "")
+            if entry is not None and entry["figures"]["bright_dn"] >= 1:
+                return metered_exposure_s(entry, self._level, frame.light, ANY_LIMITS)
+            earlier_s = self._earlier.get(("reference", frame.bench.lamp))
+        return None if earlier_s is None else earlier_s * frame.light
+
+
+def last_session(out: Path, rig: Mapping[str, Any]) -> Session | None:
+    """Return the latest session beside `out` that the same stage and camera took, if any."""
+    beside = out.absolute().parent
+    found: list[tuple[float, Session]] = []
+    for folder in sorted(beside.iterdir()) if beside.is_dir() else ():
+        if folder == out.absolute() or not is_session(folder):
+            continue
+        try:
+            session = Session(folder)
+            alike = all(session.rig.get(key) == rig.get(key) for key in ("kind", "stage", "camera"))
+            if alike and session.stored:
+                written_s = (folder / JOURNAL).stat().st_mtime
+                found.append((written_s, session))
+        except (AppError, OSError):
+            continue  # a damaged neighbour is no evidence
+    return max(found, key=lambda one: one[0])[1] if found else None
+
+
+class Pace:
+    """What frames cost in time, learnt from those that were taken.
+
+    waits: whether moves and exposures take their time; those of most simulated rigs do not.
+    """
+
+    def __init__(
+        self,
+        speeds_um_s: Mapping[str, float],
+        settle_s: float,
+        frame_bytes: int,
+        waits: bool = True,
+    ) -> None:
+        self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
+        self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
+        self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
+        self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
+
+    def learn(self, seconds: float, exposure_s: float, moving_s: float) -> None:
+        """Take note of what a frame took, by hand excepted, and of what was foreseen."""
+        foreseen_s = exposure_s + moving_s if self._waits else 0.0
+        self._learnt_s.append(max(0.0, seconds - foreseen_s))
+
+    def moving_s(self, frame: PlannedFrame, at_um: Mapping[str, float]) -> float:
+        """Return what it takes to bring the stage from where it stands to a frame's place."""
+        moves_s = [
+            _move_s(goal - at_um.get(axis, goal), self._speeds_um_s.get(axis, USUAL_SPEED_UM_S))
+            for axis, goal in frame.bench.offsets_um.items()
+            if at_um.get(axis) != goal
+        ]
+        return max(moves_s) + MOVE_S + self._settle_s if moves_s else 0.0
+
+    def estimate(
+        self,
+        frames: Iterable[PlannedFrame],
+        exposure_s: Callable[[PlannedFrame], float | None],
+        at_um: Mapping[str, float] | None = None,
+    ) -> Estimate:
+        """Return what frames in this order will take; at_um: where the stage stands before."""
+        here_um = dict(at_um or {})
+        stood: tuple | None = None
+        count, by_hand, guessed = 0, 0, 0
+        moving_s = exposing_s = 0.0
+        for frame in frames:
+            count += 1
+            moving_s += self.moving_s(frame, here_um)
+            here_um |= frame.bench.offsets_um
+            if frame.bench.lamp != "off":
+                by_hand += stood is not None and stood != frame.bench.set_by_hand
+                stood = frame.bench.set_by_hand
+            known_s = exposure_s(frame)
+            guessed += known_s is None
+            exposing_s += METERING_EXPOSURE_S * frame.light if known_s is None else known_s
+        if not self._waits:
+            moving_s = exposing_s = 0.0
+        size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
+        frame_s = median(self._learnt_s) if self._learnt_s else self._usual_s
+        return Estimate(count, moving_s, exposing_s, count * frame_s, size, by_hand, guessed)
+
+
+def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
+    """Return what frames cost on a rig before any is taken."""
+    rows, columns = rig.camera.shape
+    speeds_um_s = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
+    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits)
+
+
+def known_exposures(
+    exposures: Exposures, meterings: Mapping[str, Entry], entries: list[Entry]
+) -> Callable[[PlannedFrame], float | None]:
+    """Return what determines a frame's exposure, by a session's journal as it is now."""
+    decided = metered(entries)
+    return lambda frame: exposures.seconds(frame, meterings, decided)
+
+
+def _move_s(step_um: float, speed_um_s: float) -> float:
+    back_um = 2 * APPROACH_UM if needs_approach(0.0, step_um, APPROACH_UM) else 0.0
+    return (abs(step_um) + back_um) / speed_um_s

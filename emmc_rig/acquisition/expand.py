@@ -1,0 +1,431 @@
+"""Every frame that follows from a plan: darks, metering, references, whiteboards, shots.
+
+Source of the whiteboard procedure: see `calibration.whiteboard`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from calibration.openings import CENTRED, views_open, window_place_um
+from calibration.whiteboard import LAMP_COLOURS
+from emmc_rig.acquisition.metering import BRACKET_STEP, MOST_STEPS
+from emmc_rig.acquisition.order import spread
+from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.session.planned import SHOT_DARK, Bench, PlannedFrame
+
+OPEN_LAMP = "white"
+TURN_DEG = 90.0
+"""Of the white board: what maps no gradient and no saddle over the aperture onto itself."""
+RESPONSE_REPEATS = 2
+
+
+def exposures_s(plan: Plan, camera: Camera) -> list[tuple[float, ...] | None]:
+    """Return each shot's exposures, shortest first, None where metered; camera: as planned."""
+    own = camera.exposures_s()
+    return [
+        None
+        if shot.exposure_s == AUTO
+        else tuple(sorted(set(shot.exposure_s or (float(own[place]),))))
+        for place, shot in enumerate(plan.shots)
+    ]
+
+
+def expand(
+    plan: Plan, camera: Camera, window_um: float, window_side_um: float | None = None
+) -> tuple[PlannedFrame, ...]:
+    """Return every frame of a plan, in its order; camera: as planned.
+
+    window_um: what the stage's aperture_x adds to open the aperture. window_side_um: see
+    `emmc_rig.bench.hardware.Rig`; needed where the window opens a part of the aperture. Raises
+    AppError for views that the camera does not have, a window that uncovers none, and a shot whose
+    masks stand at several places.
+    """
+    boards = [*_boards(plan, camera), *_open_boards(plan, camera, window_um, window_side_um)]
+    lit = [
+        *_references(plan, camera, window_um),
+        *_response(plan, window_um),
+        *spread(boards, list(_lamp_checks(plan, camera, window_um))),
+        *_turned_boards(plan, camera, window_um),
+        *_last_references(plan, window_um),
+    ]
+    references = [frame for frame in lit if not frame.bench.masks_in and not frame.part]
+    others = [frame for frame in lit if frame.bench.masks_in or frame.part]
+    last = max((frame.part for frame in lit), default=0)
+    frames = [
+        *_darks(plan),
+        *references,
+        *_board_darks(plan, lit, "before", 0),
+        *others,
+        *_board_darks(plan, lit, "after", last),
+        *_shots(plan, camera, window_um),
+    ]
+    return tuple(frames)
+
+
+def _darks(plan: Plan) -> Iterator[PlannedFrame]:
+    if plan.darks is None:
+        return
+    bench = Bench("scene", "off", 0, 0, masks_in=True)
+    for place, exposure_s in enumerate(sorted(set(plan.darks.exposure_s))):
+        for repeat in range(plan.darks.repeats):
+            name = f"dark-{place}-r{repeat}"
+            yield PlannedFrame(name, "dark", bench, exposure_s, repeat=repeat)
+
+
+def _board_darks(
+    plan: Plan, boards: Sequence[PlannedFrame], when: str, part: int
+) -> Iterator[PlannedFrame]:
+    """Yield darks at every exposure under white light, metered as the whiteboards are.
+
+    At shorter ones the dark current is little, and lies on a line.
+    """
+    if plan.darks is None or not plan.darks.of_boards:
+        return
+    bench = Bench("whiteboard", "off", 0, 0, masks_in=True)
+    exposures = dict.fromkeys(
+        (one.exposure_s, one.metered_by, one.light)
+        for one in boards
+        if one.kind != "metering" and one.bench.lamp == OPEN_LAMP and one.light >= 1
+    )
+    for place, (exposure_s, metered_by, light) in enumerate(exposures):
+        for repeat in range(plan.darks.of_boards):
+            yield PlannedFrame(
+                f"dark-{when}-{place}-r{repeat}",
+                "dark",
+                bench,
+                exposure_s,
+                repeat=repeat,
+                metered_by=metered_by,
+                light=light,
+                part=part,
+            )
+
+
+def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
+    """Return the lamps of the whiteboards: white alone where a pixel sees one colour only."""
+    if plan.whiteboards is not None and plan.whiteboards.lamps is not None:
+        return plan.whiteboards.lamps
+    several = cfa_tile(camera.sensor.cfa).sum(axis=-1).max() > 1
+    filtered = all(shot.filter != "none" for shot in camera.shots)
+    return LAMP_COLOURS if several and not filtered else ("white",)
+
+
+def _metering_id(shot: int, lamp: str) -> str:
+    return f"meter-s{shot}-{lamp}"
+
+
+def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    window = {"aperture_x": window_um, "aperture_y": 0.0}
+    fitted = fittings(camera)
+    lamps = lamps_of(plan, camera)
+    if boards.open and OPEN_LAMP not in lamps:
+        lamps = (*lamps, OPEN_LAMP)
+    for shot in range(len(camera.shots)):
+        repeats = dict.fromkeys(lamps, boards.references)
+        if shot == 0 and boards.colours:
+            repeats |= {lamp: boards.colours for lamp in LAMP_COLOURS if lamp not in repeats}
+        for lamp, count in repeats.items():
+            bench = Bench("whiteboard", lamp, shot, fitted[shot], False, window)
+            metered_by = None
+            if boards.exposure_s is None:
+                metered_by = _metering_id(shot, lamp)
+                yield PlannedFrame(metered_by, "metering", bench, METERING_EXPOSURE_S)
+            for repeat in range(count):
+                yield PlannedFrame(
+                    f"reference-s{shot}-{lamp}-r{repeat}",
+                    "reference",
+                    bench,
+                    boards.exposure_s,
+                    repeat=repeat,
+                    metered_by=metered_by,
+                )
+
+
+def _boards(plan: Plan, camera: Camera) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    rows, columns = camera.views
+    views = boards.views
+    if views == "all":
+        views = tuple((v, u) for v in range(rows) for u in range(columns))
+    for v, u in views:
+        if not (0 <= v < rows and 0 <= u < columns):
+            raise AppError(
+                f"whiteboards.views: [{v}, {u}] is none of the camera's {rows}x{columns} views; "
+                "rows and columns count from 0"
+            )
+    cell_um = camera.lens.aperture_cell_um
+    y_um, x_um = centred_grid(rows, cell_um), centred_grid(columns, cell_um)
+    shots = range(len(camera.shots)) if boards.shots == "all" else boards.shots
+    for shot in shots:
+        if shot >= len(camera.shots):
+            raise AppError(
+                f"whiteboards.shots: {shot} is none of the {len(camera.shots)} shots, from 0"
+            )
+    # The pinhole lets one view's light pass, the reference that of all.
+    light = float(rows * columns)
+    fitted = fittings(camera)
+    for shot in shots:
+        masks_um = mask_offsets_um(camera, shot)
+        for v, u in views:
+            pinhole = {"aperture_x": float(x_um[u]), "aperture_y": float(y_um[v])}
+            for lamp in lamps_of(plan, camera):
+                bench = Bench("whiteboard", lamp, shot, fitted[shot], True, masks_um | pinhole)
+                metered = boards.exposure_s is None
+                for repeat in range(boards.repeats):
+                    yield PlannedFrame(
+                        f"board-s{shot}-v{v}-u{u}-{lamp}-r{repeat}",
+                        "whiteboard",
+                        bench,
+                        None if boards.exposure_s is None else boards.exposure_s * light,
+                        repeat=repeat,
+                        view=(v, u),
+                        metered_by=_metering_id(shot, lamp) if metered else None,
+                        light=light,
+                    )
+
+
+def _open_boards(
+    plan: Plan, camera: Camera, window_um: float, window_side_um: float | None
+) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None or not boards.open:
+        return
+    own_um = mask_offsets_um(camera, 0)
+    cell_um = camera.lens.aperture_cell_um
+    for place, board in enumerate(boards.open):
+        opened = int(views_open(camera.views, None, board.window).sum())
+        if opened == 0:
+            raise AppError(
+                f"whiteboards.open.{place}.window: {list(board.window)} uncovers none of the "
+                f"camera's {camera.views[0]}x{camera.views[1]} views: move it by fewer cells"
+            )
+        if board.window != CENTRED and window_side_um is None:
+            raise AppError(
+                f"whiteboards.open.{place}.window needs to know where the window's edges are: "
+                "write its side as window_side_um into the rig's file, or leave it out"
+            )
+        side_um = window_side_um or 0.0
+        there = window_place_um(board.window, camera.views, cell_um, side_um)
+        window = {"aperture_x": window_um + there[0], "aperture_y": there[1]}
+        if any(board.mask_um) and not own_um:
+            raise AppError(
+                f"whiteboards.open.{place}.mask_um: no mask of this camera moves: leave it out"
+            )
+        x_um, y_um = board.mask_um
+        moved = {
+            axis: own_um[axis] + further
+            for axis, further in (("mask_x", x_um), ("mask_y", y_um))
+            if own_um
+        }
+        bench = Bench("whiteboard", OPEN_LAMP, 0, 0, True, moved | window)
+        kind = "held-out" if board.held_out else "open"
+        for repeat in range(board.repeats):
+            yield PlannedFrame(
+                f"{kind}-{place}-r{repeat}",
+                kind,
+                bench,
+                repeat=repeat,
+                window=board.window,
+                **_white(plan, float(np.prod(camera.views)) / opened),
+            )
+
+
+def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
+    """Return how a whiteboard of the first shot is exposed, `light` times as long as metered."""
+    boards = plan.whiteboards or Boards()
+    if boards.exposure_s is not None:
+        return {"exposure_s": boards.exposure_s * light, "light": light}
+    return {"exposure_s": None, "metered_by": _metering_id(0, OPEN_LAMP), "light": light}
+
+
+def _response(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    bench = _open_bench(window_um, masks_in=False)
+    for share in sorted(boards.response):
+        for repeat in range(RESPONSE_REPEATS):
+            name = f"response-{share:g}-r{repeat}"
+            yield PlannedFrame(name, "check", bench, repeat=repeat, **_white(plan, share))
+
+
+def _lamp_checks(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    bench = _open_bench(window_um, True, mask_offsets_um(camera, 0))
+    for repeat in range(boards.lamp_checks):
+        yield PlannedFrame(f"check-r{repeat}", "check", bench, repeat=repeat, **_white(plan))
+
+
+def _turned_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    """Yield the board turned: through the masks, which are in the beam, then without them."""
+    boards = plan.whiteboards
+    if boards is None:
+        return
+    for masks_in in (True, False):
+        offsets_um = mask_offsets_um(camera, 0) if masks_in else {}
+        bench = replace(_open_bench(window_um, masks_in, offsets_um), board_turn_deg=TURN_DEG)
+        name = "open" if masks_in else "reference"
+        for repeat in range(boards.turned):
+            yield PlannedFrame(
+                f"turned-{name}-r{repeat}",
+                "turned",
+                bench,
+                repeat=repeat,
+                part=1,
+                **_white(plan),
+            )
+
+
+def _last_references(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
+    boards = plan.whiteboards
+    if boards is None or not boards.lamp_checks:
+        return
+    bench = _open_bench(window_um, masks_in=False)
+    for repeat in range(RESPONSE_REPEATS):
+        name = f"reference-again-r{repeat}"
+        yield PlannedFrame(name, "check", bench, repeat=repeat, part=2, **_white(plan))
+
+
+def _open_bench(
+    window_um: float, masks_in: bool, offsets_um: Mapping[str, float] | None = None
+) -> Bench:
+    """Return the bench of an open whiteboard of the first shot."""
+    window = {"aperture_x": window_um, "aperture_y": 0.0}
+    return Bench("whiteboard", OPEN_LAMP, 0, 0, masks_in, {**(offsets_um or {}), **window})
+
+
+def _scene_bench(plan: Plan, camera: Camera, place: int, window_um: float) -> Bench:
+    """Return how the bench stands for a shot of the scene."""
+    offsets_um = mask_offsets_um(camera, place)
+    offsets_um |= {"aperture_x": window_um, "aperture_y": 0.0}
+    lamp = plan.shots[place].lamp
+    return Bench("scene", lamp, place, fittings(camera)[place], True, offsets_um)
+
+
+def _scene_meterings(plan: Plan, camera: Camera, window_um: float) -> dict[int, PlannedFrame]:
+    """Return the frame that meters each shot whose exposure is metered.
+
+    Shots that are to be exposed alike share it where masks, filter, lamp and gain are the same.
+    """
+    found: dict[int, PlannedFrame] = {}
+    shared: dict[object, PlannedFrame] = {}
+    for place, shot in enumerate(plan.shots):
+        if shot.exposure_s != AUTO:
+            continue
+        bench = _scene_bench(plan, camera, place, window_um)
+        group = (bench.fitting, shot.lamp, shot.gain) if plan.metering.alike else place
+        name = f"meter-shot-{place}"
+        frame = PlannedFrame(name, "metering", bench, METERING_EXPOSURE_S, shot.gain)
+        found[place] = shared.setdefault(group, frame)
+    return found
+
+
+def _shot_darks(
+    plan: Plan, camera: Camera, meterings: Mapping[int, PlannedFrame]
+) -> Iterator[PlannedFrame]:
+    """Yield darks at the longest exposure of the shots: of those planned, and of each metered one.
+
+    Shots that are metered alike have one. At shorter exposures the dark current lies on a line.
+    """
+    if plan.darks is None or not plan.darks.of_shots:
+        return
+    planned = [max(bracket) for bracket in exposures_s(plan, camera) if bracket is not None]
+    exposures: list[tuple[int, float | None, str | None]] = []
+    if planned and max(planned) > max(plan.darks.exposure_s):
+        exposures.append((0, max(planned), None))
+    kept: dict[object, int] = {}
+    for place in meterings:
+        shot = plan.shots[place]
+        kept.setdefault((shot.lamp, shot.gain) if plan.metering.alike else place, place)
+    exposures += [(place, None, meterings[place].id) for place in kept.values()]
+    for place, exposure_s, metered_by in exposures:
+        bench = Bench("scene", "off", place, 0, masks_in=True)
+        for repeat in range(plan.darks.of_shots):
+            name = f"{SHOT_DARK}-{place if metered_by else 'longest'}-r{repeat}"
+            yield PlannedFrame(
+                name,
+                "dark",
+                bench,
+                exposure_s,
+                repeat=repeat,
+                metered_by=metered_by,
+            )
+
+
+def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+    meterings = _scene_meterings(plan, camera, window_um)
+    yield from {frame.id: frame for frame in meterings.values()}.values()
+    yield from _shot_darks(plan, camera, meterings)
+    steps = MOST_STEPS if plan.metering.bracket else 0
+    for place, (shot, bracket) in enumerate(
+        zip(plan.shots, exposures_s(plan, camera), strict=True)
+    ):
+        bench = _scene_bench(plan, camera, place, window_um)
+        metered_by = meterings[place].id if bracket is None else None
+        exposures: list[tuple[float | None, float]] = (
+            [(exposure_s, 1.0) for exposure_s in bracket]
+            if bracket
+            else [(None, BRACKET_STEP**step) for step in range(steps + 1)]
+        )
+        for step, (exposure_s, light) in enumerate(exposures):
+            for repeat in range(shot.repeats):
+                name = f"shot-{place}-e{step}-r{repeat}"
+                yield PlannedFrame(
+                    name,
+                    "shot",
+                    bench,
+                    exposure_s,
+                    shot.gain,
+                    repeat,
+                    metered_by=metered_by,
+                    light=light,
+                )
+
+
+def fittings(camera: Camera) -> list[int]:
+    """Return, for each shot, the first shot with the same masks, patterns and filter in the beam.
+
+    Nobody has to change anything between shots of one fitting.
+    """
+    keys = []
+    for place, shot in enumerate(camera.shots):
+        names = camera.shot_masks(place)
+        counts = [camera.masks[n].pattern.frame_count(len(camera.shots)) for n in names]
+        keys.append((names, tuple(place % count for count in counts), shot.filter))
+    return [keys.index(key) for key in keys]
+
+
+def mask_offsets_um(camera: Camera, shot: int) -> dict[str, float]:
+    """Return where the mask stage stands for a shot, by axis; none where nothing moves.
+
+    Raises AppError when a shot wants two masks at different places: there is one mask stage.
+    """
+    wanted = {
+        camera.shots[shot].offset_um.get(name, (0.0, 0.0))
+        for name in camera.moving_masks
+        if name in camera.shot_masks(shot)
+    }
+    if len(wanted) > 1:
+        raise AppError(
+            f"shot {shot} moves two masks apart, the rig has one mask stage: give both one place, "
+            f"shots.{shot}.mask_um"
+        )
+    return {
+        axis: value for x_um, y_um in wanted for axis, value in (("mask_x", x_um), ("mask_y", y_um))
+    }

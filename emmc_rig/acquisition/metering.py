@@ -1,0 +1,121 @@
+"""From frames that meter to the exposures of those that follow: whiteboards, shots of the scene.
+
+A shot aims the brightest of its readings at a level. Where most of a scene is far darker than its
+brightest parts, longer exposures follow, each BRACKET_STEP times as long as the one before it,
+until the median reading is brighter than 1 / LARGEST_RANGE of that level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from drivers.camera import Limits
+from drivers.errors import CameraSettingError
+from drivers.raw import RawFrame
+from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.plan import Metering
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
+
+METERING_TRIES = 8
+STEP = 4.0
+USABLE_LEVELS = (0.02, 0.95)
+BRACKET_STEP = 4.0
+"""Two stops: the longer frame's shot noise is half, and still most of its readings are below white
+where the shorter one is too dark."""
+MOST_STEPS = 2
+LARGEST_RANGE = 8.0
+"""Of the brightest reading over the median, which one exposure is for. A reading sums many views
+through masks, so that most scenes stay below 4."""
+
+
+def better_metering_s(
+    frame: RawFrame, found: Figures, exposure_s: float, limits_s: Limits
+) -> float | None:
+    """Return a better exposure for a metering frame; None: this one will do, or none exists."""
+    level = found.bright_dn / (frame.white_level_dn - float(frame.black_level_dn.mean()))
+    low, high = USABLE_LEVELS
+    if low <= level <= high:
+        return None
+    next_s = exposure_s * (STEP if level < low else 1 / STEP)
+    return next_s if limits_s[0] <= next_s <= limits_s[1] else None
+
+
+def metered_exposure_s(
+    metered: Entry, level: float, light: float, limits_s: tuple[float, float]
+) -> float:
+    """Return the exposure at which `light` times less light reads `level` of white.
+
+    metered: the journal line of the metering frame. Clipped to the camera's limits. Raises
+    `CameraSettingError` where the board was dark.
+    """
+    black_dn = float(np.mean(metered["black_level_dn"]))
+    bright_dn = metered["figures"]["bright_dn"]
+    if bright_dn < 1:
+        raise CameraSettingError("exposure", "cannot be metered, the board is dark: light the lamp")
+    wanted = level * (metered["white_level_dn"] - black_dn) / bright_dn
+    low_s, high_s = limits_s
+    return min(max(metered["exposure_s"] * wanted * light, low_s), high_s)
+
+
+def first_meterings(session: Session) -> dict[str, Entry]:
+    """Return the first journal line of every metering frame.
+
+    The first counts even where its file is damaged by now: frames exposed by it are there, and
+    those still to come must be exposed alike.
+    """
+    ids = {frame.id for frame in session.frames if frame.kind == "metering"}
+    found: dict[str, Entry] = {}
+    for entry in session.journal.entries:
+        if entry["kind"] == "frame" and entry["id"] in ids:
+            found.setdefault(entry["id"], entry)
+    return found
+
+
+def asked_of_scene(
+    frames: Iterable[PlannedFrame],
+    entries: Mapping[str, Entry],
+    metering: Metering,
+    limits_s: Limits,
+) -> dict[str, Any]:
+    """Return what a journal line `metered` says: exposures by shot, and frames asked for.
+
+    frames: the session's. entries: of its metering frames, by id. limits_s: of the camera. Raises
+    `CameraSettingError` where the scene is dark.
+    """
+    shots = [frame for frame in frames if frame.is_metered_shot]
+    limits_s = (limits_s[0], min(limits_s[1], metering.longest_s))
+    group_of = {}
+    for frame in shots:
+        light = (frame.bench.lamp, frame.gain)
+        group_of[frame.bench.shot] = light if metering.alike else frame.bench.shot
+    chosen_s: dict[object, float] = {}
+    steps: dict[object, int] = {}
+    for frame in shots:
+        entry = entries[frame.metered_by or ""]
+        group = group_of[frame.bench.shot]
+        exposure_s = metered_exposure_s(entry, metering.level, 1.0, limits_s)
+        chosen_s[group] = min(exposure_s, chosen_s.get(group, exposure_s))
+        steps[group] = max(_steps(entry["figures"]), steps.get(group, 0))
+    asked = [
+        frame.id
+        for frame in shots
+        if frame.is_optional
+        and frame.light <= BRACKET_STEP ** steps[group_of[frame.bench.shot]]
+        and frame.light * chosen_s[group_of[frame.bench.shot]] <= limits_s[1]
+    ]
+    return {
+        "exposures_s": {str(shot): chosen_s[group] for shot, group in group_of.items()},
+        "asked": asked,
+    }
+
+
+def _steps(figures: Mapping[str, float]) -> int:
+    """Return how many longer exposures a scene of these figures asks for."""
+    ratio = figures["bright_dn"] / max(figures["median_dn"], 1.0)
+    wanted = np.log(max(ratio / LARGEST_RANGE, 1.0)) / np.log(BRACKET_STEP)
+    return min(MOST_STEPS, int(np.ceil(wanted)))

@@ -1,0 +1,336 @@
+"""The plan of a capture, frozen and validated: shots, whiteboards, darks, order, checks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.camera import Camera, Shot
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
+
+METERING_EXPOSURE_S = 0.01
+SCHEMA_FILE = "plan.schema.json"
+
+Lamp = Literal["white", "red", "green", "blue"]
+Positive = Annotated[float, Field(gt=0)]
+Gain = Annotated[float, Field(ge=1, description="1: the camera's lowest ISO")]
+Repeats = Annotated[int, Field(ge=1, le=10_000)]
+
+
+def _several(value: object) -> object:
+    return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+AUTO = "auto"
+_POSITIVE_SCHEMA = {"type": "number", "exclusiveMinimum": 0}
+_SEVERAL_SCHEMAS = [_POSITIVE_SCHEMA, {"type": "array", "items": _POSITIVE_SCHEMA, "minItems": 1}]
+Exposures = Annotated[
+    tuple[Positive, ...],
+    BeforeValidator(_several),
+    Field(min_length=1),
+    WithJsonSchema({"anyOf": _SEVERAL_SCHEMAS}),
+]
+"""One exposure in seconds, or several: a bracket."""
+MeteredExposures = Annotated[
+    Annotated[Literal["auto"], Tag(AUTO)] | Annotated[Exposures, Tag("seconds")],
+    Discriminator(lambda value: AUTO if isinstance(value, str) else "seconds"),
+    WithJsonSchema({"anyOf": [{"const": AUTO}, *_SEVERAL_SCHEMAS]}),
+]
+"""As `Exposures`, or metered."""
+
+
+class PlannedShot(Settings):
+    """One shot of the scene.
+
+    The masks in the beam, their place and the filter are those of one of the camera's shots;
+    `mask_um` or `mask_cells` (x, y) move every mask on the stage elsewhere.
+    """
+
+    camera_shot: int | None = Field(
+        default=None, ge=0, description="from 0; default: this shot's own place in the list"
+    )
+    mask_um: tuple[float, float] | None = Field(default=None, description="x, y from the axis")
+    mask_cells: tuple[float, float] | None = Field(default=None, description="x, y in mask cells")
+    exposure_s: MeteredExposures | None = Field(
+        default=None,
+        description="auto: metered; or seconds, several are a bracket; default: the camera's own",
+    )
+    gain: Gain = 1.0
+    repeats: Repeats = 1
+    lamp: Lamp = "white"
+
+    @model_validator(mode="after")
+    def _one_place(self) -> PlannedShot:
+        if self.mask_um is not None and self.mask_cells is not None:
+            raise ValueError("give mask_um or mask_cells, not both")
+        return self
+
+
+class OpenBoard(Settings):
+    """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
+
+    mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
+    """
+
+    mask_um: tuple[float, float] = (0.0, 0.0)
+    window: tuple[int, int] = Field(
+        default=(0, 0),
+        description="x, y: by how many aperture cells the plate's window is moved, so that a part "
+        "of the aperture is open",
+    )
+    repeats: Repeats = 2
+    held_out: bool = False
+
+
+class Boards(Settings):
+    """Whiteboards: the pinhole before every view, and the open aperture without masks."""
+
+    views: Literal["all"] | tuple[tuple[int, int], ...] = Field(
+        default="all", description="all, or a list of [v, u]; [] for none"
+    )
+    open: tuple[OpenBoard, ...] = Field(
+        default=(), description="masks in, whole aperture: for the parametric route of `calibrate`"
+    )
+    shots: Literal["all"] | tuple[Annotated[int, Field(ge=0)], ...] = Field(
+        default="all", description="for which shots the pinhole is stepped: all, or a list"
+    )
+    lamps: tuple[Lamp, ...] | None = Field(
+        default=None, min_length=1, description="default: what the sensor needs"
+    )
+    repeats: Repeats = 2
+    references: Annotated[int, Field(ge=2, le=10_000)] = 4
+    lamp_checks: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="the open whiteboard of the first shot again, so often, spread over the "
+        "others, and the reference once more at the end: how the lamp drifts",
+    )
+    response: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
+        default=(), description="references at these shares of their exposure too: the response"
+    )
+    colours: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0, description="references under red, green, blue lamps: crosstalk of the filters"
+    )
+    turned: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="open whiteboards and references with the board turned by 90 degrees: how "
+        "uneven the board is over angle",
+    )
+    level: float = Field(default=0.7, gt=0, lt=1, description="of white, where metering aims")
+    exposure_s: Positive | None = Field(
+        default=None, description="of the references; default: metered"
+    )
+
+
+class Metering(Settings):
+    """Of shots with `exposure_s: auto`: where their exposure is aimed at."""
+
+    level: float = Field(
+        default=0.7, gt=0, lt=1, description="of white, where the brightest readings come"
+    )
+    bracket: bool = Field(
+        default=True, description="longer exposures too, where most of a scene is far darker"
+    )
+    alike: bool = Field(default=True, description="the same for all shots of one lamp and gain")
+    longest_s: Positive = Field(default=30.0, description="no exposure is made longer than this")
+
+
+class Darks(Settings):
+    """Dark frames, the lamp off."""
+
+    exposure_s: Exposures = (METERING_EXPOSURE_S,)
+    repeats: Annotated[int, Field(ge=2, le=10_000)] = 4
+    of_boards: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="at every exposure of the whiteboards too, so many before and after them",
+    )
+    of_shots: Annotated[int, Field(ge=0, le=10_000)] = Field(
+        default=0,
+        description="so many at the longest exposure of the shots, before them; 0, or at least 2",
+    )
+
+    @field_validator("of_shots")
+    @classmethod
+    def _repeated(cls, count: int) -> int:
+        if count == 1:
+            raise ValueError("write 0, or 2 or more: one frame does not tell its own noise")
+        return count
+
+
+class Retries(Settings):
+    """How often a frame is tried again before the capture stops, everything kept."""
+
+    per_frame: int = Field(default=4, ge=0)
+    per_session: int = Field(default=200, ge=0, description="between start and end of the program")
+
+
+class Checks(Settings):
+    """What a frame must pass before it counts."""
+
+    largest_saturated_share: float = Field(
+        default=0.02, ge=0, le=1, description="of a frame's pixels; a bracket's shortest exposure"
+    )
+    smallest_signal: float = Field(
+        default=0.002, ge=0, le=1, description="brightest pixels above black, 1 at white"
+    )
+    largest_dark: float = Field(default=0.05, gt=0, le=1, description="mean of a dark frame")
+    stage_um: float = Field(default=2.0, gt=0, description="read-back after the exposure")
+    registration_px: float = Field(
+        default=0.5, gt=0, description="shift against the last good frame, on resuming"
+    )
+
+
+class Suspender(Settings):
+    """A figure that makes a capture wait while it is outside its range.
+
+    name: for people. file: a text file that begins with the figure, as a lab's own program or the
+    system keeps it. camera: or what the camera reports under this name. low, high: the range.
+    """
+
+    name: str
+    file: str | None = None
+    camera: str | None = None
+    low: float | None = None
+    high: float | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Suspender:
+        if (self.file is None) == (self.camera is None):
+            raise ValueError("give file or camera, one of them")
+        if self.low is None and self.high is None:
+            raise ValueError("give low, high or both")
+        return self
+
+
+class Plan(Settings):
+    """What to capture; see `new_plan` for a commented one."""
+
+    title: str = ""
+    camera: str = Field(description="a shipped camera (`emmc-rig cameras`), or a YAML file")
+    shots: tuple[PlannedShot, ...] = Field(min_length=1)
+    whiteboards: Boards | None = Boards()
+    darks: Darks | None = Darks()
+    metering: Metering = Metering()
+    order: Literal["least-travel", "as-planned"] = "least-travel"
+    settle_s: float = Field(
+        default=0.0, ge=0, le=3600, description="after a move, beyond the stage's own"
+    )
+    retries: Retries = Retries()
+    checks: Checks = Checks()
+    suspend: tuple[Suspender, ...] = Field(
+        default=(), description="the capture waits while one of these is out of its range"
+    )
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan; raises AppError with one line naming the nearest valid key."""
+    return validated(Plan, read_yaml(path, AppError), str(path), AppError)
+
+
+def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
+    """Return the camera that the plan makes: one of its shots for each of the plan's.
+
+    beside: the folder that a camera file is looked for in first. Raises AppError or CameraError.
+    """
+    spec = plan.camera
+    if beside is not None and (beside / spec).is_file():
+        spec = str(beside / spec)
+    camera = find_camera(spec)
+    wanted = max(_own_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
+    if wanted >= len(camera.shots):
+        camera = camera.with_shots(wanted + 1)
+    changing = [
+        name
+        for name, mask in camera.masks.items()
+        if mask.pattern.frame_count(len(camera.shots)) > 1
+    ]
+    for place, shot in enumerate(plan.shots):
+        if changing and shot.camera_shot not in (None, place):
+            raise AppError(
+                f"shots.{place}.camera_shot: mask '{changing[0]}' shows another pattern in every "
+                f"shot, so shot {place} is always its own: leave camera_shot out"
+            )
+    shots = tuple(_camera_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
+    return camera.model_copy(update={"shots": shots})
+
+
+def _own_shot(camera: Camera, place: int, shot: PlannedShot) -> int:
+    """Return which of the camera's shots a planned one is; one of a place of its own goes round."""
+    if shot.camera_shot is not None:
+        return shot.camera_shot
+    placed = shot.mask_um is not None or shot.mask_cells is not None
+    return place % len(camera.shots) if placed else place
+
+
+def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
+    own = camera.shots[_own_shot(camera, place, shot)]
+    if shot.mask_um is None and shot.mask_cells is None:
+        return own
+    moving = camera.moving_masks or tuple(camera.masks)
+    if not moving:
+        raise AppError(f"shots.{place}: the camera has no mask to move: leave its place out")
+    if shot.mask_um is not None:
+        offsets = dict.fromkeys(moving, shot.mask_um)
+    else:
+        assert shot.mask_cells is not None
+        x, y = shot.mask_cells
+        offsets = {
+            name: (x * camera.masks[name].cell_um, y * camera.masks[name].cell_um)
+            for name in moving
+        }
+    return own.model_copy(update={"offset_um": offsets})
+
+
+def plan_schema() -> dict[str, Any]:
+    """Return the JSON schema of a plan, for editors."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Plan.model_json_schema(),
+    }
+
+
+def schema_text() -> str:
+    """Return the schema as it is shipped."""
+    return json.dumps(plan_schema(), indent=2) + "\n"
+
+
+def schema_path() -> Path:
+    """Return where the shipped schema lies."""
+    return Path(str(resources.files("emmc_rig.acquisition") / SCHEMA_FILE))
+
+
+def differences(one: Plan, other: Plan) -> list[str]:
+    """Return what differs between two plans, in words; nothing for equal ones."""
+    return list(_differences(one.model_dump(), other.model_dump(), ""))
+
+
+def _differences(one: Any, other: Any, where: str) -> Iterator[str]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in one:
+            yield from _differences(one[key], other.get(key), f"{where}.{key}")
+    elif isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        if len(one) != len(other):
+            yield f"{where.lstrip('.')} has {len(one)} entries, not {len(other)}"
+        for place, (a, b) in enumerate(zip(one, other, strict=False)):
+            yield from _differences(a, b, f"{where}.{place}")
+    elif one != other:
+        yield f"{where.lstrip('.')} is {_shown(one)}, not {_shown(other)}"
+
+
+def _shown(value: Any) -> str:
+    return json.dumps(value, default=str)

@@ -1,0 +1,103 @@
+"""Replaying a recording: which of its RAW files is which planned frame, by what files state.
+
+A file named as a frame (`shot-0-e0-r0.dng`, or as sessions name theirs) is that frame. The others
+are taken by time, then name, where there are as many as frames and all exposures agree; otherwise
+exposure by exposure, where there are as many files as frames of one. Nothing is guessed beyond
+that: what is missing is named, and the rest of the session is taken.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from drivers.camera import EXPOSURE_AGREEMENT
+from drivers.errors import FolderCameraError
+from drivers.folder import FolderCamera, Recorded
+from emmc_rig.bench.hardware import Rig
+from emmc_rig.errors import AppError
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
+
+
+def matched(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
+    """Return by frame's id the file that is it; files: in the order in which they were taken."""
+    named = {re.sub(r"^\d{5}-", "", Path(file.name).stem): file for file in files}
+    found = {frame.id: named[frame.id] for frame in frames if frame.id in named}
+    taken = {file.name for file in found.values()}
+    left = [file for file in files if file.name not in taken]
+    wanted = [frame for frame in frames if frame.id not in found and not frame.is_optional]
+    if len(wanted) == len(left) and all(map(_agree, wanted, left)):
+        return found | {frame.id: file for frame, file in zip(wanted, left, strict=True)}
+    if any(frame.exposure_s is None for frame in wanted):
+        return found  # of any exposure, so that no group is known to be whole
+    for exposure_s in {frame.exposure_s for frame in wanted}:
+        alike = [frame for frame in wanted if frame.exposure_s == exposure_s]
+        there = [file for file in left if file.exposure_s and _agree(alike[0], file)]
+        if len(alike) == len(there):
+            found |= {frame.id: file for frame, file in zip(alike, there, strict=True)}
+    return found
+
+
+def _agree(frame: PlannedFrame, file: Recorded) -> bool:
+    """Return whether the exposures that both state are the same."""
+    if frame.exposure_s is None or file.exposure_s is None:
+        return True
+    return abs(file.exposure_s / frame.exposure_s - 1) <= EXPOSURE_AGREEMENT
+
+
+def replaying(rig: Rig, frames: Sequence[PlannedFrame]) -> tuple[Rig, Mapping[str, Recorded]]:
+    """Return the rig, whose folder camera then gives each frame its file, and these files.
+
+    Raises AppError where no file is a frame.
+    """
+    camera = rig.camera
+    assert isinstance(camera, FolderCamera)
+    files = camera.files()
+    found = matched(frames, files)
+    if not found:
+        raise AppError(
+            f"{camera.folder}: which of its {len(files)} files are the plan's {len(frames)} "
+            "frames cannot be said from number and exposures; name them by their frames, such as "
+            f"{frames[0].id}.dng"
+        )
+
+    def choose(frame_id: str) -> None:
+        if frame_id not in found:
+            raise FolderCameraError(str(camera.folder), f"no file of it is frame {frame_id}")
+        camera.choose(found[frame_id].name)
+
+    recorded_s = {name: file.exposure_s for name, file in found.items() if file.exposure_s}
+    rig = replace(rig, about_to_expose=choose, recorded_s=recorded_s, reopen_camera=None)
+    return rig, found
+
+
+def there(
+    session: Session, found: Mapping[str, Recorded]
+) -> Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]:
+    """Return what chooses, for a `Sequencer`, those missing frames of which there is a file."""
+
+    def choose(now_s: Callable[[], float]) -> tuple[PlannedFrame, ...]:
+        known = {*found, *session.stored, None}
+        return tuple(f for f in session.missing() if f.id in found and f.metered_by in known)
+
+    return choose
+
+
+def missing_words(
+    folder: Path, frames: Sequence[PlannedFrame], found: Mapping[str, Recorded]
+) -> str:
+    """Return which frames have no file, "" where all have one; frames: still to be taken."""
+    missing = [frame for frame in frames if frame.id not in found and not frame.is_optional]
+    if not missing:
+        return ""
+    shown = ", ".join(
+        f"{one.id} ({one.exposure_s:g} s)" if one.exposure_s else one.id for one in missing[:5]
+    )
+    more = ", ..." if len(missing) > 5 else ""
+    return (
+        f"{folder}: no file is known to be {shown}{more}; the others are taken. Add it as "
+        f"{missing[0].id}.dng and run the same command"
+    )

@@ -1,0 +1,155 @@
+"""A capture that ends when the scene needs no more shots: which frames of a session come next.
+
+Everything but the shots comes first, so that Psi of every planned shot is known before one of them
+is chosen: measured, or foretold by the parametric fit. Then shots are taken one by one; after each
+the light field so far is reconstructed and assessed, and what is decided is journalled before it is
+acted on, so that a resume goes on with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from calibration.shadow import shadow_mask
+from emmc_rig.acquisition.assessment import METHOD, Assessment, assessed
+from emmc_rig.acquisition.plan import Plan
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera
+from emmc_rig.session.decisions import decided_words, decisions, ended
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.readings import Scale, scaled_readings, session_scale
+from emmc_rig.session.session import Session, wall_time
+from reconstruction.methods import reconstruct
+from reconstruction.result import Progress, Reconstruction
+
+PLANNED_BY = "`emmc-rig calibrate --plan` writes a plan that has them"
+SMALLEST = (16, 16)
+
+
+def refuse_without_choice(plan: Plan, camera: Camera) -> None:
+    """Raise AppError or CalibrationError unless a plan lets shots be chosen; camera: as planned.
+
+    Its whiteboards must determine Psi of every shot before the first one is taken.
+    """
+    if len(plan.shots) < 2:
+        raise AppError(
+            "--until: the plan has one shot, so that there is none to choose; list the others that "
+            "may be taken, each with its mask_um"
+        )
+    boards = plan.whiteboards
+    if boards is None or plan.darks is None:
+        wanting = "darks" if boards is not None else "whiteboards"
+        raise AppError(
+            f"--until: the plan has no {wanting}, so that Psi of its shots stays unknown; "
+            f"{PLANNED_BY}"
+        )
+    if any(not board.held_out for board in boards.open):
+        if not any(board.held_out for board in boards.open):
+            raise AppError(
+                "--until: no open whiteboard of the plan is held out to judge the fit by; "
+                f"{PLANNED_BY}"
+            )
+        shadow_mask(camera, SMALLEST)
+        return
+    views = set(boards.views) if boards.views != "all" else None
+    shots = set(boards.shots) if boards.shots != "all" else None
+    rows, columns = camera.views
+    if (views is not None and len(views) < rows * columns) or (
+        shots is not None and len(shots) < len(plan.shots)
+    ):
+        raise AppError(
+            "--until: the plan has neither open whiteboards nor the pinhole before every view of "
+            f"every shot, so that Psi of its shots stays unknown; {PLANNED_BY}"
+        )
+
+
+class Until:
+    """Says what a `Sequencer` takes next, of a session with a target; use it within one run."""
+
+    def __init__(self, session: Session, watcher: CaptureWatcher) -> None:
+        self._session, self._watcher = session, watcher
+        self._scale: Scale | None = None
+
+    def __call__(self, now_s: Callable[[], float]) -> tuple[PlannedFrame, ...]:
+        """Return the frames to take now, none when the session has what it needs.
+
+        now_s: seconds since the run began. Raises AppError, CalibrationError, ReconstructionError
+        or `OSError`.
+        """
+        session = self._session
+        missing = session.missing()
+        first = tuple(frame for frame in missing if frame.kind != "shot")
+        if first:
+            self._scale = None
+            return first
+        chosen = self._chosen()
+        due = tuple(frame for frame in missing if frame.bench.shot in chosen)
+        if due or ended(session.journal.entries) is not None:
+            return due
+        self._decide(chosen, now_s)
+        return self(now_s)
+
+    def _chosen(self) -> tuple[int, ...]:
+        """Return the shots to be taken so far: the plan's first, those decided, those begun."""
+        session = self._session
+        shots = [frame for frame in session.frames if frame.kind == "shot"]
+        decided = [entry["next"] for entry in decisions(session.journal.entries)]
+        begun = sorted({frame.bench.shot for frame in shots if frame.id in session.stored})
+        first = min(frame.bench.shot for frame in shots)
+        wanted = dict.fromkeys([first, *decided, *begun])
+        # An amended plan may have fewer shots than it was once decided of.
+        planned = {frame.bench.shot for frame in shots}
+        return tuple(shot for shot in wanted if shot in planned)
+
+    def _decide(self, shots: tuple[int, ...], now_s: Callable[[], float]) -> None:
+        session, target_db = self._session, self._session.target_db
+        assert target_db is not None
+        began_s = now_s()
+        self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
+        found = self._assessed(shots, target_db)
+        planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
+        spared = [] if found.next is not None else sorted(planned - set(shots))
+        entry = {
+            "run": session.runs,
+            "shots": list(shots),
+            "stated_db": found.stated_db,
+            "target_db": target_db,
+            "next": found.next,
+            "why": found.why,
+            "expected_db": {str(shot): value for shot, value in found.expected_db.items()},
+            "spared": spared,
+            "spared_frames": sum(
+                frame.kind == "shot" and frame.bench.shot in spared for frame in session.needed
+            ),
+            "method": METHOD,
+            "advice": found.advice,
+            "spans_s": {"decide": [began_s, now_s()]},
+            "wall": wall_time(),
+        }
+        session.note("decided", **entry)
+        self._watcher.tell(decided_words(entry))
+
+    def _assessed(self, shots: tuple[int, ...], target_db: float) -> Assessment:
+        self._scale = self._scale or session_scale(self._session)
+        result, sigma = light_field_so_far(self._session, self._scale, shots)
+        self._watcher.light_field(shots, result)
+        return assessed(self._scale.psi, result, shots, sigma, target_db)
+
+
+def light_field_so_far(
+    session: Session,
+    scale: Scale,
+    shots: Sequence[int],
+    on_step: Callable[[Progress], None] | None = None,
+) -> tuple[Reconstruction, float]:
+    """Return the light field that some shots of a session give by METHOD, and their noise.
+
+    Raises AppError, CalibrationError or ReconstructionError.
+    """
+    taken = scaled_readings(session, scale, shots)
+    sigma = taken.noise_sigma
+    result = reconstruct(
+        METHOD, taken.psi, taken.readings, sigma, usable=taken.usable, on_step=on_step
+    )
+    return result, sigma

@@ -1,0 +1,607 @@
+"""The only place that chooses devices: real ones by name, or simulated ones on the same bytes.
+
+The stage chain: device 1 carries the coded mask (axes x, y), device 2 the aperture plate (axes
+x, y), which has a pinhole of one aperture cell and, beside it, a window that leaves the whole
+aperture open.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.apt import ACTUATORS, Actuator, AptAxis, AptStage
+from drivers.apt import identify as identify_apt
+from drivers.camera import Camera as CameraDevice
+from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.errors import DriverError, TransportTimeoutError
+from drivers.folder import FolderCamera
+from drivers.grbl import GrblStage
+from drivers.grbl import identify as identify_grbl
+from drivers.plain_dng import SMALLEST_SIDE_PX
+from drivers.ports import find_port, list_serial_ports
+from drivers.ptp import PtpCamera, PtpSession
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.stage import HostStage, Stage, StageSettings
+from drivers.transport import SerialTransport, Transport
+from drivers.u3v import open_u3v
+from drivers.usb import open_device
+from drivers.zaber import ZaberStage, find_devices
+from emmc_rig.bench import plugins
+from emmc_rig.bench.camera_config import (
+    CameraChoice,
+    GphotoCameraConfig,
+    MicroManagerCameraConfig,
+    parse_camera,
+)
+from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
+from emmc_rig.bench.stage_config import (
+    AptAxisConfig,
+    AptConfig,
+    GrblConfig,
+    MicroManagerConfig,
+    PluginConfig,
+    SerialConfig,
+    ZaberConfig,
+    parse_stage,
+)
+from emmc_rig.bench.trigger import SimulatedTrigger, Trigger
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.camera import Camera, Sensor
+from emmc_rig.model.masks import cfa_tile
+from emmc_rig.model.settings import validated
+from simulators.apt import AptController
+from simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
+from simulators.clock import ManualClock
+from simulators.effects import Flaws
+from simulators.firmware import SimulatedController
+from simulators.grbl import GrblController
+from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
+from simulators.u3v import COLOURS, U3vCameraSimulator
+from simulators.usb import SimulatedUsb, UsbFunction
+from simulators.wire import PtyServer
+from simulators.zaber import AxisSpec, ZaberChain
+
+_log = logging.getLogger(__name__)
+
+STAGE_AXES = {
+    "mask_x": (1, 1),
+    "mask_y": (1, 2),
+    "aperture_x": (2, 1),
+    "aperture_y": (2, 2),
+}
+FOCUS, FOCUS_ADDRESS = "focus", (3, 1)
+"""The axis that moves the lens along the optical axis, where a stage has one."""
+MASK_TRAVEL_UM = 25_400.0
+POSITION_TOLERANCE_UM = 0.5
+SIMULATED = "simulated"
+PROBE_TIMEOUT_S = 0.2
+NO_FLAWS = Flaws()
+"""But for a mask that sits a few um off, as every one does."""
+SIMULATED_SCALES = {
+    "zaber": f",microstep_um={AxisSpec().microstep_um}",
+    "grbl": "",
+    "apt": ",actuator=z825",
+}
+"""What must be stated of simulated devices: models that no table has, an unnamed actuator."""
+
+
+class Attendant(Protocol):
+    """What a person, or a relay, does at the bench between exposures."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Light the scene or the board: off, white, red, green or blue."""
+        ...
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Put the "scene" or the "whiteboard" before the camera; the board turned in its plane."""
+        ...
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
+        ...
+
+
+def _unheard(name: str) -> None:
+    """Take no notice: real noise needs no name."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The devices of one bench.
+
+    zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
+    window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
+    clock: the devices' own. reopen_camera: opens the camera again after it went away.
+    about_to_expose: called with a frame's name before its exposure. trigger: the line by which
+    the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
+    of that square window, to put its edges between views; None: not known. stands_um: where axes
+    that no plan moves stand in a capture, as the focus. recorded_s: of a recording that is
+    replayed, the exposure of each frame by its name.
+    """
+
+    stage: Stage
+    camera: CameraDevice
+    attendant: Attendant
+    zero_um: Mapping[str, float]
+    window_um: float
+    clock: Clock = SYSTEM_CLOCK
+    reopen_camera: Callable[[], CameraDevice] | None = None
+    about_to_expose: Callable[[str], None] = _unheard
+    trigger: Trigger | None = None
+    window_side_um: float | None = None
+    stands_um: Mapping[str, float] = field(default_factory=dict)
+    recorded_s: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SimulatedRig(Rig):
+    """A rig, and the firmware behind its devices, whose faults can be armed.
+
+    still: of the PTP camera that the rig has unless its stage triggers the exposures.
+    """
+
+    chain: ZaberChain = field(kw_only=True)
+    still: PtpCameraSimulator = field(kw_only=True)
+
+
+class SimulatedAttendant:
+    """An `Attendant` that acts on the simulated bench."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+
+    def set_lamp(self, colour: str) -> None:
+        """Switch the bench's lamp."""
+        self._bench.lamp = colour
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Change what the camera looks at."""
+        self._bench.target, self._bench.board_turn_deg = target, turn_deg
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Change what is in the beam."""
+        self._bench.shot = shot
+        self._bench.masks_in = fitted
+
+
+def simulated_rig(
+    camera: Camera,
+    fine_scene: NDArray[np.float32],
+    size: tuple[int, int],
+    seed: int,
+    clock: Clock | None = None,
+    rays_per_view: int = RAYS_PER_VIEW,
+    trigger: SimulatedTrigger | None = None,
+    flaws: Flaws = NO_FLAWS,
+    focus_um: float | None = None,
+    stands_um: Mapping[str, float] | None = None,
+) -> tuple[SimulatedRig, Bench]:
+    """Return a rig of simulated devices, and the bench that they look at (for its truth).
+
+    fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
+    real one lets moves and exposures take their time; by default they take none. A frame that is
+    announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
+    pixel; few are quick, and grainy beside a good sensor's noise. trigger: the stage's arrival
+    begins the exposures of a USB3 Vision camera. flaws: what is wrong with it. focus_um: where a
+    fifth axis, `focus`, has the scene sharp; None: there is none. stands_um: see `Rig`. Raises
+    AppError for a size that the camera's RAW files cannot hold.
+    """
+    k = camera.sensor.binning
+    if min(size) // k < SMALLEST_SIDE_PX:
+        least = SMALLEST_SIDE_PX * k
+        raise AppError(
+            f"--size {size[0]}x{size[1]}: the simulated camera's RAW files hold at least "
+            f"{SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels: use {least}x{least} or more"
+        )
+    clock = clock or ManualClock()
+    aperture_um = max(camera.views) * camera.lens.aperture_cell_um
+    travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um, 3: MASK_TRAVEL_UM}
+    axes = STAGE_AXES if focus_um is None else STAGE_AXES | {FOCUS: FOCUS_ADDRESS}
+    chain = ZaberChain(clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in axes.values()})
+    zero_um = {
+        name: (MASK_TRAVEL_UM / 2 if device == 1 else aperture_um)
+        for name, (device, _) in STAGE_AXES.items()
+    }
+
+    def positions_um() -> dict[str, float]:
+        sharp_um = {} if focus_um is None else {FOCUS: focus_um}
+        return {
+            name: chain.position_um(*address) - (zero_um | sharp_um)[name]
+            for name, address in axes.items()
+        }
+
+    window_um = 2 * aperture_um
+    rng = np.random.default_rng(seed)
+    bench = Bench(
+        camera,
+        fine_scene,
+        size,
+        positions_um,
+        window_um,
+        rng,
+        flaws.mounting,
+        rays_per_view,
+        flaws.optics,
+        flaws.sensor,
+        flaws.board,
+        flaws.lamp,
+        clock.now_s,
+    )
+    stage = ZaberStage(
+        chain.transport(),
+        axes,
+        microstep_um=AxisSpec().microstep_um,
+        clock=clock,
+        settings=StageSettings(tolerance_um=POSITION_TOLERANCE_UM),
+    )
+    noise = camera.sensor.noise
+    cfa = camera.sensor.cfa_name
+    simulator = PtpCameraSimulator(
+        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
+    )
+    shape = (size[0] // k, size[1] // k)
+    function: UsbFunction = PtpUsbFunction(simulator)
+    if trigger is not None:
+        function = _triggered_camera(bench, shape, clock, chain, trigger.latency_s)
+    bus = SimulatedUsb(clock, function)
+
+    def opened() -> CameraDevice:
+        """Open the camera; one whose cable is out is plugged in first."""
+        if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
+            bus.plug(function)
+        if trigger is not None:
+            return open_u3v(backend=bus, clock=clock)
+        # The card lies in this computer's memory, hence from_card.
+        return _ptp_camera(clock, bus, shape=shape, cfa=cfa, from_card=True)
+
+    def announced(name: str) -> None:
+        digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
+        bench.rng = np.random.default_rng(int.from_bytes(digest))
+
+    rig = SimulatedRig(
+        stage,
+        opened(),
+        SimulatedAttendant(bench),
+        zero_um,
+        window_um,
+        clock,
+        opened,
+        announced,
+        trigger,
+        window_side_um(camera.views, camera.lens.aperture_cell_um),
+        stands_um or {},
+        chain=chain,
+        still=simulator,
+    )
+    return rig, bench
+
+
+def _triggered_camera(
+    bench: Bench, shape: tuple[int, int], clock: Clock, chain: ZaberChain, latency_s: float
+) -> U3vCameraSimulator:
+    """Return a USB3 Vision camera before the bench, output 1 of every controller on its line 0."""
+    sensor = bench.camera.sensor
+    bits = sensor.noise.white_level_dn.bit_length()
+    wants = []
+    if sensor.cfa_name not in COLOURS:
+        wants.append(f"a sensor of colours {', '.join(COLOURS)}, not {sensor.cfa_name}")
+    if sensor.noise.white_level_dn != 2**bits - 1 or bits not in (8, 10, 12, 16):
+        wants.append(f"white at the top of 8 to 16 bits, not at {sensor.noise.white_level_dn}")
+    if shape[0] % 2 or shape[1] % 2:
+        wants.append(f"an even number of rows and columns, not {shape[0]}x{shape[1]}")
+    if wants:
+        raise AppError(f"trigger: the simulated USB3 Vision camera needs {' and '.join(wants)}")
+    made = U3vCameraSimulator(
+        bench.expose,
+        clock,
+        shape,
+        sensor.cfa_name,
+        sensor.noise.black_level_dn,
+        bits,
+        depths=(str(bits),),
+        exposure_us=(10.0, 2e9),
+    )
+    chain.on_output = lambda device, output, level, at_s: (
+        made.raise_line(at_s + latency_s) if (output, level) == (1, 1) else None
+    )
+    return made
+
+
+def open_stage(
+    spec: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
+) -> Stage:
+    """Return the stage that `spec` names, connected; it must be closed.
+
+    spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
+    `emmc_rig.bench.stage_config`;
+    `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
+    once. settings: single settings that replace those of the file. to_measure: see `_stage`.
+    Raises AppError or a `DriverError`.
+    """
+    name, _, protocol = spec.partition(":")
+    if name == SIMULATED:
+        return open_simulated(protocol or "zaber", settings, to_measure)[0]
+    config = parse_stage(spec, settings)
+    if isinstance(config, PluginConfig):
+        care = config.stage_settings()
+        return open_plug_in(
+            STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
+        )
+    if isinstance(config, MicroManagerConfig):
+        return _open_micromanager_stage(config)
+    transports: dict[str, Transport] = {}
+    with ExitStack() as opened:
+
+        def transport(port: str) -> Transport:
+            if port not in transports:
+                flow_control = isinstance(config, AptConfig)
+                transports[port] = SerialTransport(port, flow_control=flow_control)
+                opened.callback(transports[port].close)
+            return transports[port]
+
+        stage = _stage(config, transport, SYSTEM_CLOCK, to_measure)
+        opened.pop_all()
+    return stage
+
+
+def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
+    from drivers.micromanager import MicroManagerStage, StageSetup, load_core
+
+    setup = StageSetup(
+        config.axes,
+        config.travel_um,
+        config.homes,
+        config.speed_property,
+        config.speed_unit_um_s,
+        config.speed_um_s,
+    )
+    return MicroManagerStage(load_core(config.port), setup, SYSTEM_CLOCK, config.stage_settings())
+
+
+def open_simulated(
+    protocol: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
+) -> tuple[HostStage, SimulatedController]:
+    """Return a stage over simulated firmware in memory, and that firmware."""
+    clock = ManualClock()
+    firmware = simulated_firmware(protocol, clock)
+    wire = firmware.transport()
+    config = parse_stage(f"{protocol}:{SIMULATED}{SIMULATED_SCALES[protocol]}", settings)
+    assert isinstance(config, SerialConfig)
+    return _stage(config, lambda port: wire, clock, to_measure), firmware
+
+
+def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
+    """Return a simulated controller: of the rig's four axes, or the protocol's usual ones."""
+    makers = {"zaber": ZaberChain, "grbl": GrblController, "apt": AptController}
+    if protocol not in makers:
+        raise AppError(f"no simulated stage {protocol!r}: use one of {', '.join(makers)}")
+    return makers[protocol](clock)
+
+
+def probe_port(port: str) -> str:
+    """Return what answers on a port, in words, "" when nothing does; nothing moves.
+
+    A port whose USB adapter states its protocol is asked in that one alone: bytes of another
+    may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
+    """
+    device = find_port(port)
+    guesses = {one.device: one.guess for one in list_serial_ports()}
+    guess = guesses.get(device, "")
+    transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
+    with closing(transport):
+        for protocol, ask in _PROBES.items():
+            if guess in ("", protocol):
+                try:
+                    answer = ask(transport)
+                    if answer:
+                        return f"{protocol}: {answer}"
+                except DriverError as error:
+                    _log.debug("%s is no %s: %s", port, protocol, error)
+    return ""
+
+
+def probe_simulated(protocol: str) -> str:
+    """Return what simulated firmware answers, asked through a pseudo-terminal as a port is."""
+    with PtyServer(simulated_firmware(protocol, SYSTEM_CLOCK)) as server:
+        return probe_port(server.port)
+
+
+def _probe_zaber(transport: Transport) -> str:
+    return ", ".join(
+        f"device {one.address} (id {one.device_id}, serial number {one.serial_number}, firmware "
+        f"{one.firmware}, axes {one.axis_count})"
+        for one in find_devices(transport)
+    )
+
+
+def _probe_apt(transport: Transport) -> str:
+    info = identify_apt(transport)
+    return f"{info.model}, serial number {info.serial_number}, firmware {info.firmware}"
+
+
+_PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
+"""In this order: half a line of text would leave an APT controller in the middle of a message."""
+
+
+def _actuator(axis: AptAxisConfig, to_measure: bool) -> Actuator:
+    """Return an axis's actuator, with its counts as stated; to measure it, a count is the unit."""
+    known = ACTUATORS[axis.actuator]
+    counts_per_um = axis.counts_per_um or known.counts_per_um
+    if not to_measure:
+        return replace(known, counts_per_um=counts_per_um)
+    return Actuator(1.0, known.travel_um * counts_per_um, known.top_speed_um_s * counts_per_um)
+
+
+def _stage(
+    config: SerialConfig,
+    transport: Callable[[str], Transport],
+    clock: Clock,
+    to_measure: bool = False,
+) -> HostStage:
+    """Return the stage of a configuration over transports opened by port.
+
+    to_measure: the unit is a device's own count (Grbl: its own millimetre), of unknown length.
+    """
+    try:
+        settings = config.stage_settings()
+        if isinstance(config, ZaberConfig):
+            wire = transport(config.port)
+            axes = config.axes or _found_axes(wire, clock)
+            return ZaberStage(
+                wire, axes, config.microstep_um, clock, settings, config.resolution, to_measure
+            )
+        if isinstance(config, GrblConfig):
+            return GrblStage(
+                transport(config.port),
+                config.axes,
+                clock,
+                settings,
+                steps_per_mm=config.steps_per_mm,
+                any_scale=to_measure,
+            )
+        channels = {
+            name: AptAxis(
+                transport(one.port), _actuator(one, to_measure), one.destination, one.channel
+            )
+            for name, one in config.axes.items()
+        }
+        return AptStage(channels, clock, settings)
+    except ValueError as error:
+        raise AppError(f"stage {config.protocol}: {error}") from error
+
+
+def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]]:
+    """Return every axis on a chain: by the rig's names where it is the rig, else by number."""
+    found = [
+        (device.address, axis)
+        for device in find_devices(transport, clock)
+        for axis in range(1, device.axis_count + 1)
+    ]
+    if not found:
+        raise TransportTimeoutError(transport.port, 0.5)
+    if set(found) == set(STAGE_AXES.values()):
+        return dict(STAGE_AXES)
+    return {f"{device}.{axis}": (device, axis) for device, axis in found}
+
+
+def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
+    """Open the camera that `spec` names: a kind, a colon and its address.
+
+    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `mm:CONFIG.cfg`, `folder:DIR`, `simulated`,
+    that of a plug-in, or a YAML file (`emmc_rig.bench.camera_config`). `backend`: of pyusb, for a
+    simulated bus.
+    Raises AppError for any other kind, or an error of the driver.
+    """
+    choice = parse_camera(spec)
+    if choice.kind in CAMERAS:
+        return CAMERAS[choice.kind](choice, clock, backend)
+    others = camera_kinds() - CAMERAS.keys()
+    if choice.kind not in others:
+        kinds = ", ".join((CAMERA_KINDS, *(f"{name}:" for name in sorted(others))))
+        raise AppError(f"{choice.source}: no such kind of camera; use {kinds}")
+    return open_plug_in(plugins.CAMERAS, choice.kind, choice.address, clock, **choice.options)
+
+
+def camera_kinds() -> set[str]:
+    """Return every kind of camera that `--camera` takes; a plug-in replaces none of ours."""
+    return {*CAMERAS, *plug_ins(plugins.CAMERAS)}
+
+
+def _ptp_camera(
+    clock: Clock,
+    backend: Any,
+    serial: str = "",
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    device = open_device(PTP_INTERFACE, serial=serial, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+
+
+def _no_options(choice: CameraChoice) -> str:
+    """Return the address of a camera that takes no further settings; AppError where some are."""
+    if choice.options:
+        extra = ", ".join(choice.options)
+        raise AppError(f"{choice.source}: {choice.kind} takes only an address, not {extra}")
+    return choice.address
+
+
+def _open_ptp(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return _ptp_camera(clock, backend, _no_options(choice))
+
+
+def _open_u3v(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return open_u3v(_no_options(choice), backend=backend, clock=clock)
+
+
+def _open_folder(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    return FolderCamera(_no_options(choice) or ".", clock)
+
+
+def _open_simulated(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
+    return _ptp_camera(clock, simulated_bus(clock), from_card=True)
+
+
+def _open_micromanager(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    from drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
+
+    config = validated(MicroManagerCameraConfig, choice.options, choice.source, AppError)
+    setup = CameraSetup(**config.model_dump())
+    return MicroManagerCamera(load_core(choice.address), setup, clock)
+
+
+def _open_gphoto(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
+    from drivers.gphoto import GphotoCamera
+
+    config = validated(GphotoCameraConfig, choice.options, choice.source, AppError)
+    return GphotoCamera(choice.address, clock=clock, **config.model_dump())
+
+
+def simulated_bus(clock: Clock) -> SimulatedUsb:
+    """Return a USB bus, for pyusb, with one simulated still camera."""
+    return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
+
+
+CAMERAS: dict[str, Callable[[CameraChoice, Clock, Any], CameraDevice]] = {
+    "ptp": _open_ptp,
+    "u3v": _open_u3v,
+    "folder": _open_folder,
+    "simulated": _open_simulated,
+    "gphoto2": _open_gphoto,
+    "mm": _open_micromanager,
+}
+CAMERA_KINDS = (
+    "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, gphoto2:, gphoto2:PORT, mm:CONFIG.cfg, folder:DIR, "
+    "simulated"
+)
+SCENE_SIZE = (240, 320)
+
+
+def scene_simulator(clock: Clock, seed: int = 0) -> PtpCameraSimulator:
+    """Return a simulated camera with a plain lens before a built-in scene."""
+    sensor = Sensor(cfa="rggb")
+    noise, rng = sensor.noise, np.random.default_rng(seed)
+    view = open_scene("deep-occlusions", SCENE_SIZE, (1, 1)).light_field[0, 0]
+    tile = cfa_tile(sensor.cfa)
+    repeats = (-(-SCENE_SIZE[0] // tile.shape[0]), -(-SCENE_SIZE[1] // tile.shape[1]), 1)
+    colours = np.tile(tile, repeats)[: SCENE_SIZE[0], : SCENE_SIZE[1]]
+    readings = (view * colours).sum(axis=2)
+    return PtpCameraSimulator(
+        lambda exposure_s: noise.expose_dn(readings, exposure_s, 1.0, rng),
+        clock,
+        sensor.cfa_name,
+        noise.black_level_dn,
+        noise.white_level_dn,
+        exposures=THIRD_STOPS,
+    )

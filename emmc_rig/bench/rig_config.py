@@ -1,0 +1,322 @@
+"""Which rig is meant: a simulated one before a scene, or real devices named in a YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from drivers.clock import SYSTEM_CLOCK
+from drivers.stage import Stage
+from emmc_rig.bench.hardware import (
+    NO_FLAWS,
+    STAGE_AXES,
+    Rig,
+    open_camera,
+    open_stage,
+    simulated_rig,
+)
+from emmc_rig.bench.trigger import SimulatedTrigger, Trigger, check_trigger
+from emmc_rig.errors import AppError
+from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.model.arguments import path_of
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.json_text import shown_path
+from emmc_rig.model.reading import read_yaml
+from emmc_rig.model.settings import Settings, validated
+from simulators.bench import RAYS_PER_VIEW
+from simulators.effects import EFFECTS, TOGETHER, flawed
+from simulators.still import StillStage
+
+SIMULATED = "simulated"
+RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
+LATER = ("trigger", "focus_um", "stands_um", "mask")
+Ask = Callable[[str], None]
+
+
+class Mounting(Settings):
+    """How `emmc-rig live` found the mask to sit: its rotation, and its scale over the design's."""
+
+    rotation_deg: float
+    rotation_deviation_deg: float = Field(ge=0)
+    scale: float = Field(gt=0)
+    scale_deviation: float = Field(ge=0)
+
+
+class AnyRig(Settings):
+    """What a rig's file may say of every rig.
+
+    stands_um: by axis, where those stand that no plan moves, as `focus`. mask: how it was found to
+    sit, which sessions keep.
+    """
+
+    stands_um: dict[str, float] = Field(default_factory=dict)
+    mask: Mounting | None = None
+
+    @field_validator("stands_um")
+    @classmethod
+    def _not_the_plans(cls, stands_um: dict[str, float]) -> dict[str, float]:
+        for axis in stands_um:
+            if axis in STAGE_AXES:
+                raise ValueError(f"{axis} is moved by plans: give its zero_um instead")
+        return stands_um
+
+
+class RealRig(AnyRig):
+    """Real devices.
+
+    stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
+    far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
+    the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
+    plate's open window; window_side_um: its side, for plans that open parts of the aperture.
+    Of a recording (camera `folder:DIR`, stage `simulated`) neither has to be given.
+    by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
+    not, nothing of that changes, as in a recording that is replayed. trigger: the wire by which
+    the stage's arrival begins an exposure, where there is one.
+    """
+
+    stage: str
+    camera: str
+    zero_um: dict[str, float] = Field(default_factory=dict)
+    window_um: float = 0.0
+    window_side_um: float | None = Field(default=None, gt=0)
+    by_hand: bool = True
+    trigger: Trigger | None = None
+
+
+class WiredRig(AnyRig):
+    """A YAML file for the simulated rig: with a line from the stage to its camera, a focus axis."""
+
+    kind: Literal["simulated"]
+    trigger: SimulatedTrigger | None = None
+    focus_um: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _says_something(self) -> WiredRig:
+        if self.trigger is None and self.focus_um is None:
+            raise ValueError("give trigger or focus_um; without either name the rig simulated")
+        return self
+
+
+class ImagedRig(AnyRig):
+    """The simulated rig before a scene; size: rows and columns of the light field.
+
+    rays: per view and pixel; calibration to a per cent needs 1024 or more. trigger: the line from
+    its stage to its camera, which it has not by default. flaws: what is wrong with it, by the names
+    of `simulators.effects`. focus_um: where its focus axis, if it has one, has the scene sharp.
+    """
+
+    scene: str
+    size: tuple[int, int] | None = None
+    seed: int = Field(default=0, ge=0)
+    real_time: bool = False
+    rays: int = Field(default=RAYS_PER_VIEW, ge=16)
+    trigger: SimulatedTrigger | None = None
+    flaws: tuple[str, ...] = ()
+    focus_um: float | None = Field(default=None, gt=0)
+
+    @field_validator("flaws")
+    @classmethod
+    def _known(cls, flaws: tuple[str, ...]) -> tuple[str, ...]:
+        known = (*EFFECTS, TOGETHER)
+        for name in flaws:
+            if name not in known:
+                raise ValueError(f"{name!r} is no flaw of the bench: use {', '.join(known)}")
+        return flaws
+
+
+class AskingAttendant:
+    """An `Attendant` who is a person: asked, and asked again only when something changes."""
+
+    def __init__(self, camera: Camera, ask: Ask) -> None:
+        self._camera, self._ask = camera, ask
+        self._done: dict[str, str] = {}
+
+    def set_lamp(self, colour: str) -> None:
+        """Ask for the lamp."""
+        off = "switch the lamp off"
+        self._want("lamp", off if colour == "off" else f"switch the {colour} lamp on")
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Ask for the scene or the board."""
+        turned = f", turned by {turn_deg:g} degrees in its plane" if turn_deg else ""
+        self._want("target", f"put the {target} before the camera{turned}")
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Ask for masks and filter."""
+        names = ", ".join(self._camera.shot_masks(shot)) if fitted else ""
+        chosen = self._camera.shots[shot].filter
+        masks = f"put in the masks {names}" if names else "take all masks out"
+        colour = "take any filter out" if chosen == "none" else f"put in the {chosen} filter"
+        self._want("masks", masks)
+        if any(one.filter != "none" for one in self._camera.shots):
+            self._want("filter", colour)
+
+    def _want(self, what: str, wish: str) -> None:
+        if self._done.get(what) != wish:
+            self._ask(wish)
+            self._done[what] = wish
+
+
+class NoAttendant:
+    """An `Attendant` of a bench on which nothing ever changes."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Leave the lamp as it is."""
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Leave the board or scene where it is."""
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Leave the masks in or out."""
+
+
+def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
+    """Return what a session freezes of a rig: `simulated`, or a YAML file of devices.
+
+    A file of `kind: simulated` is the simulated rig with the file's trigger. Raises AppError with
+    one line.
+    """
+    if spec == SIMULATED:
+        return _described(SIMULATED, imaged)
+    if not spec.endswith((".yaml", ".yml")):
+        raise AppError(
+            f"--rig {shown_path(spec)}: write simulated, or the name of a YAML file of devices"
+        )
+    read = read_yaml(Path(spec), AppError)
+    if isinstance(read, dict) and read.get("kind") == SIMULATED:
+        wired = validated(WiredRig, read, spec, AppError)
+        wiring = {name: getattr(wired, name) for name in LATER}
+        return _described(SIMULATED, imaged.model_copy(update=wiring))
+    config = validated(RealRig, read, spec, AppError)
+    described = _described("real", config)
+    beside = Path(spec).parent / config.stage
+    if beside.is_file():
+        described["stage"] = str(beside.resolve())
+    return described
+
+
+def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
+    """Return a rig as plain data; without what came later it reads as before there was any."""
+    described = config.model_dump(mode="json")
+    for name in LATER:
+        if name in described and not described[name]:
+            del described[name]
+    return {"kind": kind, **described}
+
+
+@dataclass(frozen=True)
+class RigChoice:
+    """Which devices a capture is to use; they are opened by `emmc_rig.capture`, not before."""
+
+    name: str
+    description: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        settings = ", ".join(
+            f"{key}={value!r}" for key, value in self.description.items() if key != "kind"
+        )
+        return f"RigChoice({self.name!r}, {settings})"
+
+
+def rig(
+    name: str | Path,
+    *,
+    scene: str = "deep-occlusions",
+    size: tuple[int, int] | None = None,
+    seed: int = 0,
+    rays: int | None = None,
+    real_time: bool = False,
+    flaws: tuple[str, ...] = (),
+) -> RigChoice:
+    """Return a rig: "simulated", or the YAML file that names real devices.
+
+    The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
+    of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
+    cent needs 1024. real_time: moves and exposures take their time. flaws: what is wrong with it,
+    by the names of `simulators.effects`. Raises AppError.
+
+    >>> import emmc_rig as emmc
+    >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
+    'simulated'
+    """
+    name = str(path_of(name, "rig", '"simulated", or the YAML file that names real devices'))
+    traced: dict[str, Any] = {} if rays is None else {"rays": rays}
+    given = {"scene": scene, "size": size, "seed": seed, "real_time": real_time, "flaws": flaws}
+    imaged = validated(ImagedRig, {**given, **traced}, "the simulated rig", AppError)
+    return RigChoice(name, rig_description(name, imaged))
+
+
+@contextmanager
+def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iterator[Rig]:
+    """Yield the rig that a description names, its devices open; camera: as planned.
+
+    ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
+    device raises.
+    """
+    settings = {key: value for key, value in description.items() if key != "kind"}
+    if description["kind"] == SIMULATED:
+        imaged = validated(ImagedRig, settings, "the simulated rig", AppError)
+        fine = fine_scene(
+            imaged.scene,
+            APERTURE_FACTOR,
+            PIXEL_FACTOR,
+            size=imaged.size,
+            views=camera.views,
+            seed=imaged.seed,
+        )
+        height, width = fine.scene.light_field.shape[2:4]
+        clock = SYSTEM_CLOCK if imaged.real_time else None
+        rig, _ = simulated_rig(
+            camera,
+            fine.samples,
+            (height, width),
+            imaged.seed,
+            clock,
+            imaged.rays,
+            imaged.trigger,
+            flawed(NO_FLAWS, imaged.flaws),
+            imaged.focus_um,
+            imaged.stands_um,
+        )
+        _check_axes(imaged, rig)
+        if imaged.trigger is not None:
+            check_trigger(imaged.trigger, rig.stage, rig.camera)
+        yield rig
+        return
+    real = validated(RealRig, settings, "the rig", AppError)
+    zero_um = dict(real.zero_um)
+    if real.stage == SIMULATED and real.camera.startswith(RECORDING):
+        # Nothing moves any more, wherever the stage of the recording was sent.
+        still: Stage = StillStage((*STAGE_AXES, *real.stands_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM)
+        zero_um = dict.fromkeys(STAGE_AXES, 0.0) | zero_um
+    else:
+        still = open_stage(real.stage)
+    with still as stage, closing(open_camera(real.camera)) as device:
+        if real.trigger is not None:
+            check_trigger(real.trigger, stage, device)
+        rig = Rig(
+            stage,
+            device,
+            AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
+            zero_um,
+            real.window_um,
+            reopen_camera=lambda: open_camera(real.camera),
+            trigger=real.trigger,
+            window_side_um=real.window_side_um,
+            stands_um=real.stands_um,
+        )
+        _check_axes(real, rig)
+        yield rig
+
+
+def _check_axes(config: AnyRig, rig: Rig) -> None:
+    """Raise AppError for an axis that the stage has not."""
+    for axis in config.stands_um:
+        if axis not in rig.stage.axes:
+            known = ", ".join(rig.stage.axes) or "none"
+            raise AppError(f"stands_um.{axis}: the stage has no such axis, only {known}")

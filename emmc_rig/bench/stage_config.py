@@ -1,0 +1,200 @@
+"""The configuration of a stage: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes.
+
+Single settings may follow the port: `zaber:/dev/ttyUSB0,microstep_um=0.49609375`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from drivers.apt import ACTUATORS
+from drivers.stage import StageSettings
+from emmc_rig.bench.plugins import STAGES, plug_ins
+from emmc_rig.errors import AppError
+from emmc_rig.model.json_text import shown_path
+from emmc_rig.model.reading import parse_yaml, read_yaml
+from emmc_rig.model.settings import Settings, explain
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Common(Settings):
+    """Settings of every stage; see `drivers.stage.StageSettings`."""
+
+    approach_um: Annotated[float, Field(ge=0)] = 10.0
+    tolerance_um: Positive = 1.0
+    settle_s: Annotated[float, Field(ge=0)] = 0.05
+    soft_limits_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    speeds_um_s: dict[str, Positive] = Field(default_factory=dict)
+    top_speeds_um_s: dict[str, Positive] = Field(default_factory=dict)
+
+    def stage_settings(self) -> StageSettings:
+        """Return the part that concerns how carefully the stage moves."""
+        return StageSettings(
+            approach_um=self.approach_um,
+            tolerance_um=self.tolerance_um,
+            settle_s=self.settle_s,
+            soft_limits_um=self.soft_limits_um,
+            speeds_um_s=self.speeds_um_s,
+            top_speeds_um_s=self.top_speeds_um_s,
+        )
+
+
+class ZaberConfig(_Common):
+    """A chain of Zaber devices; without `axes` every axis found is used.
+
+    microstep_um: of axes whose model is not known. resolution: the device's, where it holds.
+    """
+
+    protocol: Literal["zaber"] = "zaber"
+    port: str
+    axes: dict[str, tuple[int, int]] | None = None
+    microstep_um: Positive | dict[str, Positive] | None = None
+    resolution: int | dict[str, int] | None = None
+
+
+class GrblConfig(_Common):
+    """A Grbl controller, axes by letter; steps_per_mm: what its `$100` and following must be."""
+
+    protocol: Literal["grbl"] = "grbl"
+    port: str
+    axes: dict[str, Literal["X", "Y", "Z", "A", "B", "C"]] = Field(
+        default_factory=lambda: {"x": "X", "y": "Y"}
+    )
+    tolerance_um: Positive = 5.0
+    steps_per_mm: dict[str, Positive] = Field(default_factory=dict)
+
+
+class AptAxisConfig(Settings):
+    """One channel of a Thorlabs controller; counts_per_um replaces the actuator's own."""
+
+    port: str
+    actuator: str
+    counts_per_um: Positive | None = None
+    destination: int = 0x50
+    channel: int = 1
+
+
+class AptConfig(_Common):
+    """Thorlabs controllers, each axis with its own port or channel."""
+
+    protocol: Literal["apt"] = "apt"
+    axes: dict[str, AptAxisConfig]
+
+
+APT_AXIS_OPTIONS = ("actuator", "counts_per_um", "destination", "channel")
+
+
+class MicroManagerConfig(_Common):
+    """Stages of a Micro-Manager configuration; see `drivers.micromanager.StageSetup`.
+
+    port: the configuration file. axes: `XY.x`, `XY.y` or a label, by our names; all where left
+    out.
+    """
+
+    protocol: Literal["mm"] = "mm"
+    port: str
+    axes: dict[str, str] | None = None
+    travel_um: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    homes: bool = True
+    speed_property: str = ""
+    speed_unit_um_s: Positive = 1.0
+    speed_um_s: Positive = 100.0
+
+
+class PluginConfig(_Common):
+    """A stage of a plug-in: `options` go to its factory as they are."""
+
+    protocol: str
+    port: str = ""
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+SerialConfig = ZaberConfig | GrblConfig | AptConfig
+StageConfig = SerialConfig | MicroManagerConfig | PluginConfig
+PROTOCOLS: Mapping[str, type[SerialConfig]] = {
+    "zaber": ZaberConfig,
+    "grbl": GrblConfig,
+    "apt": AptConfig,
+}
+"""Those with simulated firmware."""
+
+
+def stage_protocols() -> dict[str, type[StageConfig]]:
+    """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
+    known: dict[str, type[StageConfig]] = {**PROTOCOLS, "mm": MicroManagerConfig}
+    return known | dict.fromkeys(sorted(plug_ins(STAGES) - known.keys()), PluginConfig)
+
+
+def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:
+    """Return the stage that `PROTOCOL:PORT` or the name of a YAML file describes.
+
+    `overrides` replace single settings. Raises AppError with one line.
+    """
+    shown = shown_path(spec)
+    protocol, colon, port = spec.partition(":")
+    known = stage_protocols()
+    chosen: dict[str, Any] = {}
+    if protocol in PROTOCOLS:
+        port, *options = port.split(",")
+        chosen = dict(_option(shown, one) for one in options)
+    if colon and protocol in known and (port or known[protocol] is PluginConfig):
+        data: dict[str, Any] = {"protocol": protocol, "port": port} | chosen
+        if protocol == "apt":
+            axis = {key: chosen.pop(key) for key in APT_AXIS_OPTIONS if key in chosen}
+            data = {"protocol": protocol, "axes": {"x": {"port": port} | axis}} | chosen
+    elif spec.endswith((".yaml", ".yml")):
+        read = read_yaml(Path(spec), AppError)
+        if not isinstance(read, dict):
+            raise AppError(f"{shown}: expected a mapping of settings")
+        data = dict(read)
+    else:
+        raise AppError(
+            f"--stage {shown}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
+            "zaber:/dev/ttyUSB0, or the name of a YAML file"
+        )
+    return _validated(data | dict(overrides or {}), shown)
+
+
+def _require_actuators(axes: Any, source: str) -> None:
+    """Raise AppError for an axis without an actuator: no controller reports what is plugged in."""
+    known = ", ".join(ACTUATORS)
+    for axis, one in axes.items() if isinstance(axes, dict) else ():
+        if isinstance(one, dict) and "actuator" not in one:
+            raise AppError(
+                f"{source}: {axis} must not move, its actuator is not stated: write "
+                f"actuator: with one of {known} into the stage's YAML file, or "
+                "apt:PORT,actuator=NAME"
+            )
+
+
+def _option(spec: str, text: str) -> tuple[str, Any]:
+    """Return name and value of one `NAME=VALUE` behind a port; raises AppError."""
+    name, equals, value = text.partition("=")
+    if not (equals and name and value):
+        raise AppError(f"--stage {spec}: write NAME=VALUE behind the port, not {text!r}")
+    return name.strip(), parse_yaml(value, f"--stage {spec}", AppError)
+
+
+def _validated(data: dict[str, Any], source: str) -> StageConfig:
+    protocol = str(data.get("protocol", ""))
+    known = stage_protocols()
+    if protocol not in known:
+        raise AppError(f"{source}: protocol must be one of {', '.join(known)}")
+    cls = known[protocol]
+    if cls is AptConfig:
+        _require_actuators(data.get("axes"), source)
+    try:
+        config: StageConfig = TypeAdapter(cls).validate_python(data)
+    except ValidationError as fault:
+        raise AppError(" ".join(f"{source}: {explain(fault, cls)}".split())) from fault
+    if isinstance(config, AptConfig):
+        for axis, one in config.axes.items():
+            if one.actuator not in ACTUATORS:
+                known = ", ".join(ACTUATORS)
+                raise AppError(f"{source}: axes.{axis}.actuator: use one of {known}")
+    return config

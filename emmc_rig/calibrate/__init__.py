@@ -1,1 +1,0 @@
-"""`emmc-rig calibrate`: whiteboards of a session, or of a simulated bench, to Psi."""

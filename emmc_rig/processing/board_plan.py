@@ -1,0 +1,270 @@
+"""How many whiteboards of which kind to take, and the plan that `emmc-rig capture` executes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from calibration.openings import parts
+from calibration.placement import Placement, designed_placement
+from calibration.planning import (
+    FEW_MODEL_ERROR,
+    MODEL_ERROR,
+    MOST_FRAMES,
+    Kind,
+    Light,
+    PlannedFrames,
+    free_noise,
+    plan_free,
+    plan_parametric,
+)
+from calibration.shadow import ShadowMask, shadow_mask
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.plan import (
+    METERING_EXPOSURE_S,
+    Boards,
+    Darks,
+    OpenBoard,
+    Plan,
+    PlannedShot,
+)
+from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.model.camera import Camera
+from emmc_rig.processing.bench import SERIES_SHARES, Setting, WhiteboardBench
+from emmc_rig.processing.calibration_settings import WATCHES, CalibrateSettings
+
+PLAN = "plan.yaml"
+PLAN_HEAD = """\
+# Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
+# and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
+"""
+METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
+LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
+STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
+VERIFY_UM = (-207.0, 118.0)
+
+
+def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
+    """Return what the plan counts on: the exposure of a whiteboard, and how many pixels see it."""
+    rows, columns = mask.pixel_shape()
+    views = bench.camera.views
+    single = bench.camera.sensor.cfa_name != "mono"
+    light = (1 if single else 3) * bench.camera.sensor.binning**2
+    return Light(
+        bench.camera.sensor.noise,
+        bench.board_exposure_s(),
+        views,
+        light,
+        rows * columns,
+    )
+
+
+def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
+    """Return the design with edges as soft as a bench's may be: what a plan is made for."""
+    return replace(designed_placement(camera), blur_um=0.1 * mask.cell_um)
+
+
+def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: float) -> PlannedFrames:
+    """Return the whiteboards for the parametric route."""
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    kinds = [Kind(None, stage) for stage in stages]
+    kinds += [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    return plan_parametric(mask, soft_design(camera, mask), kinds, light, target)
+
+
+def few_settings(planned: PlannedFrames, lamp: str = "white") -> list[Setting]:
+    """Return a plan as settings of the bench, in shot 0."""
+    return [
+        Setting(0, kind.pinhole, lamp, kind.stage_um, count, window=kind.window)
+        for kind, count in planned.counts.items()
+    ]
+
+
+def free_settings(camera: Camera, lamps: Sequence[str], repeats: int) -> list[Setting]:
+    """Return the settings of the free route: every shot, view and lamp."""
+    return [
+        Setting(shot, (v, u), lamp, repeats=repeats)
+        for shot in range(len(camera.shots))
+        for v, u in np.ndindex(camera.views)
+        for lamp in lamps
+    ]
+
+
+def held_out_settings(camera: Camera) -> list[Setting]:
+    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
+    return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
+
+
+def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
+    """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
+    through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
+    repeats = max(through.values(), default=1)
+    every = len(through) == np.prod(settings.camera.views)
+    fitted = [
+        OpenBoard(mask_um=kind.stage_um, window=kind.window, repeats=count)
+        for kind, count in planned.counts.items()
+        if kind.pinhole is None
+    ]
+    judging = [
+        OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
+        for one in held_out_settings(settings.camera)
+    ]
+    coloured = camera_colours(settings.camera) and "colours" not in settings.leave_out
+    return Plan(
+        title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
+        camera=settings.camera_name,
+        shots=tuple(PlannedShot() for _ in settings.camera.shots),
+        whiteboards=Boards(
+            views="all" if every else tuple(sorted(through)),
+            shots=(0,),
+            repeats=repeats,
+            references=max(2, planned.reference_frames),
+            open=(*fitted, *judging),
+            lamp_checks=0 if "lamp" in settings.leave_out else LAMP_CHECKS,
+            response=() if "response" in settings.leave_out else SERIES_SHARES,
+            colours=COLOUR_REPEATS if coloured else 0,
+            turned=0 if "turned" in settings.leave_out else TURNED_REPEATS,
+        ),
+        darks=Darks(
+            exposure_s=(METERING_EXPOSURE_S,),
+            repeats=METERING_DARKS,
+            of_boards=BOARD_DARKS,
+            of_shots=SHOT_DARKS,
+        ),
+    )
+
+
+def camera_colours(camera: Camera) -> bool:
+    """Return whether the sensor's pixels see one colour each, so that crosstalk matters."""
+    return camera.sensor.cfa_name != "mono" and camera.sensor.binning == 1
+
+
+def frames_by_kind(settings: CalibrateSettings, planned: PlannedFrames) -> Counter[str]:
+    """Return how many frames of each kind a capture takes before the shots of the scene."""
+    frames = expand(capture_plan(settings, planned), settings.camera, 0.0, 0.0)
+    return Counter(frame.kind for frame in frames if frame.kind != "shot")
+
+
+def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
+    """Return the whiteboards for all routes in one: the same number of every view, and open ones.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with the
+    frames that the settings allow (default: MOST_FRAMES before every view).
+    """
+    camera, most_frames, target = settings.camera, settings.most_frames, settings.target
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    opened = {Kind(None, stage): 2 for stage in stages}
+    views = [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    least = PlannedFrames(opened | dict.fromkeys(views, 1), 0.0)
+    others = frames_by_kind(settings, least).total() - len(views)
+    most = MOST_FRAMES if most_frames is None else (most_frames - others) // len(views)
+    if most < 1:
+        raise AppError(
+            f"--frames {most_frames}: a plan opens each of the {len(views)} views at least once, "
+            f"and takes {others} frames beside: name at least {len(views) + others}, or --leave-out"
+        )
+    soft = soft_design(camera, mask)
+    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    if planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached"
+            f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
+            f"{planned.expected_error:.3%}, with {others + most * len(views)} frames; raise "
+            f"--target{'' if most_frames is None else ' or --frames'}"
+        )
+    return replace(planned, counts={**opened, **planned.counts})
+
+
+def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
+    """Return the fewest whiteboards for the parametric routes: open ones and parts of the aperture.
+
+    Raises AppError, with the best there is, where the error asked for cannot be reached with the
+    frames that the settings allow (default: MOST_FRAMES whiteboards).
+    """
+    camera, target = settings.camera, settings.target
+    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    kinds = [Kind(None, stage) for stage in stages]
+    kinds += [Kind(None, window=window) for window in parts(camera.views)]
+    others = frames_by_kind(settings, PlannedFrames(dict.fromkeys(kinds, 1), 0.0)).total()
+    others -= len(kinds)
+    most = MOST_FRAMES if settings.most_frames is None else settings.most_frames - others
+    soft = soft_design(camera, mask)
+    planned = plan_parametric(
+        mask, soft, kinds, light, target, most=most, model_error=FEW_MODEL_ERROR
+    )
+    taken = sum(planned.counts.values())
+    if taken > max(most, 0) or planned.expected_error > target:
+        raise AppError(
+            f"a relative error of Psi of {target:.3%} cannot be reached by few whiteboards: the "
+            f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise --target "
+            "or --frames, or leave --few out"
+        )
+    return planned
+
+
+def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
+    """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
+    kind reach the target. Raises AppError where none do.
+
+    A plan of few whiteboards that would take more frames than one of every view gives way to it.
+    """
+    camera = settings.camera
+    mask = shadow_mask(camera, settings.size)
+    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
+    light = plan_light(bench, mask)
+    planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
+    counts, few, more = frames_by_kind(settings, planned), settings.few, 0
+    if few:
+        # The frames allowed may be too few to open every view.
+        with suppress(AppError):
+            whole = combined_plan(settings, mask, light)
+            of_whole = frames_by_kind(settings, whole)
+            if of_whole.total() < counts.total():
+                few, more = False, counts.total()
+                planned, counts = whole, of_whole
+    metrics = {
+        "camera": settings.camera_name,
+        "size": list(settings.size),
+        "target_relative_error": settings.target,
+        "model_error": FEW_MODEL_ERROR if few else MODEL_ERROR,
+        "few_would_take_frames": more or None,
+        "exposures": {
+            "open_s": light.exposure_s,
+            "pinhole_s": light.exposure_s * float(np.prod(camera.views)),
+        },
+        "whiteboards": [
+            {
+                "pinhole": None if kind.pinhole is None else list(kind.pinhole),
+                "stage_um": list(kind.stage_um),
+                "window": list(kind.window),
+                "frames": count,
+            }
+            for kind, count in planned.counts.items()
+        ],
+        "frames_by_kind": dict(counts),
+        "frames": counts.total(),
+        "left_out": {name: WATCHES[name] for name in sorted(settings.leave_out)},
+        "expected_relative_error": planned.expected_error,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    to_capture = capture_plan(settings, planned).model_dump(mode="json", exclude_defaults=True)
+    text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)
+    (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
+    write_metrics(folder, metrics)
+    return metrics
+
+
+def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
+    """Return the error of Psi that the free route's formula expects of so many frames a view."""
+    mask = shadow_mask(settings.camera, settings.size)
+    bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
+    light = plan_light(bench, mask)
+    return free_noise(mask, soft_design(settings.camera, mask), light).error(repeats)

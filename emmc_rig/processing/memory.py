@@ -1,0 +1,97 @@
+"""What a reconstruction needs of memory, and a ceiling that all its processes keep together.
+
+The number of workers follows from what a block is reckoned to need. What they really hold is
+limited by the system, see `emmc_rig.processing.pool`, measured, and stated in metrics.json.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from emmc_rig.errors import AppError, WrongUsageError
+from emmc_rig.files.psi import SavedPsi
+from reconstruction.methods import MethodSettings
+from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
+
+UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
+BASE_BYTES = 512 * 2**20
+"""Of a process with the program's libraries, its kernels compiled."""
+RAY_BYTES, WEIGHT_BYTES = 170, 26
+"""Of a block, for each of its rays (views times samples), and for each of their weights (shots
+times stored colours). Measured, Psi included: 169 a ray of adaptive-fast on blocks of 190,000
+samples, one shot; less for smaller ones, tv and adaptive."""
+READING_BYTES = 60
+"""Of a capture's reading in the program itself: readings, deviation, usable, and copies."""
+WHOLE, COMPARED = 8, 4
+"""Light fields that the program holds of one that is one block, to draw it; and to compare one."""
+PARALLAX_PX = 3.0
+"""Disparity whose halo is reckoned with before a survey has found the capture's own."""
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Memory of all processes together, in bytes. own: what the program itself needs of it."""
+
+    total: int
+    own: int
+
+    def workers(self, task_bytes: int) -> int:
+        """Return how many workers fit; raises AppError with the smallest ceiling for one."""
+        count = (self.total - self.own) // task_bytes
+        if count < 1:
+            # Rounded up, so that the ceiling named is one that works.
+            least = -(-(self.own + task_bytes) // 2**20)
+            raise AppError(
+                f"--memory of {self.total / 2**20:.0f} MiB: this program and one worker need "
+                f"{least} MiB; give --memory {least}MiB, or smaller blocks by --settings (blocks: "
+                "side, whole)"
+            )
+        return count
+
+    def share(self, workers: int) -> int:
+        """Return what each of so many workers may hold."""
+        return (self.total - self.own) // workers
+
+
+def parse_memory(text: str) -> int:
+    """Return the bytes of "2GiB" or "800MB"; raises WrongUsageError."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMG]?I?)B?", text.strip().upper())
+    if found is None or found[2] not in UNITS:
+        raise WrongUsageError(f"--memory {text}: write bytes with a unit, for instance 2GiB")
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+def task_bytes(psi: SavedPsi, grid: Grid) -> int:
+    """Return what a worker needs for the largest block of a grid, and for the survey."""
+    samples = max(_samples(block.outer) for block in grid)
+    if len(grid) > 1:
+        samples = max(samples, min((SAMPLE * SAMPLES) ** 2, int(np.prod(psi.size))))
+    shots, v, u, _, stored, _ = psi.shape
+    return int(BASE_BYTES + samples * v * u * (RAY_BYTES + WEIGHT_BYTES * shots * stored))
+
+
+def assumed_grid(psi: SavedPsi, settings: MethodSettings) -> Grid:
+    """Return the grid of blocks with the halo of usual disparities."""
+    views = max(psi.views)
+    halo = int(TEXTURE_REACH * psi.binning + PARALLAX_PX * (views // 2))
+    return Grid(psi.size, 2 * psi.binning, halo, settings.blocks)
+
+
+def own_bytes(psi: SavedPsi, settings: MethodSettings, as_zarr: bool, compares: bool) -> int:
+    """Return what the program holds of a capture beside its workers."""
+    grid, views = assumed_grid(psi, settings), int(np.prod(psi.views))
+    light_field = int(np.prod(psi.size)) * views * 12
+    if len(grid) == 1 and not as_zarr:
+        written = WHOLE * light_field + 4 * int(np.prod(psi.shape))
+    else:
+        written = 2 * views * 12 * max(_samples(block.part) for block in grid)
+    compared = COMPARED * light_field if compares else 0
+    return READING_BYTES * int(np.prod(psi.frames_shape)) + max(written, compared)
+
+
+def _samples(place: tuple[slice, slice]) -> int:
+    rows, columns = place
+    return (rows.stop - rows.start) * (columns.stop - columns.start)

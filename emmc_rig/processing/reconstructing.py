@@ -1,0 +1,272 @@
+"""The one way from frames and Psi to a result, for the Python API and the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import replace
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import ArrayLike, NDArray
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.exports import LIGHT_FIELD, MAPS
+from emmc_rig.files.folders import is_session, kept_folder
+from emmc_rig.files.psi import SavedPsi, open_psi
+from emmc_rig.files.results import write_metrics
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.files.shards import opened_array
+from emmc_rig.model.arguments import NAMES, numbers_of, required
+from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.settings import validated
+from emmc_rig.processing.block_tasks import Capture, fingerprint_of, run_capture
+from emmc_rig.processing.exposure import verdict_with_exposure, with_exposure
+from emmc_rig.processing.inputs import stored_frames
+from emmc_rig.processing.pool import Pool, opened_pool
+from emmc_rig.processing.result import Result, compared, figures
+from emmc_rig.session.session import Session
+from reconstruction.dictionary import Dictionary
+from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
+from reconstruction.result import Progress
+from reconstruction.tiles import check_frames, reconstruct_in_blocks
+from reconstruction.verdict.run import reconstruct_judged
+
+OnStep = Callable[[Progress], None]
+PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_scipy(matrix, ...)"
+FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
+RESULT_GROUP = "result.zarr"
+"""Light field and maps, where they are written as Zarr."""
+
+
+def reconstruct(
+    psi: ImagingMatrix,
+    frames: Frames | ArrayLike,
+    method: str = DEFAULT_METHOD,
+    *,
+    noise_sigma: float | None = None,
+    usable: NDArray[np.bool_] | None = None,
+    dictionary: Dictionary | str | None = None,
+    settings: MethodSettings | Mapping[str, Any] | None = None,
+    on_step: OnStep | None = None,
+) -> Result:
+    """Return the light field that frames and Psi speak for, with how far to trust it.
+
+    Args:
+        psi: the imaging matrix of the camera that took the frames.
+        frames: what `Camera.expose` or `open_frames` return, or an array (shot, pixel_y, pixel_x)
+            of readings, such as `psi @ scene`.
+        method: a name that `emmc-rig reconstruct --list` lists.
+        noise_sigma: standard deviation of the readings, all alike. By default that of the frames;
+            of an array, what the sensor of Psi's camera has at these readings.
+        usable: which readings to use (default: those of the frames, all of an array).
+        dictionary: for methods that need one: itself, its file, or the name of a built-in one.
+        settings: of the methods, or a dict with the keys of a settings file.
+        on_step: is called with the progress after each step.
+
+    Raises:
+        AppError: an array without `noise_sigma`, where Psi does not know its camera.
+        ReconstructionError: a method that is not known, frames that do not fit Psi.
+        ArgumentError: an argument of another type.
+
+    >>> import emmc_rig as emmc
+    >>> scene = emmc.scene("near-planar", size=(24, 32))
+    >>> psi = emmc.camera("rgbw-bayer-1shot").psi(scene.size)
+    >>> emmc.reconstruct(psi, psi @ scene, "tv").light_field.shape
+    (5, 5, 24, 32, 3)
+    """
+    required(psi, ImagingMatrix, "psi", PSI_TAKES)
+    required(method, str, "method", "the name of a method, such as 'adaptive'")
+    needs_dictionary = find_method(method).needs_dictionary
+    if isinstance(settings, Mapping):
+        settings = validated(MethodSettings, dict(settings), "settings", AppError)
+    elif settings is not None:
+        required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
+    if on_step is not None and not callable(on_step):
+        required(on_step, (), "on_step", "a function of the progress")
+    given = _as_frames(psi, frames, noise_sigma, usable)
+    atoms = None
+    if needs_dictionary:
+        made = isinstance(dictionary, Dictionary)
+        if not made and dictionary is not None:
+            required(dictionary, NAMES, "dictionary", "a dictionary, its file, or a built-in name")
+        views = psi.layout.views
+        atoms = dictionary if made else open_dictionary(dictionary, views, psi.binning)
+    settings = settings or MethodSettings()
+    # Not of each: estimated from the reading itself, it is least where noise made that small.
+    noise = given.noise_sigma
+    if is_one_block(psi.size, settings):
+        solved, verdict = reconstruct_judged(
+            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
+        )
+    else:
+        check_frames(psi.frames_shape, given.readings)
+        solved, verdict = reconstruct_in_blocks(
+            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
+        )
+    return Result(solved, verdict, psi, given, None if atoms is None else atoms.kind)
+
+
+def _as_frames(
+    psi: ImagingMatrix,
+    frames: Frames | ArrayLike,
+    noise_sigma: float | None,
+    usable: NDArray[np.bool_] | None,
+) -> Frames:
+    """Return frames as a method takes them: with a deviation, and which are usable."""
+    if noise_sigma is not None:
+        is_level = isinstance(noise_sigma, Real) and 0 <= noise_sigma < np.inf
+        if not is_level:
+            required(noise_sigma, (), "noise_sigma", "the readings' standard deviation, 0 or more")
+    if isinstance(frames, Frames):
+        given = frames
+    else:
+        readings = numbers_of(frames, "frames", FRAMES_TAKES)
+        everywhere = np.ones(readings.shape, dtype=bool)
+        if noise_sigma is None:
+            deviation = sensor_deviation(psi, readings)
+            everywhere &= np.isfinite(deviation)
+        else:
+            deviation = np.zeros(readings.shape)
+        given = Frames(readings, deviation, everywhere)
+    if noise_sigma is not None:
+        given = replace(given, deviation=np.full(given.shape, noise_sigma))
+    if usable is None:
+        return given
+    if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
+        required(usable, (), "usable", "a boolean array (shot, pixel_y, pixel_x)")
+    if usable.shape == given.shape:
+        # Why they are not to be used is not known: not that there was at least so much light.
+        given = replace(given, readings=np.where(usable, given.readings, 0))
+    return replace(given, usable=usable)
+
+
+def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the standard deviation that the sensor of Psi's camera adds to readings.
+
+    Infinite where no light reaches a pixel. Raises AppError where Psi does not know its camera.
+    """
+    if not psi.camera_json:
+        raise AppError("this Psi does not know its camera: give the readings' noise_sigma")
+    camera = Camera.model_validate_json(psi.camera_json)
+    light = pixel_light(camera, psi.size)
+    if readings.shape != light.shape:
+        return np.zeros(readings.shape)  # the method refuses these frames, and says why
+    variance = camera.sensor.noise.variance(readings, camera.exposures_s()[:, None, None], light)
+    return np.sqrt(variance)
+
+
+def is_one_block(size: tuple[int, int], settings: MethodSettings | None) -> bool:
+    """Return whether a light field of this size is reconstructed as a whole."""
+    return size[0] * size[1] <= (settings or MethodSettings()).blocks.whole
+
+
+def reconstruct_folder(
+    folder: Path,
+    out: Path,
+    method: str = DEFAULT_METHOD,
+    psi_path: Path | None = None,
+    dictionary_spec: str | None = None,
+    settings: MethodSettings | None = None,
+    truth: str | None = None,
+    on_step: OnStep | None = None,
+    chosen: str | None = None,
+    pool: Pool | None = None,
+    tile: int | None = None,
+    as_zarr: bool = False,
+) -> dict:
+    """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
+
+    A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
+    what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
+    was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
+    default as many processes as threads; if one is given, it computes small light fields, too.
+    tile: see `run_capture`. as_zarr: write light field and maps as one Zarr group, by the pool, and
+    no pictures.
+    """
+    find_method(method)
+    settings = settings or MethodSettings()
+    frames, psi_path = stored_frames(folder, out, psi_path)
+    session = Session(folder) if is_session(folder) else None
+    saved = open_psi(psi_path)
+    one_block = is_one_block(saved.size, settings)
+    if one_block and pool is None and not as_zarr:
+        psi = saved.load()
+        result = reconstruct(
+            psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
+        )
+        return _written(result, {"chosen": chosen}, out, session, truth)
+    saved.verify()
+    check_frames(saved.frames_shape, frames.readings)
+    capture = Capture(
+        kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
+        frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
+    )  # fmt: skip
+
+    def on_block(done: int, of: int) -> None:
+        if on_step is not None:
+            on_step(Progress(done, None, None, of))
+
+    with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
+        blocks = run_capture(capture, frames, workers, tile, on_block)
+        if as_zarr:
+            blocks.write_shards(out / RESULT_GROUP, workers)
+    solved, verdict = blocks.result(), blocks.verdict(saved.binning)
+    if one_block and not as_zarr:
+        arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
+        for name, array in arrays.items():
+            blocks.write(name, array)
+        light_field = arrays.pop("light_field")
+        whole = replace(solved, light_field=light_field, maps=arrays)
+        result = Result(whole, verdict, saved.load(), frames)
+        return _written(result, {"chosen": chosen, **blocks.metrics()}, out, session, truth)
+    if session is not None:
+        verdict = verdict_with_exposure(verdict, session)
+    metrics = {
+        **figures(solved, verdict, frames),
+        "shots": saved.shape[0],
+        "size": list(saved.size),
+        "psi_sha256": saved.checksum,
+        "dictionary": dictionary_spec,
+        "chosen": chosen,
+        **blocks.metrics(),
+    }
+    if as_zarr:
+        light_field = opened_array(out / RESULT_GROUP, "light_field")
+        metrics |= _compared(light_field, truth, saved)
+    else:
+        with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
+            file.attrs["method"] = method
+            for name, (shape, dtype) in blocks.shapes().items():
+                home = file if name == "light_field" else maps
+                blocks.write(name, home.create_dataset(name, shape, dtype))
+            metrics |= _compared(file["light_field"], truth, saved)
+    write_metrics(out, metrics)
+    return metrics
+
+
+def _written(
+    result: Result, further: dict[str, Any], out: Path, session: Session | None, truth: str | None
+) -> dict:
+    """Write a result that is in memory, judged by its session's exposures; return the metrics."""
+    if session is not None:
+        result = with_exposure(result, session)
+    compared_with = _compared(result.light_field, truth, result.psi.layout)
+    metrics = {**result.metrics(), **further, **compared_with}
+    result.write(out, metrics)
+    return metrics
+
+
+def _compared(light_field: Any, truth: str | None, psi: PsiLayout | SavedPsi) -> dict[str, Any]:
+    """Return how near a light field, an array or dataset, is to the scene captured, if known."""
+    if truth is None:
+        return {}
+    scene = open_scene(truth, size=psi.size, views=psi.views)
+    return {"truth": truth, **compared(light_field, np.asarray(scene))}

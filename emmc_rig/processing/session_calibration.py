@@ -1,0 +1,273 @@
+"""A session's whiteboards to Psi, by the route that predicts the whiteboard held out best."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calibration.boards import each_reading
+from calibration.routes import Outcome
+from calibration.sensor import SensorSheet, characterise
+from calibration.stage_map import Place, StageMap, locate, stage_map
+from calibration.whiteboard import Calibration, NewArray, in_memory
+from emmc_rig.errors import AppError
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
+from emmc_rig.model.arguments import path_of
+from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.pages.calibration_page import write_calibration_report
+from emmc_rig.processing.calibration_settings import ROUTES
+from emmc_rig.processing.stored import REPORT, arrays_in, outcome_figures, save_outcome
+from emmc_rig.progress import Silent, Watcher
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.readings import (
+    camera_json_of,
+    camera_of,
+    sensor_pairs,
+    session_outcome,
+    stage_frames,
+    taken_shots,
+)
+from emmc_rig.session.session import CALIBRATION, Session
+
+SENSOR, STAGE = "sensor.json", "stage.json"
+
+
+def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, Any]:
+    return {
+        name: {"value": value, "deviation": deviation, "unit": unit}
+        for name, value, deviation, unit in rows
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class SessionStage:
+    """Where the mask stage of a session was sent, where it read to be, and where the mask stood.
+
+    read_um: by the stage's own scale, None where the journal does not say. deviation_um: of each
+    measured place, x or y.
+    """
+
+    map: StageMap
+    frames: tuple[str, ...]
+    commanded_um: Sequence[tuple[float, float]]
+    read_um: Sequence[tuple[float, float] | None]
+    places: Sequence[Place]
+
+    def figures(self) -> dict[str, Any]:
+        """Return plain data: what the stage does, and every place, all in um."""
+        places = [
+            {
+                "frame": frame,
+                "commanded_um": list(sent),
+                "read_um": None if read is None else list(read),
+                "measured_um": [place.x_um, place.y_um],
+                "deviation_um": place.deviation_um,
+                "left_by_the_map_um": left.tolist(),
+            }
+            for frame, sent, read, place, left in zip(
+                self.frames, self.commanded_um, self.read_um, self.places,
+                self.map.residual_um, strict=True,
+            )
+        ]  # fmt: skip
+        map_um = {"matrix": self.map.matrix.tolist(), "offset_um": list(self.map.offset_um)}
+        return {**_figures(self.map.rows()), "Map": map_um, "Places": places}
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return the places for a table: frame, commanded, measured, left by the map."""
+        return [
+            (
+                one["frame"],
+                *("{:.2f}, {:.2f}".format(*one[key]) for key in ("commanded_um", "measured_um")),
+                f"{one['deviation_um']:.2f}",
+                "{:+.2f}, {:+.2f}".format(*one["left_by_the_map_um"]),
+            )
+            for one in self.figures()["Places"]
+        ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SessionCalibration:
+    """Psi as a session's whiteboards measure it.
+
+    outcome: all routes tried, and the choice among them. calibration: the one chosen, of the shots
+    that the session has. metrics: what metrics.json says.
+    """
+
+    outcome: Outcome
+    calibration: Calibration
+    metrics: dict[str, Any]
+    sensor: SensorSheet | None = None
+    stage: SessionStage | None = None
+
+    @property
+    def psi(self) -> ImagingMatrix:
+        """The imaging matrix of the session's shots."""
+        return self.calibration.psi
+
+    @property
+    def held_out_error(self) -> float:
+        """Relative error at which the whiteboard held out of the fit is predicted."""
+        return self.outcome.judged[self.outcome.chosen].relative_error
+
+    def save(self, out: str | Path) -> None:
+        """Write psi.h5, calibration.h5, metrics.json and report.html as the folder `out`.
+
+        An earlier result of that name is replaced; raises AppError where something else is there.
+        """
+        place = Path(self.metrics["session"]) / CALIBRATION
+        with result_folder(Path(out), "calibrate", belongs_to=place) as folder:
+            self.write(folder)
+
+    def write(self, folder: Path) -> None:
+        """Write the same files into an existing folder."""
+        save_outcome(folder, self.outcome, self.calibration)
+        stage = self.stage
+        write_calibration_report(
+            folder / REPORT,
+            self.outcome,
+            self.metrics,
+            sensor=self.sensor,
+            stage=None if stage is None else stage.map,
+            places=() if stage is None else stage.rows(),
+        )
+        write_metrics(folder, self.metrics)
+        if stage is not None:
+            (folder / STAGE).write_text(metrics_text(stage.figures()), encoding="utf-8")
+        if self.sensor is not None:
+            figures = _figures(self.sensor.rows())
+            curve = self.sensor.curve
+            figures["Photon transfer curve"] = {
+                "signal_dn": curve.mean_dn.tolist(),
+                "variance_dn2": curve.variance_dn2.tolist(),
+                "exposure_s": curve.exposure_s.tolist(),
+            }
+            for name, one in (("DSNU, DN", self.sensor.dsnu), ("PRNU, share", self.sensor.prnu)):
+                figures[f"Spectrogram of {name}"] = {
+                    direction: {
+                        "cycles_per_pixel": one.frequency[direction].tolist(),
+                        "amplitude": amplitude.tolist(),
+                    }
+                    for direction, amplitude in one.spectra.items()
+                }
+            (folder / SENSOR).write_text(metrics_text(figures), encoding="utf-8")
+
+    def __repr__(self) -> str:
+        return (
+            f"SessionCalibration({self.outcome.chosen} route, whiteboard held out to "
+            f"{self.held_out_error:.2%}, {self.psi!r})"
+        )
+
+
+def calibrate(
+    session: Session | str | Path,
+    route: str = "auto",
+    *,
+    sensor: bool = False,
+    stage: bool = False,
+    watcher: Watcher | None = None,
+) -> SessionCalibration:
+    """Return Psi as a session's whiteboards measure it; `.save(folder)` writes it with a report.
+
+    session: itself, or its folder. route: parametric, mixed or free; `auto` takes every one that
+    the session has whiteboards for, and chooses. sensor: its figures too, from the darks and the
+    references at several exposures. stage: a map of the mask stage, from every frame of the open
+    aperture.
+    Raises AppError or CalibrationError.
+    """
+    if not isinstance(session, Session):
+        session = Session(path_of(session, "session", "a session, or its folder"))
+    return _calibrated(session, route, sensor, stage, watcher or Silent(), in_memory)
+
+
+def calibrate_into(
+    folder: Path, session: Session, route: str, sensor: bool, stage: bool, watcher: Watcher
+) -> SessionCalibration:
+    """Calibrate and write the result into an existing folder.
+
+    The free route writes Psi and its deviations view by view, and does not hold them in memory:
+    they are no longer there in what is returned. Raises AppError or CalibrationError.
+    """
+    whole = taken_shots(session) == tuple(range(len(camera_of(session).shots)))
+    with arrays_in(folder) as on_disk:
+        empty = on_disk if route == "free" and whole else in_memory
+        calibration = _calibrated(session, route, sensor, stage, watcher, empty)
+        calibration.write(folder)
+    return calibration
+
+
+@one_blas_thread()
+def _calibrated(
+    session: Session, route: str, sensor: bool, stage: bool, watcher: Watcher, empty: NewArray
+) -> SessionCalibration:
+    if route not in ROUTES:
+        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
+    if stage and not camera_of(session).moving_masks:
+        raise AppError(f"{session.folder}: --stage: no mask of this camera moves")
+    if stage and route == "free":
+        raise AppError("--stage needs the fitted mask: leave --route at auto")
+    started = time.perf_counter()
+    watcher.begin("frames", None)
+    whiteboards = (frame for frame in session.frames if frame.kind == "whiteboard")
+    planes = len({(one.bench.shot, one.view, one.bench.lamp) for one in whiteboards})
+    outcome = session_outcome(
+        session,
+        None if route == "auto" else ROUTES[route],
+        lambda name: watcher.begin(name, planes if name == "Psi, free" else None),
+        empty,
+        watcher.step,
+    )
+    metrics = {
+        "camera": session.header["title"] or session.folder.name,
+        "session": str(session.folder),
+        "size": list(outcome.calibration.psi.size),
+        "route": route,
+        **outcome_figures(outcome),
+        "calibration_seconds": time.perf_counter() - started,
+        "command": command_line(),
+        "versions": versions(),
+    }
+    shots = taken_shots(session)
+    chosen = outcome.calibration
+    if len(shots) < chosen.psi.shots:
+        # What `reconstruct --psi` takes with the session's own shots.
+        chosen = chosen.of_shots(shots, camera_json_of(session, shots))
+    sheet = None
+    if sensor:
+        watcher.begin("sensor", None)
+        white_dn = camera_of(session).sensor.noise.white_level_dn
+        sheet = characterise(*sensor_pairs(session), white_dn)
+    mapped = None
+    if stage:
+        watcher.begin("stage", None)
+        mapped = _stage_of(session, outcome)
+    return SessionCalibration(outcome, chosen, metrics, sheet, mapped)
+
+
+def _stage_of(session: Session, outcome: Outcome) -> SessionStage:
+    """Return the map of the mask stage; raises AppError or CalibrationError without one."""
+    known = outcome.mixed or outcome.parametric
+    if known is None:
+        raise AppError(
+            f"{session.folder}: --stage needs open whiteboards, to which the mask is fitted; "
+            "`emmc-rig calibrate --plan` writes a plan that has"
+        )
+    planned, boards = stage_frames(session)
+    layout = outcome.calibration.psi.layout
+    shadow = known.shadow
+    seen = each_reading(boards, layout, outcome.good)
+    places = [locate(board, shadow.mask, shadow.placement) for board in seen]
+    sent = [one.stage_um for one in boards.frames]
+    # The rig's stages end every move upwards.
+    found = stage_map(sent, [(1, 1)] * len(sent), places)
+    read = [_read_um(session, one) for one in planned]
+    return SessionStage(found, tuple(one.id for one in planned), sent, read, places)
+
+
+def _read_um(session: Session, frame: PlannedFrame) -> tuple[float, float] | None:
+    read = session.stored[frame.id].get("read_um", {})
+    return (read["mask_x"], read["mask_y"]) if {"mask_x", "mask_y"} <= set(read) else None
