@@ -41,12 +41,13 @@ METHOD = """
 from reconstruction.methods import MethodSettings
 
 camera = emmc.camera("scenario-ii-cfa", 2)
-psi = camera.psi((32, 40))
-frames = camera.expose(emmc.scene("deep-occlusions", size=(32, 40)), seed=0, psi=psi)
-SLOW = "dict-ista", "dict-fista"
 slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})
+SLOW = "dict-ista", "dict-fista"
 
 def solved(method):
+    size = (20, 24) if "dict" in method else (32, 40)
+    psi = camera.psi(size)
+    frames = camera.expose(emmc.scene("deep-occlusions", size=size), seed=0, psi=psi)
     result = emmc.reconstruct(psi, frames, method, settings=slow if method in SLOW else None)
     maps = [result.maps[name] for name in sorted(result.maps)]
     stated = without_times(result.metrics())
