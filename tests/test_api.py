@@ -3,6 +3,7 @@
 import doctest
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import FunctionType
@@ -275,6 +276,10 @@ MISTAKES = {
     "frames as text": (lambda t: t[1].T @ "frames", "frames: got 'frames'"),
     "Psi of one side": (lambda t: api.camera("rgbw-mono").psi(24), "size: got 24; it takes"),
     "exposing a name": (lambda t: api.camera("rgbw-mono").expose("dark"), "scene: got 'dark'"),
+    "a Psi of no camera": (
+        lambda t: api.reconstruct(replace(t[1], camera_json="{}"), t[2].readings),
+        "the imaging matrix's camera: title: field required",
+    ),
     "frames of lists": (lambda t: api.Frames([1], [1], [1]), "readings: got list"),
     "frames of two shapes": (
         lambda t: api.Frames(t[2].readings, t[2].deviation[:, 1:], t[2].usable),

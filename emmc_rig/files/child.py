@@ -35,7 +35,7 @@ def read_in_child(kind: str, paths: Sequence[Path]) -> NDArray:
     size_bytes = sum(path.stat().st_size for path in paths)
     most_bytes = COPIES * (MOST_COMPRESSED * size_bytes + FREE_BYTES)
     job = json.dumps({"kind": kind, "most_bytes": most_bytes, "paths": [str(p) for p in paths]})
-    command = [sys.executable, "-m", "emmc_rig.files.child"]
+    command = [sys.executable, "-P", "-m", "emmc_rig.files.child"]
     try:
         done = subprocess.run(command, input=job.encode(), capture_output=True, timeout=PATIENCE_S)
     except subprocess.TimeoutExpired as fault:

@@ -10,7 +10,7 @@ from calibration.frames import MeanFrame, SensorGain
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.frames import PSI
-from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session.readings import Scale, session_scale
@@ -56,7 +56,7 @@ def designed_scale(psi: ImagingMatrix) -> Scale:
     """Return the scale of a Psi by its camera's noise model; raises AppError without a camera."""
     if not psi.camera_json:
         raise AppError("this Psi does not know its camera: name the folder of its calibration")
-    camera = Camera.model_validate_json(psi.camera_json)
+    camera = camera_of(psi)
     noise, shape = camera.sensor.noise, psi.frames_shape[1:]
     read_variance = (noise.gain_dn_per_electron * noise.read_noise_electrons) ** 2
     black = np.full(shape, noise.black_level_dn, dtype=np.float32)

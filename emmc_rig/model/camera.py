@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from scipy import sparse
 
 from emmc_rig.model.arguments import numbers_of, pair_of, required
-from emmc_rig.model.errors import CameraError
+from emmc_rig.model.errors import CameraError, SensingError
 from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
     Footprint,
@@ -27,6 +27,7 @@ from emmc_rig.model.geometry import (
     fresnel_number,
     mask_position,
 )
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.masks import AnyPattern, cfa_tile
 from emmc_rig.model.noise import SensorNoise
 from emmc_rig.model.reading import read_yaml
@@ -289,6 +290,13 @@ def load_camera(path: Path) -> Camera:
         for name, mask in camera.masks.items()
     }
     return camera.model_copy(update={"masks": masks})
+
+
+def camera_of(psi: ImagingMatrix) -> Camera:
+    """Return the camera that a Psi says it is of; raises SensingError where that is no camera."""
+    source = "the imaging matrix's camera"
+    described = parse_json(psi.camera_json, source, SensingError)
+    return validated(Camera, described, source, SensingError)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
 from emmc_rig.model.arguments import NAMES, numbers_of, required
-from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
@@ -155,7 +155,7 @@ def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDAr
     """
     if not psi.camera_json:
         raise AppError("this Psi does not know its camera: give the readings' noise_sigma")
-    camera = Camera.model_validate_json(psi.camera_json)
+    camera = camera_of(psi)
     light = pixel_light(camera, psi.size)
     if readings.shape != light.shape:
         return np.zeros(readings.shape)  # the method refuses these frames, and says why

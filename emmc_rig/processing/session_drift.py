@@ -24,7 +24,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.frames import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
-from emmc_rig.model.camera import Camera, psi_layout
+from emmc_rig.model.camera import camera_of, psi_layout
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.stored import CALIBRATION
@@ -70,7 +70,7 @@ def read_calibration(folder: Path) -> Known:
     if not path.is_file() or not (folder / PSI).is_file():
         raise AppError(f"{folder}: holds no {CALIBRATION} and {PSI}; {remedy}")
     psi = ImagingMatrix.load(folder / PSI)
-    camera = Camera.model_validate_json(psi.camera_json)
+    camera = camera_of(psi)
     stages, k = shot_stages(camera), psi.binning
     placement = lost = seen = None
     with stored_arrays(path, AppError, "calibrate again") as stored:

@@ -20,7 +20,7 @@ from calibration.errors import CalibrationError
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
-from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.drawing import COLOURS, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.page import Section, embedded, fragment
@@ -86,7 +86,7 @@ def corrected(moved: Trial, settings: DriftSettings) -> tuple[ImagingMatrix, boo
     Raises NotApplicableError for a camera whose drift cannot be estimated.
     """
     psi = moved.psi
-    camera = Camera.model_validate_json(psi.camera_json)
+    camera = camera_of(psi)
     noise, light = camera.sensor.noise, pixel_light(camera, psi.size)
     variance = noise.variance(moved.readings, camera.exposures_s()[:, None, None], light)
     try:

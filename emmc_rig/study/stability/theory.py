@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.lightfield import OPPONENT, centre_view
 from emmc_rig.progress import Watcher
 from emmc_rig.study.scores import swept_disparity
@@ -146,7 +146,7 @@ class Seen:
     @classmethod
     def of(cls, trial: Trial) -> Seen:
         """Return what theory needs of a trial; a measured scene's disparities are swept for."""
-        camera = Camera.model_validate_json(trial.true_psi.camera_json)
+        camera = camera_of(trial.true_psi)
         noise, light = camera.sensor.noise, pixel_light(camera, trial.psi.size)
         exposures_s = camera.exposures_s()[:, None, None]
         variance = noise.variance(trial.true_psi.forward(trial.truth), exposures_s, light)

@@ -18,7 +18,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
-from emmc_rig.model.camera import Camera, pixel_light
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.pages.page import Head, Section, fragment, framed, provenance_section
@@ -165,7 +165,7 @@ def noise_figures(trial: Trial, solve: Solve, seed: int) -> dict[str, float]:
     energy of that change that lies further away.
     """
     clean = trial.true_psi.forward(trial.truth)
-    camera = Camera.model_validate_json(trial.psi.camera_json)
+    camera = camera_of(trial.psi)
     exposures_s = camera.exposures_s()[:, None, None]
     light = pixel_light(camera, trial.psi.size)
     variance = camera.sensor.noise.variance(clean, exposures_s, light)
