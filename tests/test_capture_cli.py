@@ -255,8 +255,8 @@ def test_the_schema_is_printed(run):
         (["capture", "plan.yaml", *RIG, "--out", "plan.yaml"], "something else than a session"),
         (["session", "show", "occupied"], "no session"),
         (["session", "list", "occupied"], "holds no session"),
-        (["session", "list", "nowhere"], "cannot be read"),
-        (["session", "verify", "nowhere"], "no session"),
+        (["session", "list", "nowhere"], "nowhere: no such folder"),
+        (["session", "verify", "nowhere"], "nowhere: no such folder"),
         (["session", "export", "occupied", "--out", "x.h5"], "no session"),
     ],
 )
