@@ -40,11 +40,11 @@ from emmc_rig.session.verify import verify
 
 HOUSE = Path(emmc_rig.__file__).parent
 SCANNED = (
-    *sorted((HOUSE / "capture").glob("*.py")),
+    *sorted((HOUSE / "acquisition").glob("*.py")),
     HOUSE / "session" / "session.py",
     HOUSE / "session" / "lock.py",
     HOUSE / "commands" / "capture.py",
-    HOUSE / "rig" / "rig_config.py",
+    HOUSE / "bench" / "rig_config.py",
 )
 FOLDERS, WRITING_A_PLAN = HOUSE / "files" / "folders.py", ("new_file", "_free")
 NO_CAPTURE = ("direct.py", "simulate.py", "assessment.py")
@@ -216,6 +216,13 @@ def a_window_of_unknown_size(bench):
     bench.boards(open=[{"window": [0, 2]}])
     yield bench.refused()
     bench.boards(open=[{"window": [0, 0]}])
+
+
+@walk("write 0, or 2 or more: one frame does not tell its own noise")
+def a_single_dark_of_the_shots(bench):
+    bench.plan(darks={**PLAN["darks"], "of_shots": 1})
+    yield bench.refused()
+    bench.plan(darks={**PLAN["darks"], "of_shots": 2})
 
 
 @walk("give file or camera, one of them")
