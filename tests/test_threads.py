@@ -45,7 +45,7 @@ slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})
 SLOW = "dict-ista", "dict-fista"
 
 def solved(method):
-    size = (20, 24) if "dict" in method else (32, 40)
+    size = (16, 16) if "dict" in method else (32, 40)
     psi = camera.psi(size)
     frames = camera.expose(emmc.scene("deep-occlusions", size=size), seed=0, psi=psi)
     result = emmc.reconstruct(psi, frames, method, settings=slow if method in SLOW else None)

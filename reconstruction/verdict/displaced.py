@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix, camera_of
-from emmc_rig.model.errors import ModelError
+from emmc_rig.model.errors import ModelError, SensingError
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.verdict.shadow import LEAST_RELIEF, Relief, relief_of, tiles
 
@@ -88,7 +87,7 @@ def _design(psi: ImagingMatrix) -> Camera | None:
     """Return the camera of a Psi, None where it is not known or has no mask near the sensor."""
     try:
         camera = camera_of(psi)
-    except ValidationError:
+    except SensingError:
         return None
     near = [m for m in camera.masks.values() if m.distance_mm < 0.5 * camera.lens.distance_mm]
     fits = len(camera.shots) == psi.shots and camera.views == psi.light_field_shape[:2]
