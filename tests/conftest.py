@@ -3,7 +3,7 @@
 import os
 import signal
 import tempfile
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 # As many processes as cores: threads of BLAS in each would wait on each other.
@@ -32,10 +32,8 @@ def pytest_addoption(parser):
     parser.addoption(
         "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
     )
-    parser.addoption("--list-skipped", type=Path, help="file to write: tests and modules skipped")
-    parser.addoption(
-        "--only-listed", type=Path, help="run what such a file lists, as with further extras"
-    )
+    parser.addoption("--list-run", type=Path, help="file to write: the tests that were run")
+    parser.addoption("--but", type=Path, help="leave out what such a file lists")
 
 
 def pytest_xdist_auto_num_workers(config):
@@ -48,30 +46,10 @@ def pytest_xdist_auto_num_workers(config):
 NO_LIGHT_FIELDS = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
 
 
-def pytest_ignore_collect(collection_path, config):
-    """Pass over modules of which `--only-listed` names no test."""
-    listed = _listed(config)
-    if listed is not None and collection_path.suffix == ".py":
-        module = collection_path.relative_to(config.rootpath).as_posix()
-        if all(name.partition("::")[0] != module for name in listed):
-            return True
-    return None
-
-
-@cache
-def _listed(config):
-    path = config.getoption("--only-listed")
-    return None if path is None else frozenset(path.read_text(encoding="utf-8").splitlines())
-
-
 def pytest_collection_modifyitems(config, items):
-    listed = _listed(config)
-    if listed is not None:
-        items[:] = [
-            item
-            for item in items
-            if item.nodeid in listed or item.nodeid.partition("::")[0] in listed
-        ]
+    if config.getoption("--but") is not None:
+        listed = set(config.getoption("--but").read_text(encoding="utf-8").splitlines())
+        items[:] = [item for item in items if item.nodeid not in listed]
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     skips = {}
     if not (folder and Path(folder).is_dir()):
@@ -89,10 +67,10 @@ def pytest_collection_modifyitems(config, items):
 
 def pytest_terminal_summary(terminalreporter):
     """Name the checks that ran on real light fields, or say why none of those chosen did."""
-    path = terminalreporter.config.getoption("--list-skipped")
+    path = terminalreporter.config.getoption("--list-run")
     if path is not None:
-        names = {report.nodeid for report in terminalreporter.stats.get("skipped", [])}
-        path.write_text("".join(f"{name}\n" for name in sorted(names)), encoding="utf-8")
+        run = [r for name in ("passed", "failed") for r in terminalreporter.stats.get(name, [])]
+        path.write_text("".join(f"{report.nodeid}\n" for report in run), encoding="utf-8")
     reported = {
         outcome: [
             report.nodeid
