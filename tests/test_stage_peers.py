@@ -20,6 +20,9 @@ from simulators.wire import PtyServer, TcpServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers
+EARLY_READER = pytest.mark.timing(
+    "thorlabs_apt_device reads in a thread before its constructor has made what the reader writes to"
+)
 
 PATIENCE_S = 30.0
 QUICK = AxisSpec(max_speed_um_s=200_000.0, acceleration_um_s2=2e7)
@@ -151,6 +154,7 @@ def apt_controller():
     return AptController(SYSTEM_CLOCK, {apt_codec.USB_UNIT: spec})
 
 
+@EARLY_READER
 @pytest.mark.parametrize("model", ["kdc101.KDC101", "tdc001.TDC001"])
 def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
     module, _, name = model.partition(".")
@@ -186,6 +190,7 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
             peer._thread.join()
 
 
+@EARLY_READER
 def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_controller):
     devices = pytest.importorskip("thorlabs_apt_device", reason="needs the extra `peers`")
     with PtyServer(apt_controller) as server:
