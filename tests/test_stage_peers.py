@@ -21,7 +21,7 @@ from simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers
 EARLY_READER = pytest.mark.timing(
-    "thorlabs_apt_device reads in a thread before its constructor has made what the reader writes to"
+    "thorlabs_apt_device may read before its constructor has made what its reader writes to"
 )
 
 PATIENCE_S = 30.0
