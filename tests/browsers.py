@@ -11,6 +11,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 CHROMEDRIVER = shutil.which("chromedriver")
 MARKS = [
     pytest.mark.browser,
+    pytest.mark.timing("Chromium draws and answers late beside other work; the tests wait for it"),
     pytest.mark.skipif(
         CHROMIUM is None or CHROMEDRIVER is None, reason="needs chromium and chromedriver on PATH"
     ),

@@ -31,6 +31,7 @@ from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tiles import Grid
 from reconstruction.tv import TVSettings
 
+pytestmark = pytest.mark.timing("workers that answer late are taken for lost")
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 SETTINGS = MethodSettings(
     blocks=BlockSettings(whole=1000, side=32, blend=4), tv=TVSettings(max_steps=20)

@@ -126,6 +126,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.timing("computing time grows where two processes share a core's caches")
 def test_the_stage_has_a_stop_within_50_ms_while_1100_connect_and_send_half_a_request():
     """Counted is the time that this process computes: others use this computer too."""
 

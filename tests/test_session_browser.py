@@ -1,7 +1,5 @@
 """The report of a session in a real browser: complete, silent, readable on a narrow screen."""
 
-import shutil
-
 import pytest
 from capture_rigs import begun, still_rig
 
@@ -11,17 +9,10 @@ from emmc_rig.session.session import REPORT
 from emmc_rig.session.storage import SYSTEM_DISK
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: extra `browser`")
+from browsers import CHROMEDRIVER, CHROMIUM, MARKS  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-CHROMEDRIVER = shutil.which("chromedriver")
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(
-        CHROMIUM is None or CHROMEDRIVER is None, reason="needs chromium and chromedriver on PATH"
-    ),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture
