@@ -19,10 +19,15 @@ class ArgumentError(ModelError, TypeError):
     """An argument that a public function does not take."""
 
 
+def refusal(value: object, name: str, takes: str) -> ArgumentError:
+    """Return the error that says what the argument `name` takes instead of a value."""
+    return ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+
+
 def required(value: object, kinds: Kinds, name: str, takes: str) -> None:
     """Raise ArgumentError, which says what the argument `name` takes, for another kind of value."""
     if not isinstance(value, kinds):
-        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+        raise refusal(value, name, takes)
 
 
 def path_of(value: object, name: str, takes: str) -> Path:
@@ -39,7 +44,7 @@ def pair_of(value: object, name: str, takes: str) -> tuple[int, int]:
     except (TypeError, ValueError):
         numbers = False
     if not numbers or min(first, second) < 1:
-        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+        raise refusal(value, name, takes)
     return int(first), int(second)
 
 
@@ -50,7 +55,7 @@ def numbers_of(value: object, name: str, takes: str) -> NDArray:
     except (TypeError, ValueError):  # lists whose rows differ in length
         array = np.empty(0, dtype=object)
     if array.dtype.kind not in "fiub" or array.ndim == 0:
-        raise ArgumentError(f"{name}: got {_described(value)}; it takes {takes}")
+        raise refusal(value, name, takes)
     return array
 
 

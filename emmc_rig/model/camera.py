@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy import sparse
 
-from emmc_rig.model.arguments import numbers_of, pair_of, required
+from emmc_rig.model.arguments import numbers_of, pair_of, refusal, required
 from emmc_rig.model.errors import CameraError, SensingError
 from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
@@ -216,7 +216,7 @@ class Camera(Settings):
         takes = "a scene, or a light field, a floating array (v, u, y, x, 3) in [0, 1]"
         light_field = numbers_of(scene, "scene", takes)
         if light_field.ndim != 5 or light_field.dtype.kind != "f":
-            required(scene, (), "scene", takes)
+            raise refusal(scene, "scene", takes)
         required(
             seed, (int, np.random.Generator), "seed", "a whole number, or a generator of NumPy"
         )

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from emmc_rig.model import kernels
-from emmc_rig.model.arguments import numbers_of, pair_of, path_of, required
+from emmc_rig.model.arguments import numbers_of, pair_of, path_of, refusal
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.json_text import parse_json
@@ -124,7 +124,7 @@ class ImagingMatrix:
 
     def __post_init__(self) -> None:
         if getattr(self.weights, "dtype", np.dtype(object)).kind != "f":
-            required(self.weights, (), "weights", WEIGHTS_TAKE)
+            raise refusal(self.weights, "weights", WEIGHTS_TAKE)
         if self.weights.ndim != 6 or self.weights.shape[4] != (1 if self.colour is not None else 3):
             raise SensingError(f"weights of shape {self.weights.shape} do not make a Psi")
         if self.colour is not None and self.colour.shape != (self.shots, *self.size):
@@ -351,11 +351,11 @@ class ImagingMatrix:
         (Psi(1 shot, 1x1 views, 2x3, three colours a pixel, 7.2e-05 MB), 18)
         """
         if not sparse.issparse(matrix):
-            required(matrix, (), "matrix", "a sparse matrix of SciPy")
+            raise refusal(matrix, "matrix", "a sparse matrix of SciPy")
         views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")
         size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
         if not isinstance(binning, int) or binning < 1:
-            required(binning, (), "binning", "the number of samples along a pixel's side")
+            raise refusal(binning, "binning", "the number of samples along a pixel's side")
         entries = sparse.coo_array(sparse.csr_array(matrix, dtype=np.float32))
         pixels = size[0] // binning, size[1] // binning
         readings, samples = int(np.prod(pixels)), int(np.prod((*views, *size)))

@@ -22,7 +22,7 @@ from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
-from emmc_rig.model.arguments import NAMES, numbers_of, required
+from emmc_rig.model.arguments import NAMES, numbers_of, refusal, required
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
@@ -90,7 +90,7 @@ def reconstruct(
     elif settings is not None:
         required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
     if on_step is not None and not callable(on_step):
-        required(on_step, (), "on_step", "a function of the progress")
+        raise refusal(on_step, "on_step", "a function of the progress")
     given = _as_frames(psi, frames, noise_sigma, usable)
     atoms = None
     if needs_dictionary:
@@ -124,7 +124,7 @@ def _as_frames(
     if noise_sigma is not None:
         is_level = isinstance(noise_sigma, Real) and 0 <= noise_sigma < np.inf
         if not is_level:
-            required(noise_sigma, (), "noise_sigma", "the readings' standard deviation, 0 or more")
+            raise refusal(noise_sigma, "noise_sigma", "the readings' standard deviation, 0 or more")
     if isinstance(frames, Frames):
         given = frames
     else:
@@ -141,7 +141,7 @@ def _as_frames(
     if usable is None:
         return given
     if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
-        required(usable, (), "usable", "a boolean array (shot, pixel_y, pixel_x)")
+        raise refusal(usable, "usable", "a boolean array (shot, pixel_y, pixel_x)")
     if usable.shape == given.shape:
         # Why they are not to be used is not known: not that there was at least so much light.
         given = replace(given, readings=np.where(usable, given.readings, 0))
