@@ -13,7 +13,7 @@ from emmc_rig.commands.output import give_result, say, show_table, shown_progres
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from emmc_rig.study.design.check import Simulated
+    from emmc_rig.study.design.comparison import Simulated
 
 
 def design(
@@ -22,34 +22,20 @@ def design(
         typer.Argument(help="a YAML file of what the bench has (default: see docs/design.md)"),
     ] = None,
     scene: ScenesOption = None,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="instead: does theory order cameras as simulation does"),
-    ] = False,
     size: SizeOption = None,
     seed: SeedOption = 0,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="folder to write (default: emmc-design or emmc-design-check)"),
+        typer.Option("--out", help="folder to write (default: emmc-design)"),
     ] = None,
 ) -> None:
     """Choose the mask to order: by theory, confirmed by simulation; a camera and a mask file."""
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.design.bench import load_bench
-    from emmc_rig.study.design.designing import run_check, run_design
+    from emmc_rig.study.design.designing import run_design
 
     described = load_bench(bench)
     sides = parse_size(size)
-    if check:
-        with shown_progress() as bars:
-            place = out or Path("emmc-design-check")
-            checked = run_check(described, scene or [], sides, seed, place, bars)
-        _show(checked.simulated)
-        ranks = ", ".join(f"{name} {rank:+.2f}" for name, rank in checked.ranks.items())
-        tell(f"rank correlation of theory with simulation: {ranks}")
-        tell(f"open {checked.page}")
-        give_result(place)
-        return
     with shown_progress() as bars:
         place = out or Path("emmc-design")
         designed = run_design(described, scene or [], sides, seed, place, bars)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
@@ -220,50 +219,3 @@ def sheet(
         write_sheet(opened, folder, pictures)
     tell(f"open {folder / REPORT}")
     give_result(report=str(folder / REPORT))
-
-
-@app.command()
-def bench(
-    folder: Annotated[
-        Path, typer.Option("--folder", help="where the frames are written: names the disk")
-    ] = Path(),
-    shots: Annotated[int, typer.Option("--shots", min=2, help="24 MP frames to verify")] = 20,
-    listed: Annotated[int, typer.Option("--listed", min=2, help="shots to list")] = 10_000,
-    out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
-) -> None:
-    """Time what capturing costs beside the devices, and verifying and listing sessions."""
-    from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import write_metrics
-    from emmc_rig.study.benchmarks.session import listing_seconds, overheads, verification
-
-    with (
-        nullcontext() if out is None else result_folder(out, "session bench") as results,
-        shown_progress("capture on idle devices") as progress,
-    ):
-        measured = []
-        for one in overheads(folder, 300):
-            measured.append(one)
-            tell(
-                f"sequencing {one.shots} shots of {one.megapixels:.3g} MP, moves of "
-                f"{one.move_s:g} s: {one.sequencing_ms:.2f} ms each beside the devices, "
-                f"{one.handing_over_ms:.2f} ms handing over; {one.hidden_share:.0%} of hashing and "
-                "writing behind the bench's work"
-            )
-        progress.begin("verify")
-        rates = verification(folder, shots)
-        tell(
-            f"verifying {rates.shots} shots of 24 MP: {rates.verify_mb_s:.0f} MB/s; SHA-256 alone "
-            f"{rates.sha256_mb_s:.0f}, disk alone {rates.disk_mb_s:.0f}, with {rates.threads} "
-            f"threads: {rates.share:.0%} of the slower"
-        )
-        progress.begin("list")
-        listing_s = listing_seconds(folder, listed)
-        tell(f"listing a session of {listed} shots: {listing_s:.3f} s")
-        metrics = {
-            "overhead": [one.as_dict() for one in measured],
-            "verification": rates.as_dict(),
-            "listing": {"shots": listed, "seconds": listing_s},
-        }
-        if results is not None:
-            write_metrics(results, metrics)
-    give_result(metrics=metrics)

@@ -1,4 +1,4 @@
-"""The command `emmc-rig tables`: the paper's tables and figures, ours beside the paper's."""
+"""The command `emmc-rig tables`: the paper's tables, ours beside the paper's."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import OutOption, SeedOption
+from emmc_rig.commands.options import DictionaryOption, OutOption, SeedOption
 from emmc_rig.commands.output import give_result, show, shown_progress, tell
 
 
@@ -16,28 +16,22 @@ def tables(
         Path | None, typer.Option("--scenes", help="a folder of scenes (default: the built-in)")
     ] = None,
     only: Annotated[
-        str | None, typer.Option("--only", help="table2,table3,table4,figure5,...,figure10")
+        str | None, typer.Option("--only", help="table2, table3, table4, figure6, figure8")
     ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="crops and small dictionaries: minutes, not days")
-    ] = False,
-    dictionary: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--dictionary",
-            help="a file, lambertian or dct; again for r = 1/4 (default: train leave-one-out)",
-        ),
-    ] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="crops: minutes, not days")] = False,
+    dictionary: DictionaryOption = None,
     seed: SeedOption = 0,
     out: OutOption = Path("emmc-tables"),
 ) -> None:
-    """Reproduce the paper's tables and figures; run it again to go on where it stopped."""
-    from emmc_rig.study.tables.cell_sweep import FAST, TablesSettings
-    from emmc_rig.study.tables.reproducing import run_tables, shown
+    """Reproduce the paper's tables; run it again to go on where it stopped."""
+    from emmc_rig.study.tables.tables_page import run_tables, shown
+    from emmc_rig.study.tables.tables_study import FAST, TablesSettings
 
-    settings = (FAST if fast else TablesSettings()).model_copy(update={"seed": seed})
+    settings = (FAST if fast else TablesSettings()).model_copy(
+        update={"seed": seed, "dictionary": dictionary}
+    )
     with shown_progress() as bars:
-        outcome = run_tables(scenes, out, only, dictionary or [], settings, bars)
+        outcome = run_tables(scenes, out, only, settings, bars)
     for part in shown(outcome.grids, outcome.findings):
         show(part)
     tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")

@@ -23,7 +23,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.points import NotApplicableError
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.result import Reconstruction

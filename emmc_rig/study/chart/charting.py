@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullFormatter
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import (
-    COLOURS,
     FAINT,
     INK,
     LEGEND,
@@ -31,7 +29,6 @@ from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import (
     Head,
     Section,
-    embedded,
     fragment,
     framed,
     inline_svg,
@@ -39,17 +36,17 @@ from emmc_rig.pages.page import (
     provenance_section,
 )
 from emmc_rig.progress import Watcher
-from emmc_rig.study.chart.chart_sweep import ChartSweep
-from emmc_rig.study.chart.front import POOLED, Chart, Growth, Mark, charts, growths
-from emmc_rig.study.chart.peers import PEERS
-from emmc_rig.study.chart.points import ChartSettings, Point, charted_points, scalings
-from emmc_rig.study.sweep import (
+from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
+from emmc_rig.study.chart.chart_study import ChartStudy
+from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
+from emmc_rig.study.points import study_folder
+from emmc_rig.study.rows import (
     available_cores,
     check_scene_names,
+    check_size,
     csv_text,
     machine,
     provenance,
-    sweep_folder,
 )
 
 LINE_POINTS, LETTER_POINTS = 10.0, 4.6
@@ -64,19 +61,15 @@ def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
     front = chart.front()
     shown = {}
     for mark in chart.marks:
-        one = mark.configuration
+        method = mark.configuration.method
         (dot,) = axes.plot(
             mark.seconds, mark.psnr_db,
-            "D" if one.is_peer else "o",
-            markersize=8 if mark in front else 7,
-            markerfacecolor="white" if one.is_peer else colours[one.method],
-            markeredgecolor=colours[one.method],
-            markeredgewidth=1.6,
-            alpha=1 if mark in front or one.is_peer else 0.55,
+            "o", markersize=8 if mark in front else 7, color=colours[method],
+            markeredgewidth=1.6, alpha=1 if mark in front else 0.55,
             zorder=3,
         )  # fmt: skip
         dot.set_gid(chart.mark_name(mark))
-        shown.setdefault(one.method, dot)
+        shown.setdefault(method, dot)
     axes.step(
         [mark.seconds for mark in front], [mark.psnr_db for mark in front],
         where="post", color=INK, linewidth=1.1, alpha=0.55, zorder=2, label="_front",
@@ -117,48 +110,12 @@ def _name(axes: Axes, front: Sequence[Mark], colours: Mapping[str, str]) -> None
         )  # fmt: skip
 
 
-def draw_growths(growths: Sequence[Growth], folder: Path) -> dict[str, Path]:
-    """Write a chart for each axis that was varied, time beside memory; return them by axis."""
-    return {
-        axis: _draw_growth([growth for growth in growths if growth.axis == axis], axis, folder)
-        for axis in dict.fromkeys(growth.axis for growth in growths)
-    }
-
-
-def _draw_growth(growths: Sequence[Growth], axis: str, folder: Path) -> Path:
-    figure, (time, memory) = sheet(2, 4.4, 3.3, "seconds")
-    for growth, colour in zip(growths, COLOURS * len(growths), strict=False):
-        label = f"{growth.label}: {growth.exponent:.2f}"
-        if growth.expected is not None:
-            label += f" ({growth.expected:.2f} expected)"
-            first, start = growth.seconds[0], growth.at[0]
-            line = [first * (at / start) ** growth.expected for at in growth.at]
-            time.plot(growth.at, line, "--", color=colour, alpha=0.45, linewidth=1)
-        time.plot(growth.at, growth.seconds, "-o", color=colour, markersize=5, label=label)
-        memory.plot(growth.at, growth.peak_mib, "-o", color=colour, markersize=5)
-    for axes, title in ((time, "Time"), (memory, "Peak memory")):
-        axes.set_xscale("log")
-        axes.set_xticks(growths[0].at, [f"{at:g}" for at in growths[0].at])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        titled(axes, title, axis)
-    time.set_yscale("log")
-    plain_log_ticks(time, "y")
-    low, high = time.get_ylim()
-    if high / low < 4:  # what hardly moves should look as if it hardly moved
-        middle = (low * high) ** 0.5
-        time.set_ylim(middle / 2, middle * 2)
-    memory.set_ylim(0, 1.15 * max(max(growth.peak_mib) for growth in growths))
-    memory.set_ylabel("MiB", color=FAINT, fontsize=9)
-    time.legend(**LEGEND)
-    return save_drawing(figure, folder / f"growth-{axis.replace(' ', '-')}.svg")
-
-
 CAVEATS = (
     "Frames are made with the very Psi that reconstructs them; all methods have this advantage.",
     "Angular: 0 dB is what one picture copied to every view scores; below, parallax is worse than "
     "none. Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
-    "Seconds are the median of repeats after a warm-up, in a fresh process each, one at a time; "
-    "the dictionary is made beforehand. Memory is that of the whole process.",
+    "Seconds are the median of repeats after a warm-up, one point at a time in a process of their "
+    "own; the dictionary is made beforehand. Memory is that of the whole process.",
 )
 MEANS = {
     "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",
@@ -168,21 +125,15 @@ MEANS = {
 
 
 def chart_page(
-    sweep: ChartSweep,
+    study: ChartStudy,
     about: Sequence[str],
     charts: Mapping[Chart, Path],
-    growths: Sequence[Growth],
-    drawn_growths: Mapping[str, Path],
     provenance: Mapping[str, str],
 ) -> str:
-    """Return the page. about: sentences under the title. charts, drawn_growths: their SVG files."""
-    sections = [_chart_section(sweep, chart, path) for chart, path in charts.items()]
-    if growths:
-        pictures = {axis: embedded(path) for axis, path in drawn_growths.items()}
-        body = fragment("chart_growth.html", growths=growths, pictures=pictures)
-        sections.append(Section("growth", "Growth with the size of the problem", body, "Growth"))
+    """Return the page. about: sentences under the title. charts: their SVG files."""
+    sections = [_chart_section(study, chart, path) for chart, path in charts.items()]
     sections.append(provenance_section(provenance))
-    marks = {chart.mark_name(mark): _shown(sweep, mark) for chart in charts for mark in chart.marks}
+    marks = {chart.mark_name(mark): _shown(study, mark) for chart in charts for mark in chart.marks}
     return framed(
         "Speed against accuracy", about, CAVEATS, sections, ["chart.css"], ["chart.js"],
         marks_data(marks), head=_head(next(iter(charts), None)),
@@ -208,14 +159,14 @@ def _head(chart: Chart | None) -> Head:
     )
 
 
-def _chart_section(sweep: ChartSweep, chart: Chart, path: Path) -> Section:
+def _chart_section(study: ChartStudy, chart: Chart, path: Path) -> Section:
     front = chart.front()
     rows = [
         {
             "name": chart.mark_name(mark),
             "mark": mark,
             "in_front": mark in front,
-            **_means([sweep.results[point] for point in mark.points]),
+            **_means([study.results[point] for point in mark.points]),
         }
         for mark in sorted(chart.marks, key=lambda mark: mark.seconds)
     ]
@@ -234,12 +185,12 @@ def _means(results: Sequence[dict]) -> dict[str, str]:
     return means
 
 
-def _shown(sweep: ChartSweep, mark: Mark) -> ShownMark:
+def _shown(study: ChartStudy, mark: Mark) -> ShownMark:
     pairs = [
         ShownPair(
-            f"{point.capture.scene_name}: {sweep.results[point]['psnr_db']:.2f} dB",
-            sweep.picture(point),
-            sweep.truth_picture(point.capture),
+            f"{point.capture.scene_name}: {study.results[point]['psnr_db']:.2f} dB",
+            study.picture(point),
+            study.truth_picture(point),
         )
         for point in mark.points
     ]
@@ -251,22 +202,17 @@ CSV, PAGE, DRAWN = "chart.csv", "chart.html", "charts"
 COLUMNS = (
     "scene", "camera", "method", "level", "settings", "psnr_db", "ssim", "angular_db",
     "replicate_psnr_db", "disparity_mae_px", "floor_mae_px", "bad_share", "own_disparity_mae_px",
-    "seconds", "fastest_s", "slowest_s", "cpu_seconds", "repeats", "reference_s",
-    "reference_cpu_s", "dictionary_s", "peak_mib", "base_mib", "cores", "load", "shots", "views",
-    "rows", "columns", "disparity_range_px", "steps", "status", "advice", "failed",
+    "seconds", "fastest_s", "slowest_s", "cpu_seconds", "repeats", "peak_mib", "cores", "load",
+    "shots", "views", "rows", "columns", "steps", "status", "advice", "failed",
 )  # fmt: skip
 """Of chart.csv. An empty field is infinite, not known or not applicable."""
 
 
 @dataclass(frozen=True)
 class ChartOutcome:
-    """What was measured, and the page that shows it. left_out: in words, what is missing and why.
-
-    growths: with the size of the problem.
-    """
+    """What was measured, and its page. left_out: what is missing and why, in words."""
 
     charts: list[Chart]
-    growths: list[Growth]
     left_out: list[str]
     page: Path
     seconds: float
@@ -276,74 +222,59 @@ class ChartOutcome:
         return [chart for chart in self.charts if chart.scene == POOLED] or self.charts
 
 
-def run_chart(
-    settings: ChartSettings,
-    out: Path,
-    watcher: Watcher,
-    clock: Callable[[], float] = time.perf_counter,
-) -> ChartOutcome:
+def run_chart(settings: ChartSettings, out: Path, watcher: Watcher) -> ChartOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
-    Raises SweepStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written,
+    Raises StudyStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written,
     and the errors of the layers below; what is done is kept in each case.
     """
-    started = clock()
+    started = time.perf_counter()
     check_scene_names(settings.scenes)
     check_scene_names(settings.cameras, "--camera")
+    check_size(settings.size)
     points = charted_points(settings)
-    varied = scalings(settings, available_cores())
-    missing, left_out = _missing_peers(points)
-    points = [point for point in points if point.configuration.method not in missing]
-    if not points:
-        raise AppError(f"nothing to chart: {'; '.join(left_out)}")
     for capture in dict.fromkeys(point.capture for point in points):
-        _ = capture.described
-    with sweep_folder(out, ChartSweep.journal, "chart") as folder:
-        sweep = ChartSweep(settings, folder)
-        sweep.make_frames(points, watcher)
-        sweep.run([*points, *(point for one in varied for point in one.points)], watcher)
+        capture.scene_seen()  # raises for wrong input before anything is measured
+    with study_folder(out, ChartStudy.journal, "chart") as folder:
+        study = ChartStudy(settings, folder)
+        results = study.run(points, watcher)
         watcher.begin("draw", None)
-        results = {point: sweep.results[point] for point in points}
-        left_out += sweep.failures()
+        left_out = [*dict.fromkeys(study.left_out.values()), *study.failures()]
         if all("failed" in result for result in results.values()):
             raise AppError(f"nothing could be measured: {left_out[0]}")
-        found, grown = charts(results), growths(varied, sweep.results)
-        outcome = ChartOutcome(found, grown, left_out, folder / PAGE, clock() - started)
+        seconds = time.perf_counter() - started
+        outcome = ChartOutcome(charts(results), left_out, folder / PAGE, seconds)
         with result_folder(folder, "chart", adds=True) as new:
-            _write(sweep, results, outcome, new)
+            _write(study, outcome, new)
     return outcome
 
 
-def _write(sweep: ChartSweep, results: dict[Point, dict], outcome: ChartOutcome, new: Path) -> None:
+def _write(study: ChartStudy, outcome: ChartOutcome, new: Path) -> None:
     """Write the charts, chart.csv, the page and metrics.json."""
-    settings, folder = sweep.settings, new / DRAWN
-    folder.mkdir()
+    settings, drawn = study.settings, new / DRAWN
+    drawn.mkdir()
     marks = [mark for chart in outcome.charts for mark in chart.marks]
     colours = colours_of(mark.configuration.method for mark in marks)
-    drawn = {chart: draw_chart(chart, colours, folder) for chart in outcome.charts}
-    drawn_growths = draw_growths(outcome.growths, folder)
-    load = _load(list(sweep.results.values()))
-    sources = provenance(settings, outcome.seconds, Machine=machine(), Load=load)
+    load = _load(list(study.results.values()))
     text = chart_page(
-        sweep, _about(settings, results, outcome.left_out), drawn, outcome.growths, drawn_growths,
-        sources,
+        study, _about(study, load, outcome.left_out),
+        {chart: draw_chart(chart, colours, drawn) for chart in outcome.charts},
+        provenance(settings, outcome.seconds, Machine=machine(), Load=load),
     )  # fmt: skip
-    fronts = {
-        f"{chart.camera}, {chart.scene}": [
-            {"method": one.configuration.label, "seconds": one.seconds, "psnr_db": one.psnr_db}
-            for one in chart.front()
-        ]
-        for chart in outcome.charts
-    }
-    write_text(new / CSV, csv_text([_row(*one) for one in sweep.results.items()], COLUMNS))
+    write_text(new / CSV, csv_text([_row(*pair) for pair in study.results.items()], COLUMNS))
     write_text(new / PAGE, text)
     metrics = {
-        "points": len(sweep.results),
+        "points": len(study.results),
         "seconds": outcome.seconds,
         "machine": machine(),
         "load": load,
-        "fronts": fronts,
-        "growth": [asdict(growth) for growth in outcome.growths],
+        "fronts": {
+            f"{chart.camera}, {chart.scene}": [
+                {"method": m.configuration.label, "seconds": m.seconds, "psnr_db": m.psnr_db}
+                for m in chart.front()
+            ]
+            for chart in outcome.charts
+        },
         "left_out": outcome.left_out,
         "settings": settings.model_dump(mode="json"),
     }
@@ -352,30 +283,15 @@ def _write(sweep: ChartSweep, results: dict[Point, dict], outcome: ChartOutcome,
 
 def _row(point: Point, result: dict) -> dict[str, object]:
     """Return a point as a row of chart.csv."""
-    one = point.configuration
-    row = {
+    configuration = point.configuration
+    return {
         **result,
         "scene": point.capture.scene_name,
         "camera": point.capture.camera_name,
-        "method": one.method,
-        "level": one.level,
-        "settings": one.settings.model_dump_json(exclude_defaults=True),
+        "method": configuration.method,
+        "level": configuration.level,
+        "settings": configuration.settings.model_dump_json(exclude_defaults=True),
     }
-    if "failed" not in result:
-        row["views"] = "x".join(map(str, result["views"]))
-        row["rows"], row["columns"] = result["size"]
-    return row
-
-
-def _missing_peers(points: Sequence[Point]) -> tuple[set[str], list[str]]:
-    """Return the rivals that are not installed, and a line about each."""
-    missing = {}
-    for name in dict.fromkeys(p.configuration.method for p in points if p.configuration.is_peer):
-        try:
-            PEERS[name].check()
-        except AppError as fault:
-            missing[name] = f"{name}: {fault}"
-    return set(missing), list(missing.values())
 
 
 def _load(results: Sequence[dict]) -> str:
@@ -386,15 +302,14 @@ def _load(results: Sequence[dict]) -> str:
     return f"{loads[0]:.1f} to {loads[-1]:.1f}, median {loads[len(loads) // 2]:.1f}"
 
 
-def _about(
-    settings: ChartSettings, results: dict[Point, dict], left_out: Sequence[str]
-) -> list[str]:
-    done = [result for result in results.values() if "failed" not in result]
+def _about(study: ChartStudy, load: str, left_out: Sequence[str]) -> list[str]:
+    settings = study.settings
+    done = [result for result in study.results.values() if "failed" not in result]
     busy = any(result["load"] > available_cores() + 0.5 for result in done)
     lines = [
         f"{len(done)} points on {', '.join(Path(s).stem for s in settings.scenes)}, through "
         f"{', '.join(Path(c).stem for c in settings.cameras)}.",
-        f"{machine()}; load while measuring (processes that wanted a core) {_load(done)}. "
+        f"{machine()}; load while measuring (processes that wanted a core) {load}. "
         + (
             "The machine was busy: seconds by the clock are too long, CPU seconds less so."
             if busy

@@ -1,206 +1,181 @@
-"""A process that measures points: jobs as lines of JSON from standard input, figures to the output.
+"""A process that measures points one at a time: PSNR, seconds and memory of a reconstruction.
 
-Order matters: imports, frames, a warm-up on a small window (which compiles and loads), the timed
-runs, the peak of memory; only then the truth is read and compared. Each job's peak is its own.
-Before and after, a fixed reconstruction is timed, by which machines are compared.
+Order matters: frames, dictionary, a warm-up on a small window (which compiles and loads), the timed
+runs, the peak of memory; only then the light field is compared with the truth.
 """
 
 from __future__ import annotations
 
-import json
+import multiprocessing
 import os
+import signal
 import statistics
-import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
-
-import numpy as np
-from numba import get_num_threads
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
-from emmc_rig.model.frames import Frames
-from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
-from emmc_rig.study.chart.captures import read_frames, read_truth
-from emmc_rig.study.chart.peers import PEERS
+from emmc_rig.study.chart.chart_points import Point
+from emmc_rig.study.rows import available_cores, plain
 from emmc_rig.study.scores import scored
-from reconstruction.dictionary import Dictionary
+from emmc_rig.study.trial import Trial, trial_of
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, reconstruct
-from reconstruction.result import Reconstruction
-from reconstruction.tv import TVSettings, reconstruct_tv
 
-SIZE, STEPS, REPEATS = (64, 80), 20, 3
+WARM_UP_PX = 27
+"""Side of the window of the warm-up: large enough for patches, small enough to take no time."""
+EXPECTED_ERRORS = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
 
 
 @dataclass(frozen=True)
-class Reference:
-    """Median seconds, by the clock and of all cores together."""
+class Job:
+    """A point to measure. picture, truth_picture: thumbnails to write.
 
-    seconds: float
-    cpu_seconds: float
-
-
-def reference() -> Reference:
-    """Return what 20 steps of total variation take on 5x5 views of 64x80 pixels."""
-    run = _warm()
-    found = []
-    for _ in range(REPEATS):
-        cpu, wall = time.process_time(), time.perf_counter()
-        run()
-        found.append((time.perf_counter() - wall, time.process_time() - cpu))
-    walls, cpus = zip(*found, strict=True)
-    return Reference(statistics.median(walls), statistics.median(cpus))
-
-
-@lru_cache(maxsize=1)
-def _warm() -> Callable[[], object]:
-    """Return the reconstruction, run once, which may have compiled."""
-    rng = np.random.default_rng(0)
-    weights = rng.random((1, 5, 5, SIZE[0], 1, SIZE[1]), dtype=np.float32)
-    colour = rng.integers(0, 3, (1, *SIZE), dtype=np.uint8)
-    psi = ImagingMatrix(weights, colour, 1)
-    frames = rng.random(psi.frames_shape, dtype=np.float32)
-    settings = TVSettings(mu=1e-3, max_steps=STEPS, rtol=1e-30)
-
-    def run() -> object:
-        return reconstruct_tv(psi, frames, 0.005, settings)
-
-    run()
-    return run
-
-
-WARM_UP_PX = 27
-KNOWN = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
-
-
-def measured(job: dict) -> dict:
-    """Return the figures of a job: capture, method, settings, dictionary, repeats, ...
-
-    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. base_mib: resident
-    memory of the process before the timed runs, with Psi and frames; peak_mib: at most during them.
-    dictionary_s: of the one that this process has made.
+    dictionary: see `open_dictionary`. repeats: timed runs at most, until `enough_s` are spent.
     """
-    psi, frames = read_frames(Path(job["capture"]))
-    settings = MethodSettings.model_validate(job["settings"])
-    dictionary, dictionary_s = None, 0.0
-    if job["needs_dictionary"]:
-        views = psi.light_field_shape[:2]
-        dictionary, dictionary_s = _dictionary(job["dictionary"], views, psi.binning)
-    _solved(job["method"], *_window(psi, frames), dictionary, settings)
-    load, before = os.getloadavg()[0], reference()
+
+    point: Point
+    picture: Path
+    truth_picture: Path
+    dictionary: str | None
+    repeats: int
+    enough_s: float
+
+
+def measured(job: Job) -> dict:
+    """Return the figures of a job, as plain data.
+
+    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. peak_mib: resident
+    memory of the process at most during the timed runs, less the truth, which no method needs.
+    """
+    trial, method = trial_of(job.point.capture), job.point.configuration.method
+    settings = job.point.configuration.settings
+    trial.dictionary(method, job.dictionary)
+    _window(trial).solved(method, settings, job.dictionary)
+    load = os.getloadavg()[0]
     forget_peak()
-    base_mib = peak_memory_mib()
-    wall, cpu = [], []
-    result = None
-    while len(wall) < job["repeats"] and (not wall or sum(wall) < job["enough_s"]):
+    wall, cpu, result = [], [], None
+    while len(wall) < job.repeats and (not wall or sum(wall) < job.enough_s):
         result = None
         cpu_started, started = time.process_time(), time.perf_counter()
-        result = _solved(job["method"], psi, frames, dictionary, settings)
+        result = trial.solved(method, settings, job.dictionary)
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
     assert result is not None
-    peak_mib = peak_memory_mib()
-    after = reference()
-    truth, disparity = read_truth(Path(job["capture"]))
-    own = getattr(result, "maps", {}).get("disparity")
-    scores = scored(result.light_field, truth, disparity, own)
-    _save_pictures(Path(job["picture"]), result.light_field, truth)
-    return {
-        **asdict(scores),
-        "seconds": statistics.median(wall),
-        "fastest_s": min(wall),
-        "slowest_s": max(wall),
-        "cpu_seconds": statistics.median(cpu),
-        "repeats": len(wall),
-        "reference_s": (before.seconds + after.seconds) / 2,
-        "reference_cpu_s": (before.cpu_seconds + after.cpu_seconds) / 2,
-        "dictionary_s": dictionary_s,
-        "peak_mib": peak_mib,
-        "base_mib": base_mib,
-        "cores": get_num_threads(),
-        "load": load,
-        "steps": result.steps,
-        "status": result.status,
-        "advice": result.advice,
-        "shots": psi.shots,
-        "binning": psi.binning,
-        "views": list(psi.light_field_shape[:2]),
-        "size": list(psi.size),
-        "colours_stored": psi.weights.shape[4],
-        "disparity_range_px": None if disparity is None else float(np.ptp(disparity)),
-        "dictionary_atoms": dictionary.size if dictionary is not None else None,
-        "patches": result.parameters.get("patches"),
-    }
-
-
-@lru_cache(maxsize=1)
-def _dictionary(name: str | None, views: tuple[int, int], binning: int) -> tuple[Dictionary, float]:
-    """Return a dictionary and the seconds that it took to make."""
-    started = time.perf_counter()
-    made = open_dictionary(name, views, binning)
-    return made, time.perf_counter() - started
-
-
-def _solved(
-    method: str,
-    psi: ImagingMatrix,
-    frames: Frames,
-    dictionary: Dictionary | None,
-    settings: MethodSettings,
-) -> Reconstruction:
-    if method in PEERS:
-        return PEERS[method].solve(psi, frames, dictionary)
-    return reconstruct(
-        method, psi, frames.readings, frames.noise_sigma, dictionary, settings, frames.usable
+    peak_mib = peak_memory_mib() - trial.truth.nbytes / 2**20
+    scores = scored(
+        result.light_field, trial.truth, trial.disparity_px, result.maps.get("disparity")
+    )
+    lines = epipolar_lines(trial.truth)
+    save_thumbnail(job.picture, result.light_field, lines)
+    if not job.truth_picture.exists():
+        save_thumbnail(job.truth_picture, trial.truth, lines)
+    return plain(
+        {
+            **asdict(scores),
+            "seconds": statistics.median(wall),
+            "fastest_s": min(wall),
+            "slowest_s": max(wall),
+            "cpu_seconds": statistics.median(cpu),
+            "repeats": len(wall),
+            "peak_mib": peak_mib,
+            "cores": available_cores(),
+            "load": load,
+            "steps": result.steps,
+            "status": result.status,
+            "advice": result.advice,
+            "shots": trial.psi.shots,
+            "views": "x".join(map(str, trial.psi.light_field_shape[:2])),
+            "rows": trial.psi.size[0],
+            "columns": trial.psi.size[1],
+        }
     )
 
 
-def _window(psi: ImagingMatrix, frames: Frames) -> tuple[ImagingMatrix, Frames]:
-    """Return a corner that is large enough for patches and small enough to take no time."""
-    k = psi.binning
+def _window(trial: Trial) -> Trial:
+    """Return a corner of a trial; it has no truth."""
+    k = trial.psi.binning
     side = WARM_UP_PX // k * k
-    rows, columns = (slice(0, min(side, length)) for length in psi.size)
-    seen = np.s_[:, : rows.stop // k, : columns.stop // k]
-    cut = Frames(frames.readings[seen].copy(), frames.deviation[seen], frames.usable[seen].copy())
-    return psi.window(rows, columns), cut
+    rows, columns = (slice(0, min(side, length)) for length in trial.psi.size)
+    seen = (slice(None), slice(0, rows.stop // k), slice(0, columns.stop // k))
+    return replace(
+        trial,
+        psi=trial.psi.window(rows, columns),
+        readings=trial.readings[seen].copy(),
+        usable=trial.usable[seen].copy(),
+    )
 
 
-def _save_pictures(path: Path, estimate: NDArray, truth: NDArray) -> None:
-    """Write what a point shows, and the truth's beside the captures, unless it is there."""
-    lines = epipolar_lines(truth)
-    truth_path = path.with_name(f"{path.stem.partition('-')[0]}-truth.webp")
-    for light_field, where in ((estimate, path), (truth, truth_path)):
-        if not where.exists() or where == path:
-            save_thumbnail(where, light_field, lines)
+def _serve(jobs: Connection) -> None:
+    """Answer jobs until the other end is closed; the program that started this hears Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while True:
+        try:
+            job = jobs.recv()
+        except EOFError:
+            return
+        try:
+            result = measured(job)
+        except EXPECTED_ERRORS as fault:
+            result = {"failed": str(fault), "keep": False}
+        except MemoryError:
+            result = {"failed": "not enough memory", "keep": False}
+        jobs.send(result)
 
 
-def answered(job: dict) -> dict:
-    """Return the figures of a job, or why there are none: these are not kept."""
-    try:
-        return measured(job)
-    except KNOWN as fault:
-        return {"failed": str(fault), "keep": False}
-    except MemoryError:
-        return {"failed": "not enough memory", "keep": False}
+class Worker:
+    """A process that measures jobs; a context, whose end is the process's.
 
+    limit_s: after which a job is given up.
+    """
 
-def main() -> None:
-    """Do the jobs on standard input until it ends."""
-    for line in sys.stdin:
-        print(json.dumps(answered(parse_json(line, "a job", AppError))), flush=True)
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self._started: tuple[multiprocessing.process.BaseProcess, Connection] | None = None
 
+    def __enter__(self) -> Worker:
+        return self
 
-if __name__ == "__main__":
-    main()
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def measure(self, job: Job) -> dict:
+        """Return the figures of a job; `failed` says why there are none.
+
+        A result that may differ the next time has `keep` False.
+        """
+        process, jobs = self._started = self._started or self._start()
+        try:
+            jobs.send(job)
+            if jobs.poll(self.limit_s):
+                return jobs.recv()
+        except (EOFError, ConnectionError):
+            process.join()
+            self._end()
+            ended = f"ended with code {process.exitcode}"
+            return {"failed": f"the measuring process {ended}: too little memory?", "keep": False}
+        self._end()
+        return {"failed": f"not done after {self.limit_s:.0f} s"}
+
+    @staticmethod
+    def _start() -> tuple[multiprocessing.process.BaseProcess, Connection]:
+        context = multiprocessing.get_context("spawn")
+        mine, its = context.Pipe()
+        process = context.Process(target=_serve, args=(its,), daemon=True)
+        process.start()
+        its.close()
+        return process, mine
+
+    def _end(self) -> None:
+        if self._started is not None:
+            process, jobs = self._started
+            self._started = None
+            process.kill()
+            process.join()
+            jobs.close()

@@ -1,4 +1,4 @@
-"""The page of a design: the mask, light against error, what was tried; and the check's page."""
+"""The page of a design: the mask, light against error, what was tried."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.study.design.check import Simulated
+from emmc_rig.study.design.comparison import Simulated
 from emmc_rig.study.design.search import Search, pareto
 
 CAVEATS = (
@@ -43,14 +43,6 @@ def draw_pareto(found: Search, path: Path) -> Path:
     best = found.expected
     axes.plot([100 * best.light], [best.psnr_db], "o", color=INK, markersize=9, fillstyle="none")
     titled(axes, "Light against error: none beats the line in both", "light that passes, %")
-    return save_drawing(figure, path)
-
-
-def draw_check(found: Sequence[Simulated], path: Path) -> Path:
-    """Write expected against simulated PSNR as SVG and PNG; return the SVG's path."""
-    figure, (axes,) = sheet(1, 5.6, 3.8, "simulated, mean over scenes, dB")
-    axes.plot([one.expected_db for one in found], [one.mean_db for one in found], "o", color=ACCENT)
-    titled(axes, "Every camera once", "PSNR expected from Psi alone, dB")
     return save_drawing(figure, path)
 
 
@@ -129,19 +121,3 @@ def simulated_table(found: Sequence[Simulated]) -> Table:
         for one in found
     ]
     return ("Camera", "Theory", "Simulated, mean", *scenes), rows
-
-
-def check_page(
-    about: Sequence[str],
-    found: Sequence[Simulated],
-    ranks: str,
-    picture: Path,
-    provenance: Mapping[str, str],
-) -> str:
-    """Return the page of the check. ranks: the rank correlations, in words."""
-    body = fragment("design_check.html", picture=embedded(picture), rows=simulated_table(found))
-    sections = [Section("check", "Theory beside simulation", body, "Check")]
-    sections.append(provenance_section(provenance))
-    title = "Does theory order masks as simulation does?"
-    head = Head("rank correlation (Spearman)", ranks, ["choose a mask: `emmc-rig design`"])
-    return framed(title, about, CAVEATS, sections, head=head)

@@ -15,17 +15,15 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.progress import Watcher
 from emmc_rig.study.design.bench import DesignBench, bench_text
 from emmc_rig.study.design.candidates import MASK
-from emmc_rig.study.design.check import (
+from emmc_rig.study.design.comparison import (
     SCENES,
     SIZE_PX,
     Simulated,
     buildable,
-    checked_cameras,
-    rank_correlations,
     shipped_like,
     simulated,
 )
-from emmc_rig.study.design.design_page import check_page, design_page, draw_check, draw_pareto
+from emmc_rig.study.design.design_page import design_page, draw_pareto
 from emmc_rig.study.design.mask_file import (
     GDSII,
     PICTURE,
@@ -36,10 +34,11 @@ from emmc_rig.study.design.mask_file import (
     write_picture,
 )
 from emmc_rig.study.design.search import Search, search
-from emmc_rig.study.sweep import check_scene_names, open_folder, provenance
+from emmc_rig.study.points import study_folder
+from emmc_rig.study.rows import check_scene_names, provenance
 
 JOURNAL, PAGE, CAMERA = "simulations.jsonl", "report.html", "camera.yaml"
-COMMAND, CHECK_COMMAND = "design", "design --check"
+COMMAND = "design"
 DESIGNED = "this design"
 GOAL_DB = 1.5
 """Over the best shipped camera, from which a mask of one's own is worth its price."""
@@ -68,42 +67,43 @@ def run_design(
 
     Raises AppError for a folder that holds something else, and what scenes do for wrong input.
     """
-    started, scenes, folder = _begun(scenes, out, COMMAND)
-    found = search(bench, watcher)
-    winner = found.winner.camera(bench)
-    rivals = {
-        name: _at_equal_light(camera, bench)
-        for name, camera in shipped_like(bench).items()
-        if buildable(camera, bench) and len(camera.shots) == bench.shots
-    }
-    cameras = {DESIGNED: winner, **rivals}
-    compared = simulated(bench, cameras, scenes, size or SIZE_PX, seed, folder, watcher)
-    verdict = _verdict(compared)
-    cells = mask_cells(winner, bench)
-    left_out = []
-    with result_folder(folder, COMMAND, adds=True) as new:
-        write_picture(cells, new / PICTURE)
-        if can_write_gdsii():
-            write_gdsii(cells, winner.masks[MASK].cell_um, new / GDSII)
-        else:
-            left_out.append(f'{GDSII} needs gdstk: pip install "emmc-rig[design]", run it again')
-        camera = with_picture(winner).model_dump(mode="json", exclude_defaults=True)
-        (new / CAMERA).write_text(yaml.safe_dump(camera, sort_keys=False), encoding="utf-8")
-        (new / "bench.yaml").write_text(bench_text(bench), encoding="utf-8")
-        picture = draw_pareto(found, new / "light.svg")
-        origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
-        about = [f"{len(found.tried)} masks tried for {bench.shots} shot(s) by theory; {verdict}"]
-        page = design_page(about, found, compared, verdict, picture, folder / CAMERA, origin)
-        (new / PAGE).write_text(page, encoding="utf-8")
-        write_metrics(new, _metrics(bench, found, compared))
-    return Designed(found, tuple(compared), verdict, folder / PAGE, tuple(left_out))
-
-
-def _begun(scenes: Sequence[str], out: Path, command: str) -> tuple[float, Sequence[str], Path]:
-    """Return when it began, the scenes, checked, and the folder."""
-    scenes = tuple(scenes) or SCENES
+    started, scenes = time.monotonic(), tuple(scenes) or SCENES
     check_scene_names(scenes)
-    return time.monotonic(), scenes, open_folder(out, JOURNAL, command)
+    with study_folder(out, JOURNAL, COMMAND) as folder:
+        searched = search(bench, watcher)
+        winner = searched.winner.camera(bench)
+        rivals = {
+            name: _at_equal_light(camera, bench)
+            for name, camera in shipped_like(bench).items()
+            if buildable(camera, bench) and len(camera.shots) == bench.shots
+        }
+        cameras = {DESIGNED: winner, **rivals}
+        compared = simulated(bench, cameras, scenes, size or SIZE_PX, seed, folder, watcher)
+        verdict = _verdict(compared)
+        with result_folder(folder, COMMAND, adds=True) as new:
+            left_out = _write_mask(winner, bench, new)
+            (new / "bench.yaml").write_text(bench_text(bench), encoding="utf-8")
+            picture = draw_pareto(searched, new / "light.svg")
+            origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
+            about = [
+                f"{len(searched.tried)} masks tried for {bench.shots} shot(s) by theory; {verdict}"
+            ]
+            page = design_page(about, searched, compared, verdict, picture, folder / CAMERA, origin)
+            (new / PAGE).write_text(page, encoding="utf-8")
+            write_metrics(new, _metrics(bench, searched, compared))
+    return Designed(searched, tuple(compared), verdict, folder / PAGE, tuple(left_out))
+
+
+def _write_mask(winner: Camera, bench: DesignBench, folder: Path) -> list[str]:
+    """Write the camera and its mask; return a line for what could not be written."""
+    cells = mask_cells(winner, bench)
+    write_picture(cells, folder / PICTURE)
+    camera = with_picture(winner).model_dump(mode="json", exclude_defaults=True)
+    (folder / CAMERA).write_text(yaml.safe_dump(camera, sort_keys=False), encoding="utf-8")
+    if not can_write_gdsii():
+        return [f'{GDSII} needs gdstk: pip install "emmc-rig[design]", run it again']
+    write_gdsii(cells, winner.masks[MASK].cell_um, folder / GDSII)
+    return []
 
 
 def _at_equal_light(camera: Camera, bench: DesignBench) -> Camera:
@@ -138,40 +138,3 @@ def _metrics(
         "simulated": [asdict(one) for one in compared],
         "settings": bench.model_dump(mode="json"),
     }
-
-
-@dataclass(frozen=True)
-class Checked:
-    """Theory beside simulation. ranks: Spearman's correlation by scene, and of the mean."""
-
-    simulated: tuple[Simulated, ...]
-    ranks: Mapping[str, float]
-    page: Path
-
-
-def run_check(
-    bench: DesignBench,
-    scenes: Sequence[str],
-    size: tuple[int, int] | None,
-    seed: int,
-    out: Path,
-    watcher: Watcher,
-) -> Checked:
-    """Compare theory with simulation on many cameras; raises what `run_design` does."""
-    started, scenes, folder = _begun(scenes, out, CHECK_COMMAND)
-    cameras = {
-        name: _at_equal_light(camera, bench)
-        for name, camera in checked_cameras(bench, seed).items()
-    }
-    found = simulated(bench, cameras, scenes, size or SIZE_PX, seed, folder, watcher)
-    ranks = rank_correlations(found)
-    words = ", ".join(f"{name} {rank:+.2f}" for name, rank in ranks.items())
-    with result_folder(folder, CHECK_COMMAND, adds=True) as new:
-        picture = draw_check(found, new / "check.svg")
-        origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
-        about = [f"{len(found)} cameras, {len(scenes)} scenes."]
-        page = check_page(about, found, words, picture, origin)
-        (new / PAGE).write_text(page, encoding="utf-8")
-        rows, settings = [asdict(one) for one in found], bench.model_dump(mode="json")
-        write_metrics(new, {"rank_correlations": ranks, "simulated": rows, "settings": settings})
-    return Checked(tuple(found), ranks, folder / PAGE)

@@ -1,9 +1,9 @@
 """What to expect of a camera before it is built: error, bound of disparity, light; from Psi alone.
 
 The error is that of textures on two surfaces half a sample of disparity apart, averaged over the
-disparities to be seen (see `reconstruction.theory.periodic`). It orders the default method's PSNR:
-rank correlation 0.93 over 13 cameras with the mean of four scenes of group A, 96x96 (`emmc-rig
-design --check`).
+disparities to be seen (see `periodic`). It orders the default method's PSNR: rank
+correlation 0.93 over 13 cameras with the mean of four scenes of group A, 96x96
+(benchmarks/design_check.py).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.geometry import fresnel_number
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.theory.bounds import ziv_zakai
-from reconstruction.theory.periodic import SIDE, Block, SceneTexture
+from emmc_rig.study.design.periodic import SIDE, Block, SceneTexture
+from emmc_rig.study.design.ziv_zakai import ziv_zakai
 
 APART_PX = 0.5
 """Between the two surfaces, samples of disparity."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from emmc_rig.model.camera import Camera, Mask
 from emmc_rig.model.errors import CameraError
-from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.trial import DESIGN, Capture, Fault, Trial, trial_of
 
 

@@ -14,7 +14,7 @@ from calibration.placement import Placement, designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.trial import MASK, Capture, Fault, Trial, trial_of
 from simulators.flaws import OpticsFlaws
 

@@ -9,7 +9,7 @@ import numpy as np
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
-from emmc_rig.study.sweep import NotApplicableError
+from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.trial import SEVERAL, SHOTS, Array, Capture, Fault, Trial, trial_of
 from simulators import changes
 from simulators.raycaster import World

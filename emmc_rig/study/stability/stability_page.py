@@ -15,8 +15,8 @@ from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
 from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows, known_levels
-from emmc_rig.study.stability.fault_sweep import StabilitySweep
 from emmc_rig.study.stability.faults import Point
+from emmc_rig.study.stability.stability_study import StabilityStudy
 
 DASHED = (0, (3, 2))
 PANEL_INCHES = (3.9, 2.75)
@@ -150,13 +150,13 @@ CAVEATS = (
 def stability_page(
     about: Sequence[str],
     sections: Sequence[Section],
-    sweep: StabilitySweep,
+    study: StabilityStudy,
     curves: Sequence[Curve],
 ) -> str:
     """Return the page. about: sentences under the title. curves: whose points show pictures."""
     return framed(
         "Where methods fail", about, CAVEATS, sections, ["chart.css", "stability.css"],
-        ["chart.js"], marks_data(_marks(sweep, curves)), head=_head(curves),
+        ["chart.js"], marks_data(_marks(study, curves)), head=_head(curves),
     )  # fmt: skip
 
 
@@ -195,22 +195,22 @@ def curves_section(scene: str, kind: str, curves: Sequence[Curve], svg: Path) ->
     return Section(key, f"{kind}, {scene}", body)
 
 
-def _marks(sweep: StabilitySweep, curves: Iterable[Curve]) -> dict[str, ShownMark]:
+def _marks(study: StabilityStudy, curves: Iterable[Curve]) -> dict[str, ShownMark]:
     marks = {}
     for curve in curves:
         measured = zip(curve.strengths, curve.levels, curve.points, strict=True)
         for index, (strength, level, points) in enumerate(measured):
             if level is not None:
                 label = f"{curve.fault.title}, {shown(strength)} {curve.fault.unit}"
-                pairs = [_pair(sweep, point) for point in points]
+                pairs = [_pair(study, point) for point in points]
                 words = f"{curve.label}: {level:.2f} dB"
                 marks[curve.mark_name(index)] = ShownMark(label, words, pairs)
     return marks
 
 
-def _pair(sweep: StabilitySweep, point: Point) -> ShownPair:
-    result = sweep.results[point]
+def _pair(study: StabilityStudy, point: Point) -> ShownPair:
+    result = study.results[point]
     words = f"{point.scene_name}: {number(result['psnr_db'], '.2f')} dB"
     if result["view_db"] is not None:
         words += f", copied centre view {result['view_db']:.2f} dB"
-    return ShownPair(words, sweep.picture(point), sweep.truth_picture(point))
+    return ShownPair(words, study.picture(point), study.truth_picture(point))

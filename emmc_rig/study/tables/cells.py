@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -108,17 +108,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Part:
-    """A table or figure. scenes: which of those given; "shown" means one of them only.
-
-    pictured: the methods whose pictures it shows, of its first scene.
-    """
+    """A table, or a figure that compares. scenes: of those given; "shown": one of them only."""
 
     name: str
     title: str
     scenes: Literal["synthetic", "other", "shown synthetic", "shown other"]
     captures: tuple[Capture, ...]
     methods: tuple[str, ...] = METHODS
-    pictured: tuple[str, ...] = ()
 
 
 _SCENARIOS_OF_TABLE_2 = (Capture("i", 3), Capture("ii", 1), Capture("iii", 3))
@@ -153,57 +149,17 @@ PARTS = {
             ),
         ),
         Part(
-            "figure5",
-            "Figure 5: what the sensor records in the same total time",
-            "shown synthetic",
-            _NOISY,
-            (),
-        ),
-        Part(
             "figure6",
-            "Figure 6: reconstructions of the three scenarios by TV-Dict",
+            "Figure 6: a colour filter array, and demosaiced first",
             "shown synthetic",
-            (
-                *_SCENARIOS_OF_TABLE_2,
-                Capture("ii", 1, demosaiced=True),
-                *_NOISY,
-                Capture("ii", 1, noisy=True, demosaiced=True),
-            ),
+            (Capture("ii", 1), Capture("ii", 1, demosaiced=True)),
             ("tv-dict",),
-            pictured=("tv-dict",),
-        ),
-        Part(
-            "figure7",
-            "Figure 7: epipolar images, CFA sensor, one shot",
-            "shown synthetic",
-            (Capture("ii", 1),),
-            pictured=METHODS,
         ),
         Part(
             "figure8",
             "Figure 8: mask patterns before a CFA sensor, with noise",
             "synthetic",
             tuple(Capture("ii", 1, noisy=True, mask=mask) for mask in MASKS),
-            pictured=("dict-admm",),
-        ),
-        Part(
-            "figure9",
-            "Figure 9: methods and scenarios side by side",
-            "shown other",
-            (Capture("i", 3), Capture("ii", 1), Capture("iii", 1), Capture("iii", 2)),
-            pictured=METHODS,
-        ),
-        Part(
-            "figure10",
-            "Figure 10: super-resolution, r = 1/4, by TV-Dict",
-            "shown other",
-            (
-                *(Capture("i", shots, 2) for shots in (3, 12)),
-                *(Capture("ii", shots, 2) for shots in (1, 4)),
-                *(Capture("iii", shots, 2) for shots in (1, 4)),
-            ),
-            ("tv-dict",),
-            pictured=("tv-dict",),
         ),
     )
 }
@@ -251,8 +207,3 @@ def cells_of(part: Part, scenes: Sequence[str]) -> list[Cell]:
         for capture in part.captures
         for method in part.methods
     ]
-
-
-def distinct(cells: Iterable[Cell]) -> list[Cell]:
-    """Return every cell once, in order."""
-    return list(dict.fromkeys(cells))

@@ -1,4 +1,4 @@
-"""Tables II, III, IV and Figure 8 as grids of ours beside the paper's, for screen and page."""
+"""Tables II, III, IV, Figures 6 and 8 as grids: ours beside the paper's, for screen and page."""
 
 from __future__ import annotations
 
@@ -59,9 +59,8 @@ class Grid:
 
 
 def grids(parts: Sequence[Part], results: Results, scenes: Sequence[str]) -> list[Grid]:
-    """Return the grids of the parts that are tables; cells that were not measured stay empty."""
-    tables = ("table2", "table3", "table4", "figure8")
-    return [_grid(part, results, scenes) for part in parts if part.name in tables]
+    """Return the grids of the parts; cells that were not measured stay empty."""
+    return [_grid(part, results, scenes) for part in parts]
 
 
 def pair_of(results: Results, cell: Cell) -> Pair:
@@ -143,8 +142,10 @@ def _rows(part: Part) -> tuple[tuple[str, ...], tuple[str, ...], list[Rows]]:
             for one, title in SCENARIOS.items()
         ]
         return ("sensor",), ("1 (RGB 3)", "2 (RGB 6)", "3 (RGB 9)", "4 (RGB 12)"), [rows]
-    columns = _names(every) if part.name == "table3" else [MASK_TITLES[c.mask] for c in every]
-    return (), tuple(columns), [[((), every, part.methods)]]
+    columns = _names(every)
+    if part.name == "figure8":
+        columns = tuple(MASK_TITLES[c.mask] for c in every)
+    return (), columns, [[((), every, part.methods)]]
 
 
 def _grid(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
@@ -155,10 +156,14 @@ def _grid(part: Part, results: Results, scenes: Sequence[str]) -> Grid:
     lines: list[Line] = []
     for rows in blocks:
         lines += _lines(results, shown, rows)
-        if part.name != "figure8" and not same:
+        if part.name.startswith("table") and not same:
             lines += _papers_means(part, rows)
     return Grid(part.name, part.title, ("scene", *heads, "method"), columns, tuple(lines))
 
 
 def _names(captures: Sequence[Capture]) -> tuple[str, ...]:
-    return tuple(f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}" for c in captures)
+    return tuple(
+        f"({c.scenario}) {SCENARIOS[c.scenario]} × {c.shots}"
+        + (", demosaiced first" if c.demosaiced else "")
+        for c in captures
+    )

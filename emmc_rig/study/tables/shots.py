@@ -7,12 +7,13 @@ The frames are made with the Psi that reconstructs them, as the paper does: an i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.tables.cells import Capture
@@ -75,38 +76,27 @@ class Shots:
     sensor_psnr_db: float
 
 
-class Sensors:
-    """Takes shots; keeps the last Psi, as the methods and noise levels of a capture share it."""
+@lru_cache(maxsize=1)
+def _psi(camera_json: str, size: tuple[int, int]) -> ImagingMatrix:
+    return build_imaging_matrix(Camera.model_validate_json(camera_json), size)
 
-    def __init__(self, seed: int) -> None:
-        self._seed = seed
-        self._last: tuple[object, ImagingMatrix] | None = None
 
-    def psi(self, capture: Capture, size: tuple[int, int]) -> ImagingMatrix:
-        """Return Psi of a capture for a light field of `size` (rows, columns)."""
-        camera = capture.camera()
-        key = camera.model_dump_json(), size
-        if self._last is None or self._last[0] != key:
-            self._last = None
-            self._last = key, build_imaging_matrix(camera, size)
-        return self._last[1]
+def shots_of(capture: Capture, light_field: Array, scene: str, seed: int) -> Shots:
+    """Return the shots of a light field (v, u, y, x, c).
 
-    def take(self, capture: Capture, light_field: Array, scene: str) -> Shots:
-        """Return the shots of a light field (v, u, y, x, c).
-
-        The noise depends on the seed and the scene's name only, not on what was taken before.
-        """
-        size = light_field.shape[2], light_field.shape[3]
-        psi = self.psi(capture, size)
-        clean = psi.forward(light_field)
-        frames, usable, sigma = clean, np.ones(clean.shape, dtype=bool), 0.0
-        if capture.noisy:
-            rng = np.random.default_rng([self._seed, *scene.encode()])
-            found = capture.camera().read_out(clean, rng)
-            frames, usable, sigma = found.readings, found.usable, found.noise_sigma
-        quality = psnr_db(frames, clean)
-        if capture.demosaiced:
-            frames = demosaiced_rggb(frames[0])
-            usable = np.repeat(usable, 3, axis=0)
-            psi = self.psi(capture.solved_as(), size)
-        return Shots(psi, frames.astype(np.float32), usable, sigma, quality)
+    The noise depends on the seed and the scene's name only, not on what was taken before.
+    """
+    size = light_field.shape[2], light_field.shape[3]
+    camera = capture.camera()
+    psi = _psi(camera.model_dump_json(), size)
+    clean = psi.forward(light_field)
+    frames, usable, sigma = clean, np.ones(clean.shape, dtype=bool), 0.0
+    if capture.noisy:
+        read = camera.read_out(clean, np.random.default_rng([seed, *scene.encode()]))
+        frames, usable, sigma = read.readings, read.usable, read.noise_sigma
+    quality = psnr_db(frames, clean)
+    if capture.demosaiced:
+        frames = demosaiced_rggb(frames[0])
+        usable = np.repeat(usable, 3, axis=0)
+        psi = _psi(capture.solved_as().camera().model_dump_json(), size)
+    return Shots(psi, frames.astype(np.float32), usable, sigma, quality)

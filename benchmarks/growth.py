@@ -1,0 +1,90 @@
+"""Seconds and memory grow with the size of the problem as the operations counted say.
+
+Pixels, views, shots, the range of disparities: one is varied, all else equal. The exponent is the
+slope of the logarithms. The largest sizes take minutes: `--largest 512x640`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import lab
+import numpy as np
+from matplotlib import pyplot as plt
+
+from emmc_rig.study.chart.chart_points import Configuration, Point
+from emmc_rig.study.chart.measure import Job, Worker
+from emmc_rig.study.trial import Capture
+from reconstruction.methods import MethodSettings
+
+METHODS = {
+    "adaptive": {},
+    "adaptive-fast": {},
+    "tv": {"tv": {"max_steps": 30, "rtol": 1e-12}},
+    "dict-omp": {"sparse": {"solver": {"atoms": 10, "tolerance_factor": 0}}},
+}
+"""With settings whose work does not depend on how soon they converge, where there are such."""
+
+
+def measure(
+    scene: str, camera: str, seed: int, method: str, axis: str, size: tuple[int, int], views: int,
+    shots: int, zoom: int,
+) -> dict:  # fmt: skip
+    """Return CPU seconds and peak memory, measured in a process of its own."""
+    capture = Capture(scene, camera, size, seed, zoom, shots, (views, views))
+    settings = MethodSettings.model_validate(METHODS[method])
+    point = Point(capture, Configuration(method, axis, settings))
+    with TemporaryDirectory() as folder, Worker(limit_s=3600) as worker:
+        pictures = Path(folder, "picture.webp"), Path(folder, "truth.webp")
+        result = worker.measure(Job(point, *pictures, None, repeats=3, enough_s=20))
+    return {name: result[name] for name in ("seconds", "cpu_seconds", "peak_mib")}
+
+
+def main() -> None:
+    """Measure every axis by every method."""
+    parser = lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="64x80")
+    parser.add_argument("--largest", default="128x160", help="rows x columns")
+    args = lab.parsed(parser)
+    largest = 24 if args.smallest else int(args.largest.split("x")[0])
+    rows_px, columns_px = args.size
+    base = {"size": args.size, "views": 5, "shots": 1, "zoom": 1}
+    varied = {
+        "pixels": [
+            {"size": (rows_px * k, columns_px * k)} for k in (1, 2, 4, 8) if rows_px * k <= largest
+        ],
+        "views": [{"views": n} for n in (3, 5, 7)],
+        "shots": [{"shots": n} for n in (1, 2, 3)],
+        "disparity range": [{"zoom": n} for n in (1, 2, 4)],
+    }
+    if args.smallest:
+        varied = {"views": varied["views"][:2]}
+    points = [
+        {
+            "scene": args.scenes[0], "camera": args.camera, "seed": args.seed, "method": method,
+            "axis": axis, **base, **change,
+        }
+        for method in (["tv"] if args.smallest else METHODS)
+        for axis, changes in varied.items()
+        for change in changes
+    ]  # fmt: skip
+    rows = lab.measured(points, measure, "growth", args)
+    _, panels = plt.subplots(1, len(varied), figsize=(4 * len(varied), 3.2), squeeze=False)
+    exponents = []
+    for (axis, changes), panel in zip(varied.items(), panels[0], strict=True):
+        at = [
+            float(np.prod(next(iter(change.values())))) ** (1 + (axis == "views"))
+            for change in changes
+        ]
+        for method, some in rows[rows.axis == axis].groupby("method"):
+            panel.loglog(at, some.cpu_seconds, "-o", label=method)
+            slope = np.polyfit(np.log(at), np.log(some.cpu_seconds), 1)[0]
+            exponents.append((axis, method, slope, some.peak_mib.max()))
+        panel.set(xlabel=axis, ylabel="CPU s")
+    panels[0][0].legend()
+    columns = ["axis", "method", "exponent", "peak MiB"]
+    lab.finished(lab.pd.DataFrame(exponents, columns=columns), panels[0][0], "growth", args)
+
+
+if __name__ == "__main__":
+    main()

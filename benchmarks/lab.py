@@ -1,0 +1,113 @@
+"""What the scripts of the lab share: their arguments, rows kept in a CSV, one picture."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import joblib
+import matplotlib
+import pandas as pd
+
+from emmc_rig.study.trial import Capture
+
+matplotlib.use("Agg")
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
+GROUP_A = ("dragons", "dice", "fish", "buttercup", "occlusions", "begonia", "antinous")
+GROUP_B = ("messerschmitt", "bikes", "isochart", "general11", "lytro1", "lytro2")
+"""Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
+SMALLEST = (24, 32)
+
+
+def arguments(
+    sentence: str | None,
+    scenes: Sequence[str] = ("deep-occlusions",),
+    camera: str = "scenario-ii-cfa",
+    size: str = "64x80",
+) -> argparse.ArgumentParser:
+    """Return a parser of what most scripts take; the defaults are a script's own."""
+    parser = argparse.ArgumentParser(description=sentence)
+    parser.add_argument("--scene", action="append", help=f"may repeat; default: {scenes}")
+    parser.add_argument("--group", choices="AB", help="of the real light fields, instead of scenes")
+    parser.add_argument("--camera", default=camera)
+    parser.add_argument("--size", default=size, help="rows x columns of each scene's middle")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smallest", action="store_true", help="to see that it runs: seconds")
+    parser.set_defaults(scenes=scenes)
+    return parser
+
+
+def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
+    """Return the arguments, `size` as rows and columns, `scenes` as chosen."""
+    args = parser.parse_args(given)
+    args.size = tuple(int(side) for side in args.size.lower().split("x"))
+    if args.group:
+        folder = Path(os.environ["EMMC_LIGHTFIELDS"])
+        args.scenes = [str(folder / name) for name in (GROUP_A if args.group == "A" else GROUP_B)]
+    args.scenes = tuple(args.scene or args.scenes)
+    if args.smallest:
+        args.size, args.scenes = SMALLEST, args.scenes[:1]
+    args.out.mkdir(parents=True, exist_ok=True)
+    return args
+
+
+def captures(args, **changed: object) -> list[Capture]:
+    """Return each scene through the camera."""
+    return [
+        Capture(scene, args.camera, args.size, args.seed, **changed)  # pyright: ignore
+        for scene in args.scenes
+    ]
+
+
+def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, args) -> pd.DataFrame:
+    """Return a row for each point: the point's values and what `measure(**point)` returns.
+
+    Rows are kept in NAME.csv as they are done; those that it holds are not measured again. Delete
+    the file after a change of the program.
+    """
+    points = list(points)
+    path = args.out / f"{name}.csv"
+    kept = pd.read_csv(path, dtype=str) if path.is_file() else pd.DataFrame()
+    keys = list(points[0])
+    known: set[tuple[str, ...]] = set()
+    if set(keys) <= set(kept.columns):
+        known = set(kept[keys].fillna("").itertuples(index=False, name=None))
+    missing = [point for point in points if tuple(map(_text, point.values())) not in known]
+    rows = joblib.Parallel(n_jobs=args.jobs, return_as="generator")(
+        joblib.delayed(_row)(measure, point) for point in missing
+    )
+    for done, row in enumerate(rows, 1):
+        kept = pd.concat([kept, pd.DataFrame([{k: _text(v) for k, v in row.items()}])])
+        kept.to_csv(path, index=False)
+        print(f"{done}/{len(missing)}", row, file=sys.stderr)
+    wanted = {tuple(map(_text, point.values())) for point in points}
+    chosen = kept[[key in wanted for key in kept[keys].fillna("").itertuples(False, None)]]
+    return chosen.reset_index(drop=True).apply(_numbers)
+
+
+def _row(measure: Callable[..., dict], point: dict) -> dict:
+    return {**point, **measure(**point)}
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "" if value is None else Path(value).name if str(value).startswith("/") else str(value)
+
+
+def _numbers(column: pd.Series) -> pd.Series:
+    numbers = pd.to_numeric(column, errors="coerce")
+    return numbers if numbers.notna().sum() == column.replace("", None).notna().sum() else column
+
+
+def finished(rows: pd.DataFrame, axes, name: str, args) -> None:
+    """Print the rows, and save the picture that `axes` belong to as NAME.svg."""
+    print(rows.to_string(index=False, float_format="%.3g"))
+    axes.figure.tight_layout()
+    axes.figure.savefig(args.out / f"{name}.svg")
+    print(args.out / f"{name}.csv", args.out / f"{name}.svg")

@@ -1,0 +1,94 @@
+"""Verdicts flag what a fault broke and pass what is good: rates over faults of capture and Psi.
+
+A result is broken when it lost more than 3 dB against the same capture without the fault, good when
+it lost 1 dB at most. It is poor when it had little to lose: without the fault it was within 5 dB of
+a picture of one even colour, or another method of those measured was 2 dB better.
+"""
+
+from __future__ import annotations
+
+import lab
+import numpy as np
+from matplotlib import pyplot as plt
+
+from emmc_rig.model.errors import ModelError
+from emmc_rig.study.points import NotApplicableError
+from emmc_rig.study.stability.faults import FAULTS, Point
+from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Capture
+from reconstruction.errors import ReconstructionError
+from reconstruction.verdict.run import reconstruct_judged
+
+BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
+
+
+def measure(
+    scene: str, camera: str, size: tuple[int, int], seed: int, method: str, fault: str,
+    strength: float,
+) -> dict:  # fmt: skip
+    """Return PSNR and verdict of a method under a fault; empty where it does not apply."""
+    zoom = 3 if Capture(scene, camera).is_built_in else 1
+    point = Point(Capture(scene, camera, size, seed, zoom), fault, strength, method)
+    try:
+        given = point.trial()
+        result, verdict = reconstruct_judged(
+            method, given.psi, given.readings, given.noise_sigma, given.dictionary(method), None,
+            given.usable,
+        )  # fmt: skip
+    except (NotApplicableError, ReconstructionError, ModelError) as why:
+        return {"psnr_db": None, "even_db": None, "level": "", "reasons": str(why)}
+    return {
+        "psnr_db": given.psnr_db(result.light_field),
+        "even_db": given.psnr_db(given.even),
+        "level": verdict.level,
+        "reasons": "; ".join(reason.what for reason in verdict.reasons),
+    }
+
+
+def kinds(rows):
+    """Return the rows with what each is, whatever its verdict, and whether it was flagged."""
+    rows = rows.dropna(subset="psnr_db").copy()
+    one_trial = ["scene", "camera", "fault", "seed"]
+    harmless = {fault.name: f"{fault.quick[0]:g}" for fault in FAULTS.values()}
+    first = rows.strength.map("{:g}".format) == rows.fault.map(harmless)
+    clean = rows[first].set_index([*one_trial, "method"])[["psnr_db", "even_db"]]
+    best = rows[first].groupby(one_trial).psnr_db.max().rename("best_db")
+    rows = rows.join(clean, on=[*one_trial, "method"], rsuffix="_clean").join(best, on=one_trial)
+    lost = rows.psnr_db_clean - rows.psnr_db
+    few = rows.psnr_db_clean < np.maximum(rows.best_db - POOR_DB, rows.even_db_clean + EVEN_DB)
+    rows["kind"] = np.select(
+        [lost > BROKEN_DB, few, lost <= GOOD_DB], ["broken", "poor", "good"], "between"
+    )
+    rows["flagged"] = rows.level.isin(["doubt", "do not use"])
+    return rows
+
+
+def main() -> None:
+    """Measure every fault of capture and Psi on every scene, by every method."""
+    args = lab.parsed(
+        lab.arguments(__doc__, ("near-planar", "deep-occlusions"), "rgbw-bayer-3shots")
+    )
+    shots = len(Capture(args.scenes[0], args.camera).described.shots)
+    faults = [f for f in FAULTS.values() if f.kind in (SENSOR, MASK, SHOTS) and f.shots <= shots]
+    points = [
+        {
+            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
+            "method": method, "fault": fault.name, "strength": float(strength),
+        }
+        for scene in args.scenes
+        for fault in (faults[:1] if args.smallest else faults)
+        for strength in fault.quick
+        for method in (["tv"] if args.smallest else ["tv", "adaptive-fast"])
+    ]  # fmt: skip
+    rows = kinds(lab.measured(points, measure, "verdicts", args))
+    summary = rows.groupby("kind").flagged.agg(["sum", "count"])
+    _, axes = plt.subplots()
+    (100 * summary["sum"] / summary["count"]).plot.bar(ax=axes, ylabel="flagged, %")
+    lab.finished(summary.reset_index(), axes, "verdicts", args)
+    wrong = rows[
+        ((rows.kind == "broken") & (rows.level == "trust")) | ((rows.kind == "good") & rows.flagged)
+    ]
+    print(wrong[["scene", "method", "fault", "strength", "kind", "level", "reasons"]].to_string())
+
+
+if __name__ == "__main__":
+    main()

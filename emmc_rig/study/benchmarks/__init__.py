@@ -1,1 +1,0 @@
-"""Speed, as ratios to a bound or to a library measured in the same run; commands show them."""

@@ -1,0 +1,155 @@
+"""The points of a chart: captures, and methods with their settings.
+
+Nothing is computed here. The methods are those of `reconstruction.methods.METHODS`, whatever they
+are; VARIATIONS adds settings for those it knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import Field
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.errors import nearest_of
+from emmc_rig.model.settings import Settings
+from emmc_rig.study.trial import Capture
+from reconstruction.methods import METHODS, MethodSettings, installed_methods
+from simulators.scenes import SCENES
+
+FAST_SCENES = ("near-planar", "deep-occlusions", "wide-disparity")
+FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
+CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-2shots", "rgbw-bayer-3shots", "rgbw-mono")
+FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0, "limit_s": 300.0}
+DEFAULT = "default"
+_QUICK_PATCHES = {"stride": 9, "solver": {"rtol": 1e-2, "max_steps": 200}}
+VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "tv": {
+        "15 steps": {"tv": {"max_steps": 15}},
+        "40 steps": {"tv": {"max_steps": 40}},
+        DEFAULT: {},
+        "best": {"tv": {"rtol": 1e-5, "max_steps": 1500}},
+    },
+    "dict-omp": {
+        "5 atoms, stride 9": {"sparse": {"stride": 9, "solver": {"atoms": 5}}},
+        DEFAULT: {},
+        "40 atoms": {"sparse": {"solver": {"atoms": 40}}},
+        "stride 3": {"sparse": {"stride": 3}},
+    },
+    "dict-admm": {
+        "fast": {"sparse": _QUICK_PATCHES},
+        DEFAULT: {},
+        "best": {"sparse": {"stride": 3, "solver": {"rtol": 1e-4}}},
+    },
+    "tv-dict": {
+        "fast": {"sparse": _QUICK_PATCHES, "tv": {"max_steps": 40}},
+        DEFAULT: {},
+        "best": {"sparse": {"stride": 3}, "tv": {"rtol": 1e-4, "max_steps": 1500}},
+    },
+}
+SLOW_METHODS = ("dict-lars", "dict-ista", "dict-fista", "dict-sl0")
+BESIDE_FRONT = ("best", "fast", "5 atoms, stride 9", "40 atoms", "stride 3")
+"""Levels that take long, or that the front over all scenes does without: --fast has none."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A method with settings; `level` names one of a method's settings."""
+
+    method: str
+    level: str = DEFAULT
+    settings: MethodSettings = field(default_factory=MethodSettings)
+
+    @property
+    def label(self) -> str:
+        """In words, such as "tv, 15 steps"."""
+        return self.method if self.level == DEFAULT else f"{self.method}, {self.level}"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement."""
+
+    capture: Capture
+    configuration: Configuration
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        capture = self.capture
+        return f"{capture.scene_name}, {capture.camera_name}, {self.configuration.label}"
+
+
+class ChartSettings(Settings):
+    """How a chart measures.
+
+    zoom: built-in scenes are rendered so many times larger than `size`, and cut. repeats: at most;
+    they end early when `enough_s` are spent.
+    """
+
+    scenes: tuple[str, ...]
+    cameras: tuple[str, ...]
+    size: tuple[int, int] | None = None
+    zoom: int = Field(default=1, ge=1)
+    fast: bool = False
+    methods: tuple[str, ...] = ()
+    dictionary: str | None = None
+    repeats: int = Field(default=5, ge=1)
+    enough_s: float = Field(default=120.0, gt=0)
+    limit_s: float = Field(default=3600.0, gt=0, description="after which a point is given up")
+    seed: int = Field(default=0, ge=0)
+
+
+def chart_settings(
+    fast: bool,
+    scenes: Sequence[str],
+    cameras: Sequence[str],
+    size: tuple[int, int] | None,
+    repeats: int | None,
+    **others: object,
+) -> ChartSettings:
+    """Return the settings of a chart; defaults are those of --fast or of the full chart."""
+    given = {"size": size, "repeats": repeats}
+    chosen = {
+        "fast": fast,
+        "scenes": tuple(scenes) or (FAST_SCENES if fast else tuple(SCENES)),
+        "cameras": tuple(cameras) or (FAST_CAMERAS if fast else CAMERAS),
+        **(FAST if fast else {}),
+        **{key: value for key, value in given.items() if value is not None},
+        **others,
+    }
+    return ChartSettings.model_validate(chosen)
+
+
+def check_methods(names: Sequence[str]) -> None:
+    """Raise AppError naming the nearest for a method that is not known."""
+    for name in names:
+        if name not in METHODS:
+            raise AppError(f"--method {name}: {nearest_of(name, METHODS)}")
+
+
+def configurations(settings: ChartSettings) -> list[Configuration]:
+    """Return the methods with their settings, quick ones first."""
+    check_methods(settings.methods)
+    chosen = settings.methods or [
+        method for method in installed_methods() if not (settings.fast and method in SLOW_METHODS)
+    ]
+    return [
+        Configuration(method, level, MethodSettings.model_validate(changed))
+        for method in METHODS
+        if method in chosen
+        for level, changed in VARIATIONS.get(method, {DEFAULT: {}}).items()
+        if not (settings.fast and level in BESIDE_FRONT)
+    ]
+
+
+def charted_points(settings: ChartSettings) -> list[Point]:
+    """Return the points of speed against accuracy."""
+    return [
+        Point(Capture(scene, camera, settings.size, settings.seed, settings.zoom), configuration)
+        for scene in settings.scenes
+        for camera in settings.cameras
+        for configuration in configurations(settings)
+    ]

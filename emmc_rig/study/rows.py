@@ -1,0 +1,118 @@
+"""Points and results as plain data: digests, rows of CSV files, where figures came from."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from pydantic_core import to_jsonable_python
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.results import command_line, metrics_text, versions
+from emmc_rig.model.json_text import parse_json
+from emmc_rig.model.settings import Settings
+
+
+def digest_of(inputs: Mapping[str, object]) -> str:
+    """Return a digest of plain data, the same for equal content in any order of keys."""
+    text = json.dumps(inputs, sort_keys=True, allow_nan=False)
+    return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
+
+
+def plain(result: Mapping[str, object]) -> dict:
+    """Return a result as read back from JSON: None for what is not finite, lists for tuples."""
+    return parse_json(metrics_text(result), "a result", AppError)
+
+
+def described(point: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as plain data; of its capture what identifies it."""
+    values = {each.name: getattr(point, each.name) for each in fields(point)}
+    if "capture" in values:
+        values["capture"] = values["capture"].identity()
+    return to_jsonable_python(values)
+
+
+def csv_text(
+    rows: Sequence[Mapping[str, object]],
+    columns: Sequence[str] = (),
+    form: str = ".6g",
+    forms: Mapping[str, str] | None = None,
+) -> str:
+    """Return rows as CSV: the columns named, or all that any row has; None is an empty field.
+
+    form: of floats, but for the columns that `forms` has.
+    """
+
+    def written(name: str, value: object) -> object:
+        return format(value, (forms or {}).get(name, form)) if isinstance(value, float) else value
+
+    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n", restval="", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows({name: written(name, value) for name, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def provenance(settings: Settings, seconds: float, **more: str) -> dict[str, str]:
+    """Return what a page says of where it came from; more: rows after the seconds."""
+    return {
+        "Command line": command_line(),
+        "Seconds of this run": f"{seconds:.0f}",
+        **more,
+        "Settings": settings.model_dump_json(),
+        **{f"Version of {name}": version for name, version in versions().items()},
+    }
+
+
+def check_scene_names(specs: Sequence[str], option: str = "--scene") -> None:
+    """Raise AppError when two scenes (or cameras, by `option`) have one name."""
+    names = [Path(spec).stem for spec in specs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise AppError(f"{option}: two are called '{twice}'; name each once, or rename one")
+
+
+SMALLEST_PX = 16
+
+
+def check_size(size: tuple[int, int] | None) -> None:
+    """Raise AppError for a picture too small to be judged."""
+    if size is not None and min(size) < SMALLEST_PX:
+        raise AppError(f"--size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
+
+
+def available_cores() -> int:
+    """Return the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def machine() -> str:
+    """Return the processor's name and the number of cores."""
+    name = platform.processor() or platform.machine()
+    try:
+        cpu = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
+    except OSError:
+        cpu = ""
+    if found := re.search(r"^model name\s*:\s*(.+)$", cpu, re.MULTILINE):
+        name = found[1].strip()
+    return f"{name}, {available_cores()} cores"
+
+
+def dictionary_identity(dictionary: str | None) -> str:
+    """Return what identifies a dictionary: its name, and of a file its size and time."""
+    if dictionary is None or not Path(dictionary).is_file():
+        return dictionary or "lambertian"
+    seen = Path(dictionary).stat()
+    return f"{dictionary} {seen.st_size} {seen.st_mtime_ns}"

@@ -1,1 +1,0 @@
-"""What Psi allows before anything is reconstructed: errors to be expected, bounds, conditioning."""
