@@ -27,7 +27,6 @@ from emmc_rig.pages.frame_view import (
     preview,
     white_balance,
 )
-from emmc_rig.study.benchmarks.devices import picture_timing
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction
 from simulators.usb import SimulatedUsb
@@ -174,14 +173,6 @@ def test_a_name_from_the_camera_never_leaves_the_folder(tmp_path):
     frame = type(frame)(**{**frame.__dict__, "metadata": {"name": "../../etc/passwd.nef/x"}})
     assert save_frame(tmp_path / ".", frame) == tmp_path / "frame-0001.dng"
     assert len(files(tmp_path)) == 3
-
-
-def test_the_benchmark_times_a_download_against_rawpy():
-    timing = picture_timing((1000, 1500), repeats=2)
-    assert timing.megabytes == pytest.approx(3.0, rel=0.01)
-    assert min(timing.as_dict().values()) > 0
-    # The mosaic lies in the picture's bytes: a second picture would be a copy too many.
-    assert timing.peak_pictures < 1.8
 
 
 def test_half_the_light_is_half_way_to_white():

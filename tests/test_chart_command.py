@@ -5,6 +5,7 @@ import json
 import os
 import re
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -16,15 +17,14 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
-from emmc_rig.study.chart import chart_sweep, measure, points
-from emmc_rig.study.chart.captures import kept_capture
-from emmc_rig.study.chart.chart_sweep import ChartSweep, timing_lock, working
+from emmc_rig.study.chart import chart_points, chart_study
+from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
+from emmc_rig.study.chart.chart_study import ChartStudy
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
-from emmc_rig.study.chart.measure import Reference, measured
-from emmc_rig.study.chart.peers import Peer
-from emmc_rig.study.chart.points import chart_settings
-from emmc_rig.study.sweep import SweepStopped, digest_of
+from emmc_rig.study.chart.measure import Job, Worker, measured
+from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.trial import Capture
+from reconstruction.methods import MethodSettings
 from simulators.scenes import render
 
 SIZE = (24, 32)
@@ -41,22 +41,15 @@ def at_once(measure):
     return working
 
 
-@pytest.fixture(autouse=True)
-def lock_of_its_own(monkeypatch, tmp_path):
-    """Nothing is timed here, so that a chart on this machine need not be waited for."""
-    monkeypatch.setattr(chart_sweep, "lock_path", lambda: tmp_path / "lock")
-
-
 @pytest.fixture
 def quick(monkeypatch):
-    """Few settings of total variation alone, measured in this process, by a known yardstick."""
-    monkeypatch.setattr(measure, "reference", lambda: Reference(0.01, 0.01))
-    monkeypatch.setattr(points, "VARIATIONS", LEVELS)
-    monkeypatch.setattr(chart_sweep, "working", at_once(measured))
+    """Few settings of total variation alone, measured in this process."""
+    monkeypatch.setattr(chart_points, "VARIATIONS", LEVELS)
+    monkeypatch.setattr(chart_study, "Worker", at_once(measured))
 
 
 def settings(**more):
-    chosen = {"methods": ("tv",), "scaling": False, **more}
+    chosen = {"methods": ("tv",), **more}
     scenes, cameras = chosen.pop("scenes", ["dark"]), ["rgbw-bayer-1shot"]
     return chart_settings(True, scenes, cameras, SIZE, 1, **chosen)
 
@@ -121,118 +114,70 @@ def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
             raise KeyboardInterrupt
         return measured(job)
 
-    monkeypatch.setattr(chart_sweep, "working", at_once(stopping))
-    with pytest.raises(SweepStopped, match="1 of 2 points are kept"):
+    monkeypatch.setattr(chart_study, "Worker", at_once(stopping))
+    with pytest.raises(StudyStopped, match="1 of 2 points are kept"):
         run_chart(settings(), tmp_path / "out", Silent())
     run_chart(settings(), tmp_path / "out", Silent())
     assert len(calls) == 3
-    kept = (tmp_path / "out" / ChartSweep.journal).read_text()
+    kept = (tmp_path / "out" / ChartStudy.journal).read_text()
     run_chart(settings(), tmp_path / "out", Silent())
     assert len(calls) == 3
-    assert (tmp_path / "out" / ChartSweep.journal).read_text() == kept
-
-
-def test_growth_is_charted(quick, monkeypatch, tmp_path):
-    capture = Capture("dark", "rgbw-bayer-1shot", SIZE)
-    first = []
-
-    def as_quick_as_small(run, point, path, picture, watcher):
-        if not first:
-            job = {
-                "capture": path, "settings": {"tv": {"max_steps": 2}}, "method": "tv",
-                "needs_dictionary": False, "repeats": 1, "enough_s": 1, "picture": picture,
-            }  # fmt: skip
-            first.append((measured(job), picture))
-        figures, shown = first[0]
-        picture.write_bytes(shown.read_bytes())
-        size = point.capture.size
-        seconds = 1e-4 * size[0] * size[1]
-        return {**figures, "cpu_seconds": seconds, "size": list(size)}
-
-    monkeypatch.setattr(ChartSweep, "_measured", as_quick_as_small)
-
-    def always_the_same(asked, folder):
-        path, _ = kept_capture(capture, folder)
-        return path, digest_of({"asked": repr(asked)})
-
-    monkeypatch.setattr(chart_sweep, "kept_capture", always_the_same)
-    outcome = run_chart(settings(scaling=True), tmp_path / "out", Silent())
-    pixels = next(growth for growth in outcome.growths if growth.axis == "pixels")
-    assert pixels.exponent == pytest.approx(1)
-    assert pixels.expected == pytest.approx(1)
-    assert (tmp_path / "out/charts/growth-disparity-range.svg").is_file()
-    assert "Growth with the size" in outcome.page.read_text()
+    assert (tmp_path / "out" / ChartStudy.journal).read_text() == kept
 
 
 @pytest.fixture
 def job(tmp_path):
     """Three steps of total variation on a small capture."""
-    path, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", SIZE), tmp_path)
-    return {
-        "capture": str(path), "settings": {"tv": {"max_steps": 3}}, "method": "tv",
-        "needs_dictionary": False, "dictionary": None, "repeats": 2, "enough_s": 60,
-        "picture": str(tmp_path / f"{digest}-x.webp"),
-    }  # fmt: skip
+    three = MethodSettings.model_validate({"tv": {"max_steps": 3}})
+    point = Point(Capture("dark", "rgbw-bayer-1shot", SIZE), Configuration("tv", "3 steps", three))
+    return Job(point, tmp_path / "x.webp", tmp_path / "truth.webp", None, 2, 60.0)
 
 
-def test_a_worker_outlives_what_fails_and_tells_each_jobs_peak(job, tmp_path):
-    large, digest = kept_capture(Capture("dark", "rgbw-bayer-1shot", (96, 160)), tmp_path)
-    later = {**job, "capture": str(large), "picture": str(tmp_path / f"{digest}-x.webp")}
-    wrong = {**job, "needs_dictionary": True, "dictionary": str(tmp_path / "none.h5")}
-    with (
-        timing_lock("a test") as held,
-        working({"NUMBA_NUM_THREADS": "1"}, 300, held) as worker,
-    ):
+def test_a_worker_outlives_what_fails_and_says_each_jobs_peak(job, tmp_path):
+    capture = replace(job.point.capture, size=(96, 160))
+    later = replace(job, point=replace(job.point, capture=capture))
+    sparse = replace(job.point, configuration=Configuration("dict-omp"))
+    wrong = replace(job, point=sparse, dictionary=str(tmp_path / "none.h5"))
+    with Worker(300) as worker:
         first = worker.measure(job)
-        process = worker._process
         reported = worker.measure(wrong)
         assert "none.h5" in reported["failed"]
         assert not reported["keep"]
         wide, again = worker.measure(later), worker.measure(job)
-        assert (worker._process is process) == worker.lasting
-    assert first["cores"] == 1
     assert first["repeats"] == 2
     assert first["steps"] == 3
     assert 0 < first["fastest_s"] <= first["seconds"] <= first["slowest_s"]
-    assert 50 < first["base_mib"] <= first["peak_mib"]
-    assert list(tmp_path.glob("*-truth.webp"))
-    # Psi alone takes 5 x 5 x 96 x 160 numbers more.
-    assert again["peak_mib"] < wide["peak_mib"] - 1
-    assert again["peak_mib"] == pytest.approx(first["peak_mib"], rel=0.1)
+    assert job.truth_picture.is_file()
+    # The light field and its dual variables take 5 x 5 x 96 x 160 x 3 x 6 numbers more.
+    assert again["peak_mib"] < wide["peak_mib"] - 10
     assert again["psnr_db"] == first["psnr_db"]
 
 
 def test_a_job_that_takes_too_long_is_given_up_and_the_next_is_done(job):
-    with timing_lock("a test") as held, working({}, 0.01, held) as worker:
+    with Worker(0.01) as worker:
         assert worker.measure(job) == {"failed": "not done after 0 s"}
         worker.limit_s = 300
         assert worker.measure(job)["steps"] == 3
 
 
-def test_a_worker_that_fails_by_itself_says_why(job):
-    with timing_lock("a test") as held, working({}, 300, held) as worker:
-        with pytest.raises(AppError, match="tv: the measuring process failed: KeyError: 'repeats'"):
-            worker.measure({key: job[key] for key in job if key != "repeats"})
+def test_a_worker_that_is_killed_is_a_failure_that_may_pass(job):
+    with Worker(300) as worker:
+        worker.measure(job)
+        assert worker._started
+        worker._started[0].kill()
+        worker._started[0].join()
+        reported = worker.measure(job)
+        assert not reported["keep"]
+        assert "ended with code -9" in reported["failed"]
         assert worker.measure(job)["steps"] == 3
-
-
-def test_a_missing_rival_is_one_line(quick, monkeypatch, tmp_path):
-    absent = Peer("nobody's", ("no_such_library",), points.PEERS["sklearn-omp"].solve)
-    monkeypatch.setitem(points.PEERS, "absent", absent)
-    outcome = run_chart(settings(methods=("tv", "absent")), tmp_path / "out", Silent())
-    (line,) = outcome.left_out
-    assert "pip install" in line
-    assert {mark.configuration.method for c in outcome.charts for mark in c.marks} == {"tv"}
-    with pytest.raises(AppError, match="nothing to chart: absent: no_such_library"):
-        run_chart(settings(methods=("absent",)), tmp_path / "out", Silent())
 
 
 def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
     full = at_once(lambda _: {"failed": "no room", "keep": False})
-    monkeypatch.setattr(chart_sweep, "working", full)
+    monkeypatch.setattr(chart_study, "Worker", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
         run_chart(settings(), tmp_path / "out", Silent())
-    assert not (tmp_path / "out" / ChartSweep.journal).read_text()
+    assert not (tmp_path / "out" / ChartStudy.journal).read_text()
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,9 @@ from emmc_rig.processing.block_tasks import BlockTask, Capture
 from emmc_rig.processing.pool import WorkersError, opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_folder
 from emmc_rig.progress import Silent
-from emmc_rig.study.stability import sweeping
-from emmc_rig.study.stability.fault_sweep import stability_settings
-from emmc_rig.study.stability.sweeping import run_stability
+from emmc_rig.study.stability import stability_run
+from emmc_rig.study.stability.stability_run import run_stability
+from emmc_rig.study.stability.stability_study import stability_settings
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tiles import Grid
 from reconstruction.tv import TVSettings
@@ -95,7 +95,7 @@ def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
     chosen = stability_settings(
         True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",), screening="off"
     )
-    monkeypatch.setattr(sweeping, "_write", lambda *_: None)
+    monkeypatch.setattr(stability_run, "_write", lambda *_: None)
     ran = [
         run_stability(chosen, tmp_path / name, Silent(), cluster=address).curves
         for name, address in (("here", None), ("there", cluster.scheduler_address))

@@ -28,9 +28,10 @@ from emmc_rig.study.design.mask_file import (
     write_gdsii,
     write_picture,
 )
+from emmc_rig.study.design.periodic import Block, SceneTexture, _shift, prior_covariance
 from emmc_rig.study.design.printed import Print, printed_psi
 from emmc_rig.study.design.search import pareto
-from reconstruction.theory.periodic import Block, SceneTexture, _shift, prior_covariance
+from emmc_rig.study.design.ziv_zakai import ziv_zakai
 
 RGBW = Candidate("random_rgbw", 0.5, 36.0, 0.12)
 SMALL = DesignBench(size=(48, 64), stage_travel_um=(200.0, 200.0))
@@ -282,3 +283,12 @@ def test_a_bench_that_cannot_be_is_one_line(run, tmp_path, change, says):
     assert says in err
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "emmc-design").exists()
+
+
+def test_without_readings_the_disparity_is_as_uncertain_as_its_prior():
+    grid = np.linspace(-2, 2, 401)
+    uniform = (grid[-1] - grid[0]) ** 2 / 12
+    bound = ziv_zakai(grid, np.zeros((401, 401)))
+    assert bound <= uniform
+    assert bound == pytest.approx(uniform, rel=0.02)
+    assert ziv_zakai(grid, np.full((401, 401), 50.0)) < 1e-12

@@ -15,7 +15,6 @@ from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.scale import designed_scale, open_scale
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.benchmarks.live import field_timing, stop_timing
 from reconstruction.errors import ReconstructionError
 from reconstruction.preview import Preview, coarser
 
@@ -279,11 +278,3 @@ def test_a_solver_that_fails_is_reported(one_shot):
     live.update(frame)
     clock.now = 5.0
     until(lambda: live.update(frame)["why"] == "no luck")
-
-
-def test_the_benchmark_stops_among_pages_and_follows_frames():
-    stop = stop_timing(clients=3, stops=2)
-    assert 0 < stop.median_ms <= stop.worst_ms
-    field = field_timing(emmc.camera("rgbw-bayer-1shot"), SIZE, "near-planar")
-    assert field.size == SIZE
-    assert field.psnr_db > 15

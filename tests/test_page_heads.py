@@ -10,10 +10,10 @@ from emmc_rig.pages.page import light_field_head, typed
 from emmc_rig.pages.viewer import render_viewer
 from emmc_rig.study.chart.charting import chart_page
 from emmc_rig.study.stability.stability_page import stability_page
-from emmc_rig.study.tables.reproducing import tables_page
+from emmc_rig.study.tables.tables_page import tables_page
 
 NOT_ASKED: Any = None
-"""The sweep, where nothing was measured."""
+"""The study, where nothing was measured."""
 
 
 def head_of(page):
@@ -27,8 +27,8 @@ def head_of(page):
 @pytest.mark.parametrize(
     "page",
     [
-        lambda: tables_page([], [], [], {}, {}, {}),
-        lambda: chart_page(NOT_ASKED, [], {}, [], {}, {}),
+        lambda: tables_page([], [], [], {}),
+        lambda: chart_page(NOT_ASKED, [], {}, {}),
         lambda: stability_page([], [], NOT_ASKED, []),
     ],
     ids=["tables", "chart", "stability"],

@@ -11,6 +11,8 @@ import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
 
+from drivers.dng import encode_dng
+from drivers.raw import decode_raw
 from emmc_rig.acquisition.checks import figures
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -20,7 +22,6 @@ from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SYSTEM_DISK
-from emmc_rig.study.benchmarks import session as session_benchmark
 from simulators.disk import SimulatedDisk
 from simulators.still import StillStage
 
@@ -135,27 +136,13 @@ def test_thinning_keeps_the_places_of_the_colours_and_the_figures():
 
 
 def test_the_figures_of_a_frame_are_its_saturation_mean_and_brightest():
-    frame = session_benchmark._frame((100, 120), 0)
+    drawn = np.random.default_rng(0).integers(256, 3800, (100, 120), dtype=np.uint16)
+    frame = decode_raw(encode_dng(drawn, "rggb", 256, 4000, 0.01))
     dn = frame.mosaic.astype(float)
     found = figures(frame)
     assert found.mean_dn == pytest.approx(dn.mean() - 256)
     assert found.bright_dn == pytest.approx(np.percentile(dn, 99.9) - 256, abs=2)
     assert found.saturated == 0
-
-
-def test_the_benchmark_measures_what_it_says(tmp_path, monkeypatch):
-    monkeypatch.setattr(session_benchmark, "LARGE_SHAPE", (40, 60))
-    monkeypatch.setattr(session_benchmark, "MOVE_S", 0.0)
-    small, large = session_benchmark.overheads(tmp_path, 8)
-    for one in (small, large):
-        assert one.shots == 8
-        assert one.sequencing_ms > 0
-        assert 0 <= one.hidden_share <= 1
-    rates = session_benchmark.verification(tmp_path, 3)
-    assert rates.megabytes == pytest.approx(3 * 40 * 60 * 2 / 1e6, rel=0.2)
-    assert rates.share > 0
-    assert session_benchmark.listing_seconds(tmp_path, 5) > 0
-    assert not any(tmp_path.iterdir())
 
 
 def test_a_still_stage_refuses_what_a_real_one_would():

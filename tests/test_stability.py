@@ -14,10 +14,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.pages import drawing
-from emmc_rig.pages.page import Section
 from emmc_rig.progress import Silent
 from emmc_rig.study import trial
-from emmc_rig.study.stability import sweeping
+from emmc_rig.study.points import StudyStopped
+from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
     Span,
@@ -29,10 +29,13 @@ from emmc_rig.study.stability.curves import (
     span_words,
     strength_at,
 )
-from emmc_rig.study.stability.fault_sweep import StabilitySweep, planned, stability_settings
 from emmc_rig.study.stability.faults import FAULTS, Point
-from emmc_rig.study.stability.sweeping import BREAKS_CSV, POINTS_CSV, run_stability
-from emmc_rig.study.sweep import SweepStopped
+from emmc_rig.study.stability.stability_run import BREAKS_CSV, POINTS_CSV, run_stability
+from emmc_rig.study.stability.stability_study import (
+    StabilityStudy,
+    planned,
+    stability_settings,
+)
 from emmc_rig.study.trial import Capture
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
@@ -61,7 +64,7 @@ def few_steps(monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """No charts: they take longer than a few steps do."""
-    monkeypatch.setattr(sweeping, "_write", lambda *_: None)
+    monkeypatch.setattr(stability_run, "_write", lambda *_: None)
 
 
 def ends(found):
@@ -149,8 +152,7 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
     chosen = quick(
         scenes=["dark", str(shed)], faults=("flicker", "disparity-range"), screening="both"
     )
-    more = Section("theory", "Theory beside it", "<p>expected</p>", "Theory")
-    outcome = run_stability(chosen, tmp_path / "out", Silent(), [more])
+    outcome = run_stability(chosen, tmp_path / "out", Silent())
     folder = tmp_path / "out"
     assert outcome.curves[0].scene == POOLED
     assert any("Disparity range" in line and "shed" in line for line in outcome.left_out)
@@ -165,7 +167,6 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
     page = Page((folder / "stability.html").read_text())
     assert not page.foreign
     assert len(page.ids) == len(set(page.ids))
-    assert "theory" in page.ids
     marks = [name for name in page.ids if name.startswith("mark-")]
     assert len(marks) == sum(len(curve.levels) for curve in outcome.curves)
     metrics = json.loads((folder / METRICS).read_text())
@@ -177,15 +178,15 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
 
 def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp_path):
     run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
-    lines = (tmp_path / "out" / StabilitySweep.journal).read_text().splitlines()
+    lines = (tmp_path / "out" / StabilityStudy.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
 
 
 def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
-    missing = replace(METHODS["unrolled"], package="no_such_module")
-    monkeypatch.setitem(METHODS, "unrolled", missing)
-    outcome = run_stability(quick(methods=("tv", "unrolled")), tmp_path / "out", Silent())
-    assert outcome.left_out == ["unrolled needs no_such_module, which is not installed"]
+    missing = replace(METHODS["dict-omp"], package="no_such_module")
+    monkeypatch.setitem(METHODS, "dict-omp", missing)
+    outcome = run_stability(quick(methods=("tv", "dict-omp")), tmp_path / "out", Silent())
+    assert outcome.left_out == ["dict-omp needs no_such_module: not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 
@@ -194,9 +195,9 @@ def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undraw
     chosen, found = quick(faults=("flicker", "missing-shot")), []
     for name, pool in (("alone", None), ("shared", Posting(backwards=True))):
         (tmp_path / name).mkdir()
-        sweep = StabilitySweep(chosen, tmp_path / name)
+        sweep = StabilityStudy(chosen, tmp_path / name)
         found.append(sweep.run(planned(chosen), Silent(), pool))
-        lines = (tmp_path / name / StabilitySweep.journal).read_text().splitlines()
+        lines = (tmp_path / name / StabilityStudy.journal).read_text().splitlines()
         assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
     assert list(found[0]) == list(found[1])
     for point, one in found[0].items():
@@ -214,14 +215,14 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
         return once(*arguments)
 
     monkeypatch.setattr(trial, "reconstruct", stopping)
-    with pytest.raises(SweepStopped, match="1 of 4 points are kept"):
+    with pytest.raises(StudyStopped, match="1 of 4 points are kept"):
         run_stability(quick(), tmp_path / "out", Silent())
     run_stability(quick(), tmp_path / "out", Silent())
     assert len(calls) == 1 + 4
-    kept = (tmp_path / "out" / StabilitySweep.journal).read_text()
+    kept = (tmp_path / "out" / StabilityStudy.journal).read_text()
     run_stability(quick(), tmp_path / "out", Silent())
     assert len(calls) == 1 + 4
-    assert (tmp_path / "out" / StabilitySweep.journal).read_text() == kept
+    assert (tmp_path / "out" / StabilityStudy.journal).read_text() == kept
     run_stability(quick(seed=1), tmp_path / "out", Silent())
     assert len(calls) == 1 + 8
 

@@ -8,10 +8,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import save_views
+from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.stability.mask_faults import misplaced_psi
 from emmc_rig.study.stability.shot_faults import flicker_gains
-from emmc_rig.study.sweep import NotApplicableError
 from emmc_rig.study.trial import Capture
 from simulators import changes
 from simulators.scenes import render

@@ -14,12 +14,11 @@ from rich.console import Console
 from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.pages.pictures import detailed_pieces
 from emmc_rig.progress import Silent
-from emmc_rig.study.tables import reproducing
-from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
-from emmc_rig.study.tables.cells import PARTS, cells_of, distinct
+from emmc_rig.study.tables import tables_page, tables_study
+from emmc_rig.study.tables.cells import PARTS, cells_of
 from emmc_rig.study.tables.grids import MEAN
-from emmc_rig.study.tables.library import Cut
-from emmc_rig.study.tables.reproducing import COLUMNS, run_tables, shown
+from emmc_rig.study.tables.tables_page import COLUMNS, run_tables, shown
+from emmc_rig.study.tables.tables_study import TablesSettings, TablesStudy
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary, dct_dictionary
 from reconstruction.methods import MethodSettings
@@ -28,14 +27,18 @@ from reconstruction.tv import TVSettings
 
 NAMES = ("attic", "dragons")
 QUICK = TablesSettings(
-    cut=Cut((16, 18)),
-    binned_cut=Cut((16, 18), 2),
+    size=(16, 18),
+    binned_size=(16, 18),
     methods=MethodSettings(
         tv=TVSettings(max_steps=2),
         sparse=SparseSettings(stride=8, solver=BPDNSettings(method="admm", max_steps=3, rtol=0.5)),
     ),
     binned_stride=8,
 )
+
+
+def quick(dictionary):
+    return QUICK.model_copy(update={"dictionary": dictionary})
 
 
 def save_scenes(folder):
@@ -63,7 +66,7 @@ def small_dictionary(tmp_path_factory):
 def whole(scenes, small_dictionary, tmp_path_factory):
     """All tables and figures of two tiny scenes."""
     folder = tmp_path_factory.mktemp("whole") / "out"
-    outcome = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
+    outcome = run_tables(scenes, folder, None, quick(small_dictionary), Silent())
     return folder, outcome
 
 
@@ -84,8 +87,8 @@ def test_every_cell_is_one_row_of_the_csv(whole):
     folder, _ = whole
     with open(folder / "tables.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    cells = distinct(cell for part in PARTS.values() for cell in cells_of(part, list(NAMES)))
-    assert len(rows) == len(cells) == 18 + 21 + 36 + (12 - 3) + 2
+    cells = {cell for part in PARTS.values() for cell in cells_of(part, list(NAMES))}
+    assert len(rows) == len(cells) == 18 + 21 + 36 + (12 - 3) + 1
     assert tuple(rows[0]) == COLUMNS
     shared = [row for row in rows if "figure8" in row["tables"] and "table2" in row["tables"]]
     assert [row["mask"] for row in shared] == ["rgbw"] * 3
@@ -126,36 +129,16 @@ def test_the_page_is_whole_and_asks_for_nothing(whole):
         assert target.startswith(("data:", "#"))
         if target.startswith("#"):
             assert target[1:] in links.anchors
-    assert links.pictures == 4 + 6
     assert not re.search(r"https?://", re.sub(r'"data:[^"]*"', "", text))
     for part in PARTS.values():
         assert part.title.partition(":")[0] in text
     assert "30.22" in text
 
 
-def test_figures_and_charts_are_pictures(whole):
-    folder, _ = whole
-    names = {path.name for path in (folder / "figures").iterdir()}
-    figures = {f"figure{n}.png" for n in (5, 6, 7, 8, 9, 10)}
-    beside = {name.replace("png", kind) for name in figures for kind in ("pdf", "svg", "txt")}
-    assert names == figures | beside | {
-        "chart-shots.svg", "chart-noise.svg", "chart-colour.svg", "chart-masks.svg",
-    }  # fmt: skip
-    for name in figures:
-        picture = cv2.imread(str(folder / "figures" / name))
-        assert picture is not None
-        assert min(picture.shape[:2]) > 300
-        assert picture.std() > 10
-        text = (folder / "figures" / name).with_suffix(".txt").read_text()
-        caption = " ".join(text.split())
-        assert PARTS[name.removesuffix(".png")].title in caption
-        assert "Scene " in caption
-
-
 def test_the_metrics_tell_the_findings(whole):
     folder, outcome = whole
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["cells"] == 86
+    assert metrics["cells"] == 85
     reported = {finding["name"]: finding for finding in metrics["findings"]}
     for finding in outcome.findings:
         assert reported[finding.claim.name]["verdict"] == finding.verdict
@@ -165,7 +148,7 @@ def test_the_metrics_tell_the_findings(whole):
 
 def test_grids_hold_means_and_the_papers_numbers(whole):
     _, outcome = whole
-    table_2, table_3, table_4, figure_8 = outcome.grids
+    table_2, table_3, table_4, _, figure_8 = outcome.grids
     line = next(x for x in table_2.lines if x.heads == ("dragons", "noise-free", "TV-Dict"))
     assert [pair.paper for pair in line.pairs] == [30.22, 27.98, 30.52]
     assert all(pair.ours is not None for pair in line.pairs)
@@ -196,10 +179,8 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
     folder, outcome = whole
     (folder / "mine.txt").write_text("keep")
     before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
-    from emmc_rig.study.tables import cell_sweep as module
-
-    monkeypatch.setattr(module, "reconstruct", None)
-    again = run_tables(scenes, folder, None, [small_dictionary], QUICK, Silent())
+    monkeypatch.setattr(tables_study, "reconstruct", None)
+    again = run_tables(scenes, folder, None, quick(small_dictionary), Silent())
     assert again.grids == outcome.grids
     assert before == ((folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes())
     assert (folder / "mine.txt").read_text() == "keep"
@@ -207,7 +188,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
 
 
 def test_a_part_alone_is_done_from_the_command_line(run, scenes):
-    code, out, _ = run("--scenes", scenes, "--only", "figure5", "--fast", "--out", "r")
+    code, out, _ = run("--scenes", scenes, "--only", "figure6", "--fast", "--out", "r")
     assert code == 0
     assert "open r/tables.html" in out
 
@@ -215,7 +196,7 @@ def test_a_part_alone_is_done_from_the_command_line(run, scenes):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--only", "figure11"], "did you mean 'figure1"),
+        (["--only", "figure7"], "did you mean 'figure"),
         (["--scenes", "nowhere"], "no such folder"),
         (["--scenes", "."], "no scenes"),
         (["--dictionary", "nothing.h5"], "no such file"),
@@ -245,10 +226,10 @@ def test_ctrl_c_is_reported_with_how_to_go_on(run, scenes, monkeypatch):
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
 
-    for place, stage in ((TablesSweep, "measure"), (reproducing, "draw_figures")):
+    for place, stage in ((TablesStudy, "measure"), (tables_page, "grids")):
         with monkeypatch.context() as patch:
             patch.setattr(place, stage, interrupted)
-            code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
+            code, _, err = run("--scenes", scenes, "--only", "figure6", "--fast")
         assert code == 130
         assert "run the same command again" in one_line(err)
 
@@ -257,8 +238,8 @@ def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
     def full(*arguments, **named):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(reproducing, "draw_figures", full)
-    code, _, err = run("--scenes", scenes, "--only", "figure5", "--fast")
+    monkeypatch.setattr(tables_page, "grids", full)
+    code, _, err = run("--scenes", scenes, "--only", "figure6", "--fast")
     assert (code, "No space left" in one_line(err)) == (1, True)
 
 

@@ -4,9 +4,82 @@ import numpy as np
 import pytest
 from full_splitting import from_patches, gradient
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.model import kernels
 from reconstruction.differences import norm_squared, variation
 from reconstruction.tv import TVSettings, reconstruct_tv
+
+
+class PeerProblem:
+    """The problem in pyproximal's terms, on flattened light fields (c, v, u, y, x)."""
+
+    def __init__(self, psi, frames, mu):
+        import pylops
+        import pyproximal as proximal
+
+        self.psi, self.mu = psi, mu
+        views_v, views_u, rows, columns, colours = psi.light_field_shape
+        self.shape = (colours, views_v, views_u, rows, columns)
+        derivatives = [
+            pylops.FirstDerivative(
+                self.shape, axis=axis, kind="forward", edge=False, dtype=psi.weights.dtype
+            )
+            for axis in (4, 3, 2, 1)
+        ]
+        self.differences = pylops.VStack(derivatives, dtype=psi.weights.dtype)
+        self.variation = proximal.L21(ndim=4 * colours, sigma=mu)
+        problem = self
+
+        class Misfit(proximal.ProxOperator):
+            """1/2 |Psi L - I|^2 with its exact proximal step."""
+
+            def __init__(self) -> None:
+                super().__init__(None, False)
+                self.step, self.inverse = 0.0, np.empty(0)
+
+            def __call__(self, x) -> float:
+                residual = psi.forward(problem.natural(x)) - frames
+                return 0.5 * float(np.sum(np.square(residual, dtype=np.float64)))
+
+            def prox(self, x, tau: float):
+                if self.step != tau:
+                    self.step, self.inverse = tau, psi.solver(1 / tau).inverse
+                planar = np.ascontiguousarray(np.moveaxis(x.reshape(problem.shape), 0, 3))
+                kernels.data_step(
+                    psi.weights, psi.colour_map, self.inverse, frames, psi.binning, planar
+                )
+                return np.moveaxis(planar, 3, 0).ravel()
+
+        self.misfit = Misfit()
+
+    def natural(self, flat):
+        """Return a flattened light field as (v, u, y, x, c)."""
+        return np.moveaxis(flat.reshape(self.shape), 0, -1)
+
+    def flat(self, light_field):
+        """Return a light field (v, u, y, x, c) as pyproximal takes it."""
+        return np.ascontiguousarray(np.moveaxis(light_field, -1, 0)).ravel()
+
+    def solve(
+        self,
+        start,
+        primal_step: float,
+        steps: int,
+        dual_step: float,
+    ):
+        """Return the light field (v, u, y, x, c) after pyproximal's primal-dual steps."""
+        import pyproximal as proximal
+
+        found = proximal.optimization.primaldual.PrimalDual(
+            self.misfit,
+            self.variation,
+            self.differences,
+            x0=self.flat(start),
+            tau=primal_step,
+            mu=dual_step,
+            niter=steps,
+            gfirst=False,
+        )
+        return self.natural(found)
 
 
 def capture(psi):
@@ -63,8 +136,6 @@ def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_st
 
 def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
     pytest.importorskip("pyproximal")
-    from emmc_rig.study.benchmarks.variational import PeerProblem
-
     psi = coded_psi("rggb", 2, 3, (4, 6), (2, 3), np.float64)
     truth, frames = capture(psi)
     mu, primal_step, steps = 1e-3, 3.0, 60
@@ -89,18 +160,3 @@ def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
     np.testing.assert_allclose(ours.light_field, theirs, atol=1e-6)
     value = peer.misfit(peer.flat(theirs)) + peer.variation(peer.differences @ peer.flat(theirs))
     assert ours.objective[-1] == (steps, pytest.approx(value, rel=1e-9))
-
-
-def test_the_steps_of_both_are_timed():
-    pytest.importorskip("pyproximal")
-    from emmc_rig.study.benchmarks.variational import variational_timings
-
-    rows = list(variational_timings(find_camera("rgbw-bayer-1shot"), (16, 20), 1))
-    assert [row.name for row in rows] == [
-        "fused step",
-        "pyproximal",
-        "pyproximal without data step",
-    ]
-    assert all(row.seconds > 0 for row in rows)
-    assert rows[1].times_ours == rows[1].seconds / rows[0].seconds
-    assert rows[0].times_ours == 1

@@ -12,11 +12,12 @@ import pytest
 from emmc_rig.errors import AppError
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
 from emmc_rig.progress import Silent
-from emmc_rig.study.sweep import NotApplicableError, Sweep, SweepStopped, csv_text, plain
+from emmc_rig.study.points import NotApplicableError, Study, StudyStopped
+from emmc_rig.study.rows import csv_text, plain
 
 
 @dataclass
-class Squares(Sweep[int]):
+class Squares(Study[int]):
     """Squares of numbers, tens together; a negative number has none."""
 
     noun = "numbers"
@@ -72,26 +73,26 @@ def test_points_are_measured_in_groups_and_recalled_in_their_order(tmp_path):
 
 
 def test_points_of_one_digest_are_measured_once(tmp_path):
-    sweep = Squares(None, tmp_path)
-    results = sweep.run([7, 107], Silent())
-    assert sweep.calls == [[7]]
+    study = Squares(None, tmp_path)
+    results = study.run([7, 107], Silent())
+    assert study.calls == [[7]]
     assert results[107] == results[7]
 
 
 def test_what_cannot_be_measured_is_left_out_and_the_others_are_not(tmp_path):
-    sweep, watcher = Squares(None, tmp_path), Counted()
-    results = sweep.run([-1, 65, 66, 67, 2], watcher)
+    study, watcher = Squares(None, tmp_path), Counted()
+    results = study.run([-1, 65, 66, 67, 2], watcher)
     assert list(results) == [65, 2]
-    assert sweep.left_out == dict.fromkeys((66, 67), "66 is unlucky") | {-1: "no root is negative"}
+    assert study.left_out == dict.fromkeys((66, 67), "66 is unlucky") | {-1: "no root is negative"}
     assert watcher.steps == watcher.total == 4
 
 
 def test_a_failure_that_may_pass_is_measured_again(tmp_path):
     for _ in range(2):
-        sweep = Squares(None, tmp_path)
-        sweep.run([55, 5], Silent())
-        assert [55] in sweep.calls
-        assert sweep.failures() == ["55: full"]
+        study = Squares(None, tmp_path)
+        study.run([55, 5], Silent())
+        assert [55] in study.calls
+        assert study.failures() == ["55: full"]
     assert (tmp_path / "points.jsonl").read_text().count("\n") == 1
 
 
@@ -105,20 +106,20 @@ def test_ctrl_c_says_what_is_kept_and_closes_what_measures(tmp_path):
             finally:
                 closed.append(points)
 
-    with pytest.raises(SweepStopped, match="2 of 4 numbers are kept in"):
+    with pytest.raises(StudyStopped, match="2 of 4 numbers are kept in"):
         Closing(None, tmp_path).run([1, 2, 3, 4], Counted(2))
     assert closed == [[1, 2, 3, 4]]
-    sweep = Squares(None, tmp_path)
-    assert len(sweep.run([1, 2, 3, 4], Silent())) == 4
-    assert sweep.calls == [[3, 4]]
+    study = Squares(None, tmp_path)
+    assert len(study.run([1, 2, 3, 4], Silent())) == 4
+    assert study.calls == [[3, 4]]
 
 
 def test_other_figures_of_a_point_are_another_digest(tmp_path, monkeypatch):
     Squares(None, tmp_path).run([1], Silent())
     monkeypatch.setattr(Squares, "revision", 2)
-    sweep = Squares(None, tmp_path)
-    sweep.run([1], Silent())
-    assert sweep.calls == [[1]]
+    study = Squares(None, tmp_path)
+    study.run([1], Silent())
+    assert study.calls == [[1]]
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
