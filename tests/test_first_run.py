@@ -1,4 +1,4 @@
-"""The first run on a machine: compiling is said once, and done by other processes meanwhile."""
+"""The first run on a machine: compiling is said once, and done by other processes first."""
 
 import sys
 
@@ -28,7 +28,7 @@ class Recorder:
         self.seen.append("killed")
 
 
-def test_the_first_kernel_compiled_starts_processes_that_the_solver_waits_for(monkeypatch, capsys):
+def test_the_first_kernel_compiled_waits_for_other_processes(monkeypatch, capsys):
     recorder, started = Recorder(), []
     monkeypatch.setattr(
         first_run.subprocess, "Popen", lambda typed, **_: started.append(typed) or recorder
@@ -38,27 +38,24 @@ def test_the_first_kernel_compiled_starts_processes_that_the_solver_waits_for(mo
     def twice(x):
         return x + x
 
-    with first_run.compiled_ahead(recorder, "adaptive", "rgbw-mono", 2) as watcher:
-        watcher.begin("scene", None)
+    with first_run.compiled_first(recorder, "adaptive", "rgbw-mono", 2):
+        recorder.begin("scene", None)
         assert (twice(2), twice(2.5)) == (4, 5.0)
-        watcher.step("one")
-        watcher.begin("reconstruct", None)
+        recorder.begin("reconstruct", None)
     assert started == [
         [sys.executable, "-m", "emmc_rig.commands.first_run", part, "rgbw-mono", "2"]
         for part in ("search", "fit")
     ]
     assert recorder.seen == [
-        "scene", "step one", "compile", *2 * ["waited"], "reconstruct", *2 * ["killed", "waited"],
+        "scene", "compile", *2 * ["waited"], *2 * ["killed", "waited"], "reconstruct",
     ]  # fmt: skip
     assert capsys.readouterr().err.count("compiling kernels for this machine, once") == 1
 
 
 def test_a_run_that_compiles_nothing_starts_nothing(monkeypatch):
-    recorder = Recorder()
     monkeypatch.setattr(first_run.subprocess, "Popen", lambda typed, **_: 1 / 0)
-    with first_run.compiled_ahead(recorder, "adaptive", "rgbw-mono", None) as watcher:
-        watcher.begin("reconstruct", None)
-    assert recorder.seen == ["reconstruct"]
+    with first_run.compiled_first(Recorder(), "adaptive", "rgbw-mono", None):
+        pass
 
 
 def test_a_method_of_other_parts_is_compiled_by_one_process(monkeypatch):
@@ -71,7 +68,7 @@ def test_a_method_of_other_parts_is_compiled_by_one_process(monkeypatch):
     def half(x):
         return x / 2
 
-    with first_run.compiled_ahead(Recorder(), "dict-omp", "rgbw-mono", None):
+    with first_run.compiled_first(Recorder(), "dict-omp", "rgbw-mono", None):
         assert half(3.0) == 1.5
     assert started == [["dict-omp", "rgbw-mono"]]
 

@@ -52,7 +52,7 @@ def demo(
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     import emmc_rig as emmc
-    from emmc_rig.commands.first_run import compiled_ahead
+    from emmc_rig.commands.first_run import compiled_first
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
@@ -88,9 +88,9 @@ def demo(
     with (
         result_folder(out, "demo") as folder,
         shown_progress() as bars,
-        compiled_ahead(bars, method, camera, shots) as watcher,
+        compiled_first(bars, method, camera, shots),
     ):
-        metrics = run_demo(settings, folder, watcher)
+        metrics = run_demo(settings, folder, bars)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     tell(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "

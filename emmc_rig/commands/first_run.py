@@ -1,9 +1,12 @@
-"""The first run on a machine compiles kernels: it says so, and other processes compile ahead.
+"""The first run on a machine compiles kernels: it says so, and other processes compile first.
 
-Numba keeps what it compiled on the disk, so that what one process compiled another loads. While
-this process still simulates the capture, one other searches disparities in a small light field and
-one fits it: each needs kernels that the other does not. Of a method that does neither, one process
-reconstructs.
+Numba keeps what it compiled on the disk, so that what one process compiled another loads. When this
+process needs a first kernel, one other searches disparities in a small light field and one fits it:
+each needs kernels that the other does not. Of a method that does neither, one process reconstructs.
+
+This process waits for them: machine code depends on whether what a kernel calls was compiled or
+loaded, and a process that compiled beside the others would compute with other code than the disk
+has for later runs, whose results then differ.
 """
 
 from __future__ import annotations
@@ -26,64 +29,56 @@ from reconstruction.result import Progress
 SIZE = (48, 64)
 """Of the light field that is compiled for: no kernel depends on it."""
 NOISE = 0.002
-SOLVING = "reconstruct"
-"""The stage before which the other processes must be done."""
 PARTS = {"adaptive": ("search", "fit"), "adaptive-fast": ("search", "fit")}
 """What the other processes do for a method; for one that is not here, the whole of it."""
 
 
 @dataclass
-class Compiling(event.Listener):
-    """A `Watcher` that starts the other processes when the first kernel is compiled.
+class CompileFirst(event.Listener):
+    """Lets other processes compile when the first kernel is about to be.
 
-    method: and then the other arguments of this module. watcher: is shown every stage.
+    method: and then the other arguments of this module. watcher: is shown the stage.
     """
 
     watcher: Watcher
     method: str
     arguments: Sequence[str]
-    ahead: list[subprocess.Popen] = field(default_factory=list, init=False)
+    done: bool = field(default=False, init=False)
 
     def on_start(self, event: event.Event) -> None:
         """A kernel that the disk does not hold is about to be compiled."""
-        if not self.ahead:
-            say("first run", "compiling kernels for this machine, once; later runs start at once")
-            quiet = subprocess.DEVNULL  # Ctrl-C reaches it too, and what fails there fails here
-            for part in PARTS.get(self.method, (self.method,)):
-                command = [sys.executable, "-m", __name__, part, *self.arguments]
-                self.ahead.append(
-                    subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
-                )
+        if self.done:
+            return
+        self.done = True
+        say("first run", "compiling kernels for this machine, once; later runs start at once")
+        self.watcher.begin("compile", None)
+        quiet = subprocess.DEVNULL  # Ctrl-C reaches them too, and what fails there fails here
+        commands = [
+            [sys.executable, "-m", __name__, part, *self.arguments]
+            for part in PARTS.get(self.method, (self.method,))
+        ]
+        processes = [
+            subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+            for command in commands
+        ]
+        try:
+            for process in processes:
+                process.wait()
+        finally:
+            for process in processes:
+                process.kill()
+                process.wait()
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing: the other processes go on."""
-
-    def begin(self, stage: str, steps: int | None) -> None:
-        """Wait for the kernels before the stage that needs them."""
-        if stage == SOLVING and self.ahead:
-            self.watcher.begin("compile", None)
-            for one in self.ahead:
-                one.wait()
-        self.watcher.begin(stage, steps)
-
-    def step(self, detail: str) -> None:
-        """Pass it on."""
-        self.watcher.step(detail)
+        """Nothing: the kernel is compiled here."""
 
 
 @contextmanager
-def compiled_ahead(
-    watcher: Watcher, method: str, camera: str, shots: int | None
-) -> Iterator[Watcher]:
-    """Yield a watcher for a run that ends in a reconstruction by this method and camera."""
-    compiling = Compiling(watcher, method, (camera, *(() if shots is None else (str(shots),))))
-    with event.install_listener("numba:compile", compiling):
-        try:
-            yield compiling
-        finally:
-            for one in compiling.ahead:
-                one.kill()
-                one.wait()
+def compiled_first(watcher: Watcher, method: str, camera: str, shots: int | None) -> Iterator[None]:
+    """Have kernels compiled before a run that reconstructs by this method and camera needs them."""
+    arguments = (camera, *(() if shots is None else (str(shots),)))
+    with event.install_listener("numba:compile", CompileFirst(watcher, method, arguments)):
+        yield
 
 
 def compile_for(part: str, camera: str, shots: int | None) -> None:
