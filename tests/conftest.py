@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -31,15 +33,31 @@ def pytest_addoption(parser):
     parser.addoption(
         "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
     )
+    parser.addoption("--all", action="store_true", help="the slow tests, too, as CI does")
     parser.addoption("--list-run", type=Path, help="file to write: the tests that were run")
     parser.addoption("--but", type=Path, help="leave out what such a file lists")
+
+
+def tests_are_named(config):
+    return config.args_source != config.ArgsSource.TESTPATHS
 
 
 def pytest_xdist_auto_num_workers(config):
     """Return the cores for a run of everything; a real device, or tests named, get one process."""
     real = config.getoption("--stage") or config.getoption("--camera")
-    everything = config.args_source == config.ArgsSource.TESTPATHS
-    return os.cpu_count() if everything and not real else 0
+    return 0 if tests_are_named(config) or real else os.cpu_count()
+
+
+def pytest_sessionstart(session):
+    """Compile what most tests need once, before the workers begin: each would compile it again."""
+    if hasattr(session.config, "workerinput") or tests_are_named(session.config):
+        return
+    first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
+    parts = [["search"], ["fit"]], [["dict-admm"], ["dict-omp"]]
+    for together in parts:
+        processes = [subprocess.Popen([*first_run, *one, "rgbw-bayer-3shots"]) for one in together]
+        for process in processes:
+            process.wait()
 
 
 NO_LIGHT_FIELDS = "EMMC_LIGHTFIELDS does not name a folder of real light fields"
@@ -49,6 +67,10 @@ def pytest_collection_modifyitems(config, items):
     if config.getoption("--but") is not None:
         listed = set(config.getoption("--but").read_text(encoding="utf-8").splitlines())
         items[:] = [item for item in items if item.nodeid not in listed]
+    if not (config.getoption("--all") or tests_are_named(config)):
+        slow = [item for item in items if "slow" in item.keywords]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if "slow" not in item.keywords]
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     skips = {}
     if not (folder and Path(folder).is_dir()):
