@@ -42,6 +42,11 @@ def tests_are_named(config):
     return config.args_source != config.ArgsSource.TESTPATHS
 
 
+def pytest_configure(config):
+    if not hasattr(config, "workerinput") and tests_are_named(config):
+        config.option.all = True  # workers get the options, and do not know what was named
+
+
 def pytest_xdist_auto_num_workers(config):
     """Return the cores for a run of everything; a real device, or tests named, get one process."""
     real = config.getoption("--stage") or config.getoption("--camera")
@@ -67,7 +72,7 @@ def pytest_collection_modifyitems(config, items):
     if config.getoption("--but") is not None:
         listed = set(config.getoption("--but").read_text(encoding="utf-8").splitlines())
         items[:] = [item for item in items if item.nodeid not in listed]
-    if not (config.getoption("--all") or tests_are_named(config)):
+    if not config.getoption("--all"):
         slow = [item for item in items if "slow" in item.keywords]
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if "slow" not in item.keywords]
