@@ -12,7 +12,7 @@ from emmc_rig.study import ablation, constants, next_shot
 from emmc_rig.study.oracle import STEP_PX, matched_disparity
 from emmc_rig.study.sweep import open_folder
 from emmc_rig.study.trial import Capture
-from reconstruction.adaptive import parsimony, search
+from reconstruction.adaptive import search
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.search import DECISIVE
 from reconstruction.methods import MethodSettings, reconstruct
@@ -47,7 +47,6 @@ def test_the_constants_of_the_method_are_those_that_its_modules_and_settings_hav
     assert found["search.DECISIVE"] == DECISIVE
     assert found["settings.texture.steps"] == TextureSettings().steps
     assert "search.NEAR_PX" in found, "assigned with another"
-    assert "parsimony.DECISIVE" not in found, "imported"
     assert "settings.nearer" not in found, "no number"
     assert "assembly.TAPS" not in found, "compiled into kernels"
 
@@ -58,16 +57,14 @@ def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp
     seen = []
 
     def reconstructed(psi, frames, noise_sigma, settings, usable):
-        seen.append((search.DECISIVE, parsimony.DECISIVE, settings.texture.momentum))
+        seen.append((search.DECISIVE, settings.texture.momentum))
         return reconstruct("tv", psi, frames, noise_sigma, settings=QUICK, usable=usable)
 
     monkeypatch.setattr(constants, "reconstruct_adaptive", reconstructed)
     given = [Capture("deep-occlusions", find_camera(CAMERA), SIZE)]
     costs, left_out = constants.constant_costs(given, tmp_path, Silent())
-    own = DECISIVE, DECISIVE, 0.5
-    assert sorted(seen) == sorted(
-        [own, (2 * DECISIVE,) * 2 + (0.5,), (DECISIVE / 2,) * 2 + (0.5,), (*own[:2], 0.25)]
-    )
+    own = DECISIVE, 0.5
+    assert sorted(seen) == sorted([own, (2 * DECISIVE, 0.5), (DECISIVE / 2, 0.5), (DECISIVE, 0.25)])
     assert left_out == ["settings.texture.momentum may not be 1.0"]
     assert {(cost.constant, cost.factor) for cost in costs} == {
         ("search.DECISIVE", 2.0),
@@ -75,7 +72,7 @@ def test_twice_and_half_of_a_constant_are_measured_and_put_back(monkeypatch, tmp
         ("settings.texture.momentum", 0.5),
     }
     assert all(cost.mean_db == cost.error_db == cost.worst_db == 0 for cost in costs)
-    assert search.DECISIVE == parsimony.DECISIVE == DECISIVE
+    assert search.DECISIVE == DECISIVE
     monkeypatch.setattr(constants, "reconstruct_adaptive", None)
     assert constants.constant_costs(given, tmp_path, Silent())[0] == costs
 

@@ -34,7 +34,6 @@ LEFT_OUT = {
     "stacking of like blocks": {"texture": {"reach": 0}},
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},
     "momentum": {"texture": {"momentum": 0.0}},
-    "total variation in the mean": {"free": False},
     "a second fit, of less misfit": {"misfits": (0.004,)},
     "a second fit, of more misfit": {"misfits": (0.0015,)},
     "disparity (all at 0)": {"furthest_px": 0.01},
