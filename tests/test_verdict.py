@@ -527,7 +527,7 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
 
 
-@pytest.mark.parametrize("scene", ["deep-occlusions", "near-planar"])
+@pytest.mark.parametrize("scene", ["deep-occlusions", "non-lambertian", "wide-disparity"])
 def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
     given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
     result, verdict = reconstruct_judged(
