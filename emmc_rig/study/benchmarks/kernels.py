@@ -25,6 +25,7 @@ from emmc_rig.model.sensing import rows_of_colours
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures, median_s, start_timings
 from reconstruction import kernels as tv_kernels
+from reconstruction.differences import stencils
 from reconstruction.problem import colour_metric
 from reconstruction.tv import reconstruct_tv, row_bands
 
@@ -72,6 +73,7 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
     inverse = psi.solver(0.01).inverse
     planar = np.ascontiguousarray(rows_of_colours(light_field))
     dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
+    taps, room = stencils(1, psi.light_field_shape, planar.dtype), np.empty_like(planar)
     moved = np.zeros((psi.frames_shape[1], 2))
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     pool = ThreadPoolExecutor(len(bands))
@@ -100,7 +102,7 @@ def kernel_timings(camera: Camera, size: tuple[int, int], repeats: int) -> Itera
         ),
         (
             "TV step",
-            lambda: tv_kernels.sweep(data, steps, planar, dual, bands, moved, pool.map),
+            lambda: tv_kernels.sweep(data, steps, taps, planar, dual, room, bands, moved, pool.map),
             psi.weights.nbytes + 2 * light_field.nbytes + 2 * dual.nbytes,
         ),
     ]
