@@ -24,7 +24,6 @@ PARTS = {
     "stacking of like blocks": {"texture": {"reach": 0}},
     "higher threshold of chrominance": {"texture": {"chroma": 1.0}},
     "momentum": {"texture": {"momentum": 0.0}},
-    "the other models in the mean": {"free": False},
     "a second fit, of less misfit": {"misfits": (0.004,)},
     "disparity (all at 0)": {"furthest_px": 0.01},
 }

@@ -21,6 +21,7 @@ from emmc_rig.model import kernels
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import rows_of_colours
 from reconstruction import kernels as tv_kernels
+from reconstruction.differences import stencils
 from reconstruction.problem import colour_metric
 from reconstruction.tv import row_bands
 
@@ -54,6 +55,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
     inverse = psi.solver(0.01).inverse
     planar = np.ascontiguousarray(rows_of_colours(light_field))
     dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
+    taps, room = stencils(1, psi.light_field_shape, planar.dtype), np.empty_like(planar)
     moved = np.zeros((psi.frames_shape[1], 2))
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     pool = ThreadPoolExecutor(len(bands))
@@ -73,7 +75,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
             once + light_field.nbytes,
         ),
         "TV step": (
-            lambda: tv_kernels.sweep(data, steps, planar, dual, bands, moved, pool.map),
+            lambda: tv_kernels.sweep(data, steps, taps, planar, dual, room, bands, moved, pool.map),
             once + light_field.nbytes + 2 * dual.nbytes,
         ),
     }  # fmt: skip

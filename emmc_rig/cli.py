@@ -29,7 +29,7 @@ from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
 from emmc_rig.commands.train import train
 from emmc_rig.errors import ERRORS, StoppedError, WrongUsageError
-from emmc_rig.model.errors import ViewOrderWarning
+from emmc_rig.model.errors import RemovedSettingWarning, ViewOrderWarning
 from emmc_rig.version import __version__
 
 INTERRUPTED = 130
@@ -94,13 +94,14 @@ def _warnings_as_notes() -> Iterator[None]:
         otherwise = warnings.showwarning
 
         def shown(message: Warning | str, category: type[Warning], *where: Any) -> None:
-            if issubclass(category, ViewOrderWarning):
+            if issubclass(category, (RemovedSettingWarning, ViewOrderWarning)):
                 say("note", message)
             else:
                 otherwise(message, category, *where)
 
         warnings.showwarning = shown
-        warnings.simplefilter("default", ViewOrderWarning)
+        for shown_once in (RemovedSettingWarning, ViewOrderWarning):
+            warnings.simplefilter("default", shown_once)
         yield
 
 

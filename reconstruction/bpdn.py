@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from emmc_rig.model.compiling import njit
 from emmc_rig.model.settings import Settings
-from reconstruction import bpdn_kernels as kernels
+from reconstruction import bpdn_solvers as solvers
 from reconstruction.errors import ReconstructionError
 from reconstruction.patches import padded
 
@@ -82,17 +81,9 @@ class Code:
 EMPTY = Code(np.zeros(0, np.float32), 0.0, 0.0, 0.0, 0.0, True)
 
 
-@njit(cache=True, nogil=True)
-def assemble(atoms, weights, out):
-    """Set out (sample,) to the atoms (atom, sample) weighted by the code."""
-    kernels.combine(atoms, weights, out)
-
-
 def median_norm(atoms: Array32) -> float:
     """Return the median norm of atoms (atom, measurement)."""
-    sizes = np.empty(len(atoms), dtype=np.float32)
-    kernels.norms(atoms, sizes)
-    return float(np.median(sizes))
+    return float(np.median(solvers.norms(atoms)))
 
 
 def penalty_of(
@@ -121,74 +112,50 @@ def prepared(
     """
     size = median_norm(atoms)
     scale = float(np.sqrt(np.mean(np.sum(np.square(data, dtype=np.float64), axis=1))))
-    count, length = atoms.shape
+    count, method = len(atoms), settings.method
 
     def greedy(one: Array32, measured: int) -> Code:
-        weights = np.empty(count, dtype=np.float32)
         tolerance = settings.tolerance_factor * noise_sigma * np.sqrt(measured)
-        if settings.method == "omp":
-            steps, residual = kernels.omp(
-                atoms, one, min(settings.atoms, measured), tolerance, weights
-            )
+        if method == "omp":
+            most = min(settings.atoms, measured)
+            weights, steps, residual = solvers.omp(atoms, one, most, tolerance)
         else:
-            steps, residual = kernels.sl0(
-                atoms,
-                one,
-                tolerance,
-                settings.sl0_shrink,
-                settings.sl0_inner_steps,
-                settings.sl0_narrowest,
-                SL0_RIDGE,
-                weights,
-            )
-        return Code(weights, 0.0, np.nan, float(residual), float(steps), True)
+            widths = settings.sl0_shrink, settings.sl0_inner_steps, settings.sl0_narrowest
+            weights, steps, residual = solvers.sl0(atoms, one, tolerance, *widths, SL0_RIDGE)
+        return Code(weights, 0.0, np.nan, residual, steps, True)
 
-    if settings.method not in MINIMISERS:
+    if method not in MINIMISERS:
         return greedy
     if not size * scale > 0:
         return lambda one, measured: Code(np.zeros(count, np.float32), 0, 0, 0, 0, True)
-    rho = inverse = None
-    if settings.method == "admm":
+    rho, inverse = 0.0, None
+    if method == "admm":
         # One factor serves all patches of a class, so their penalties share one rho.
         eta = np.median([penalty_of(size, count, one, noise_sigma, settings) for one in data])
-        rho = np.float32(eta / (settings.threshold * scale / size))
-        inverse = np.empty((length, length), dtype=np.float32)
-        if not kernels.factor(atoms, rho, inverse):
-            raise ReconstructionError("a sensed dictionary is singular: raise the penalty")
+        rho = float(eta / (settings.threshold * scale / size))
+        try:
+            inverse = solvers.ridge_inverse(atoms, rho)
+        except np.linalg.LinAlgError as fault:
+            raise ReconstructionError(
+                "a sensed dictionary is singular: raise the penalty"
+            ) from fault
+    limits = settings.rtol, settings.max_steps
 
     def minimise(one: Array32, measured: int) -> Code:
-        weights = np.empty(count, dtype=np.float32)
         eta = penalty_of(size, count, one, noise_sigma, settings)
-        if settings.method == "admm":
-            steps, gap = kernels.admm(
-                atoms,
-                inverse,
-                one,
-                np.float32(eta),
-                rho,
-                np.float32(settings.relaxation),
-                settings.rtol,
-                settings.max_steps,
-                weights,
+        if method == "lars":
+            weights, steps, arrived = solvers.lars(atoms, one, eta, settings.max_steps)
+            gap = solvers.duality_gap(atoms, one, eta, weights)
+            return Code(
+                weights, eta, gap, np.nan, steps, gap <= (LARS_GAP if arrived else settings.rtol)
             )
-        elif settings.method == "lars":
-            steps = kernels.lars(atoms, one, eta, settings.max_steps, weights)
-            correlation = np.empty(count, dtype=np.float32)
-            gap = kernels.objective_and_gap(atoms, one, np.float32(eta), weights, correlation)[1]
-            if steps != kernels.NONE:
-                return Code(weights, eta, gap, np.nan, steps, gap <= LARS_GAP)
-            steps = settings.max_steps
+        if inverse is not None:
+            relax = settings.relaxation
+            weights, steps, gap = solvers.admm(atoms, inverse, one, eta, rho, relax, *limits)
         else:
-            steps, gap = kernels.proximal_gradient(
-                atoms,
-                one,
-                np.float32(eta),
-                settings.method == "fista",
-                settings.rtol,
-                settings.max_steps,
-                weights,
-            )
-        return Code(weights, eta, float(gap), np.nan, float(steps), gap <= settings.rtol)
+            accelerate = method == "fista"
+            weights, steps, gap = solvers.proximal_gradient(atoms, one, eta, accelerate, *limits)
+        return Code(weights, eta, gap, np.nan, steps, gap <= settings.rtol)
 
     return minimise
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvals_banded
 
 from emmc_rig.model.sensing import rows_of_colours
-from reconstruction import difference_kernels
-from reconstruction.difference_kernels import Stencils
+from reconstruction import kernels
 from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
@@ -58,7 +57,7 @@ def fitting_indices(order: int, shape: tuple[int, ...]) -> list[MultiIndex]:
     return found
 
 
-def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> Stencils:
+def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> kernels.Stencils:
     """Return the stencils of all derivatives that fit a light field (v, u, y, x, ...)."""
     indices = fitting_indices(order, shape)
     offsets = [list(product(*(range(n + 1) for n in index))) for index in indices]
@@ -67,7 +66,7 @@ def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> Stencils:
         for index, taps in zip(indices, offsets, strict=True)
         for tap in taps
     ]
-    return Stencils(
+    return kernels.Stencils(
         np.array(indices, dtype=np.int64),
         np.cumsum([0, *map(len, offsets)]),
         np.array([tap for taps in offsets for tap in taps], dtype=np.int64),
@@ -113,5 +112,5 @@ def planar_variation(planar: Array, order: int, metric: Array) -> float:
     shape = (*planar.shape[:3], planar.shape[4])
     totals = np.empty(planar.shape[2])
     taps = stencils(order, shape, planar.dtype)
-    difference_kernels.variation_rows(planar, taps, metric, totals)
+    kernels.variation_rows(planar, taps, metric, totals)
     return float(totals.sum())

@@ -1,14 +1,13 @@
-"""Fused loops of primal-dual total variation on the kernels' axes (v, u, y, colour, x).
+"""Fused loops of primal-dual DV_K, total variation included, on the axes (v, u, y, colour, x).
 
-The primal step is the exact proximal point of the misfit and of a quadratic pull to a target.
+The primal step is the exact proximal point of the misfit and of a quadratic pull to a target. The
+dual variable has axes (v, u, y, index, colour, x), one index for each derivative of `Stencils`, of
+the colours after multiplication by a 3 x 3 metric.
 
-The dual variable has axes (v, u, y, direction, colour, x), directions x, y, u, v: forward
-differences, 0 across the far border, of the colours after multiplication by a 3 x 3 metric.
-
-One sweep reads and writes the light field and the dual variable once: rows of pixels are taken in
-order, the primal step of a row is followed by the dual step of the row before it while both are
-in cache. Bands of rows run in parallel; the dual step of a band's last row needs the next band's
-first and is done after all bands.
+One sweep reads and writes the light field and the dual variable once. Rows of the dual variable
+need the rows of pixels up to K further down: they follow the primal step at that distance, so that
+both find their rows in cache. Bands of rows run in parallel; the dual steps of a band's last K rows
+need the next band's first and are done after all bands.
 """
 
 from __future__ import annotations
@@ -68,40 +67,6 @@ def mix(metric, lines):
 
 
 @njit(cache=True, fastmath=True)
-def _descend(light_field, dual, step, back, v, u, y, out):
-    """Set out (colour, x) to the light field less step times the adjoint of `_dual_rows`' gradient.
-
-    back: the transposed metric.
-    """
-    width = light_field.shape[4]
-    here = dual[v, u, y]
-    for c in range(3):
-        gx, gy, gu, gv = here[0, c], here[1, c], here[2, c], here[3, c]
-        line = out[c]
-        for x in range(width):
-            line[x] = gx[x] + gy[x] + gu[x] + gv[x]
-        for x in range(1, width):
-            line[x] -= gx[x - 1]
-        if y > 0:
-            gy = dual[v, u, y - 1, 1, c]
-            for x in range(width):
-                line[x] -= gy[x]
-        if u > 0:
-            gu = dual[v, u - 1, y, 2, c]
-            for x in range(width):
-                line[x] -= gu[x]
-        if v > 0:
-            gv = dual[v - 1, u, y, 3, c]
-            for x in range(width):
-                line[x] -= gv[x]
-    mix(back, out)
-    for c in range(3):
-        row, line = light_field[v, u, y, c], out[c]
-        for x in range(width):
-            line[x] = row[x] + step * line[x]
-
-
-@njit(cache=True, fastmath=True)
 def pull_row(data, v, u, y, lines):
     """Draw lines (colour, x), row y of view (v, u), towards the target, if there is one."""
     if data.pulled.size > 0:
@@ -153,171 +118,195 @@ def fit_rows(data, steps, light_field, row, ahead, first, moved):
     moved[row, 1] = power
 
 
-@njit(cache=True, fastmath=True)
-def _primal_rows(data, steps, light_field, dual, row, ahead, moved):
-    """Do the primal step of a row of pixels; set ahead, for _dual_rows, to metric (2 new - old)."""
-    back = steps.metric.T.copy()
-    for v in range(light_field.shape[0]):
-        for u in range(light_field.shape[1]):
-            for part in range(data.binning):
-                y = row * data.binning + part
-                lines = ahead[v, u, part]
-                _descend(light_field, dual, steps.primal, back, v, u, y, lines)
-                pull_row(data, v, u, y, lines)
-    fit_rows(data, steps, light_field, row, ahead, 0, moved)
+class Stencils(NamedTuple):
+    """The stencils of all derivatives that fit somewhere; taps begin[i]:begin[i + 1] make the i-th.
 
+    reach: (index, 4), how many samples beyond its own a derivative needs along x, y, u, v.
+    offset: (tap, 4) along x, y, u, v. factor: (tap,), of the light field's type.
+    """
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _dual_rows(steps, ahead, below, has_below, dual, base):
-    """Do the dual step of the rows of `ahead` (v, u, part, colour, x); `below`: the next block."""
-    _, step, bound, relax, _ = steps
-    views_v, views_u, parts, _, width = ahead.shape
-    raised = np.empty((4, 3, width), dual.dtype)
-    size = np.empty(width, dual.dtype)
-    one = np.float32(1)
-    tiny = np.float32(1e-30)
-    for v in range(views_v):
-        for u in range(views_u):
-            for part in range(parts):
-                here = dual[v, u, base + part]
-                size[:] = 0
-                for c in range(3):
-                    line = ahead[v, u, part, c]
-                    right = raised[0, c]
-                    old = here[0, c]
-                    for x in range(width - 1):
-                        right[x] = old[x] + step * (line[x + 1] - line[x])
-                    right[width - 1] = 0
-                    for direction in range(1, 4):
-                        old = here[direction, c]
-                        new = raised[direction, c]
-                        inside = True
-                        beyond = line
-                        if direction == 1:
-                            if part + 1 < parts:
-                                beyond = ahead[v, u, part + 1, c]
-                            elif has_below:
-                                beyond = below[v, u, 0, c]
-                            else:
-                                inside = False
-                        elif direction == 2:
-                            if u + 1 < views_u:
-                                beyond = ahead[v, u + 1, part, c]
-                            else:
-                                inside = False
-                        else:
-                            if v + 1 < views_v:
-                                beyond = ahead[v + 1, u, part, c]
-                            else:
-                                inside = False
-                        if inside:
-                            for x in range(width):
-                                new[x] = old[x] + step * (beyond[x] - line[x])
-                        else:
-                            for x in range(width):
-                                new[x] = 0
-                    for direction in range(4):
-                        new = raised[direction, c]
-                        for x in range(width):
-                            size[x] += new[x] * new[x]
-                for x in range(width):
-                    size[x] = relax * min(one, bound / np.sqrt(size[x] + tiny))
-                for direction in range(4):
-                    for c in range(3):
-                        old = here[direction, c]
-                        new = raised[direction, c]
-                        for x in range(width):
-                            old[x] = (one - relax) * old[x] + size[x] * new[x]
+    reach: Any
+    begin: Any
+    offset: Any
+    factor: Any
 
 
 @njit(cache=True)
-def _copy(source, target):
-    """Copy a whole array: an assignment compiles for seconds, for its message of shapes."""
-    values, places = source.reshape(-1), target.reshape(-1)
-    for i in range(values.size):
-        places[i] = values[i]
+def _fits(shape, reach, v, u, y):
+    """Return whether a stencil fits along v, u and y."""
+    return v + reach[3] < shape[0] and u + reach[2] < shape[1] and y + reach[1] < shape[2]
+
+
+@njit(cache=True, fastmath=True)
+def _differentiate(light_field, stencils, index, v, u, y, out):
+    """Set out (3, x), colours apart, to a derivative that fits of a light field (v, u, y, 3 x).
+
+    The colours of a row are taken as one line; where a stencil would reach into the next colour
+    the derivative does not exist and is set to 0.
+    """
+    reach, begin, offset, factor = stencils
+    line = out.reshape(-1)
+    first, last = begin[index], begin[index + 1]
+    if (last - first) % 2:
+        dx, dy, du, dv = offset[first]
+        source = light_field[v + dv, u + du, y + dy][dx:]
+        scale = factor[first]
+        for x in range(source.size):
+            line[x] = scale * source[x]
+    # Two taps at a time halve the passes over the line.
+    for tap in range(first + (last - first) % 2, last, 2):
+        dx, dy, du, dv = offset[tap]
+        source = light_field[v + dv, u + du, y + dy][dx:]
+        dx, dy, du, dv = offset[tap + 1]
+        other = light_field[v + dv, u + du, y + dy][dx:]
+        scale, weight = factor[tap], factor[tap + 1]
+        if tap == first:
+            for x in range(min(source.size, other.size)):
+                line[x] = scale * source[x] + weight * other[x]
+        else:
+            for x in range(min(source.size, other.size)):
+                line[x] += scale * source[x] + weight * other[x]
+    out[:, out.shape[1] - reach[index, 0] :] = 0
+
+
+@njit(cache=True, fastmath=True)
+def _descend(light_field, dual, stencils, step, back, v, u, y, out):
+    """Set out (3, x) to a row of the light field less step times the adjoint on the dual variable.
+
+    dual: (v, u, y, index, 3 x), 0 where a stencil does not fit, so that no colour spills over.
+    """
+    reach, begin, offset, factor = stencils
+    line = out.reshape(-1)
+    line[:] = 0
+    for index in range(len(reach)):
+        for tap in range(begin[index], begin[index + 1]):
+            dx, dy, du, dv = offset[tap]
+            if dv > v or du > u or dy > y:
+                continue
+            if _fits(dual.shape, reach[index], v - dv, u - du, y - dy):
+                source = dual[v - dv, u - du, y - dy, index]
+                scale = factor[tap]
+                moved = line[dx:]
+                for x in range(moved.size):
+                    moved[x] += scale * source[x]
+    mix(back, out)
+    row = light_field[v, u, y].reshape(-1)
+    for x in range(line.size):
+        line[x] = row[x] - step * line[x]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _sweep_band(data, steps, light_field, dual, begin, end, moved, first, last):
-    """Do the rows of pixels from begin to end, but for the dual step of the last one.
+def _dual_rows(steps, stencils, ahead, dual, begin, end):
+    """Do the dual step of rows begin to end: ahead (v, u, y, 3 x), dual (v, u, y, index, 3 x)."""
+    _, step, bound, relax, _ = steps
+    views_v, views_u, _, count, values = dual.shape
+    width = values // 3
+    raised = np.empty((count, 3, width), dual.dtype)
+    size = np.empty(width, dual.dtype)
+    one = np.float32(1)
+    tiny = np.float32(1e-30)
+    for y in range(begin, end):
+        for v in range(views_v):
+            for u in range(views_u):
+                size[:] = 0
+                for index in range(count):
+                    if not _fits(dual.shape, stencils.reach[index], v, u, y):
+                        continue
+                    new, old = raised[index], dual[v, u, y, index]
+                    _differentiate(ahead, stencils, index, v, u, y, new)
+                    for c in range(3):
+                        line, before = new[c], old[c * width : (c + 1) * width]
+                        for x in range(width):
+                            line[x] = before[x] + step * line[x]
+                            size[x] += line[x] * line[x]
+                for x in range(width):
+                    size[x] = relax * min(one, bound / np.sqrt(size[x] + tiny))
+                for index in range(count):
+                    if not _fits(dual.shape, stencils.reach[index], v, u, y):
+                        continue
+                    new, old = raised[index], dual[v, u, y, index]
+                    for c in range(3):
+                        line, before = new[c], old[c * width : (c + 1) * width]
+                        for x in range(width):
+                            before[x] = (one - relax) * before[x] + size[x] * line[x]
 
-    first, last: set to the `ahead` of those rows, for the dual steps at the bands' edges.
-    """
-    ring = np.empty((2, *first.shape), light_field.dtype)
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved):
+    """Do the rows of pixels from begin to end, but for the dual steps of the last K rows."""
+    back = steps.metric.T.copy()
+    furthest = stencils.reach[:, 1].max()
+    flat = ahead.reshape((*ahead.shape[:3], ahead.shape[3] * ahead.shape[4]))
+    done = begin * data.binning
     for row in range(begin, end):
-        ahead = ring[row % 2]
-        _primal_rows(data, steps, light_field, dual, row, ahead, moved)
-        if row == begin:
-            _copy(ahead, first)
-        else:
-            # A constant True would be a type of its own, and compiled once more.
-            below = row > begin
-            _dual_rows(steps, ring[(row - 1) % 2], ahead, below, dual, (row - 1) * data.binning)
-    _copy(ring[(end - 1) % 2], last)
+        base = row * data.binning
+        for v in range(light_field.shape[0]):
+            for u in range(light_field.shape[1]):
+                for y in range(base, base + data.binning):
+                    lines = ahead[v, u, y]
+                    _descend(light_field, dual, stencils, steps.primal, back, v, u, y, lines)
+                    pull_row(data, v, u, y, lines)
+        fit_rows(data, steps, light_field, row, ahead, base, moved)
+        ready = max(done, base + data.binning - furthest)
+        _dual_rows(steps, stencils, flat, dual, done, ready)
+        done = ready
 
 
 def sweep(
     data: Data,
     steps: Steps,
+    stencils: Stencils,
     light_field: NDArray[np.floating],
     dual: NDArray[np.floating],
+    ahead: NDArray[np.floating],
     bands: NDArray[np.int64],
     moved: NDArray[np.float64],
     run: Callable[..., Iterable[object]] = map,
 ) -> None:
     """Do one over-relaxed primal-dual iteration in place (Condat 2013, algorithm 3.1).
 
+    dual: (v, u, y, index, colour, x), 0 where no stencil fits. ahead: room for another light field.
     bands: (band, 2) first and last + 1 row of pixels. moved: (pixel_y, 2), set to the squared
     change and the squared size of the light field per row of pixels. run: `map`, or that of a
     thread pool: the bands are independent (numba's own parallel loop takes 15 s more to compile).
     """
-    views_v, views_u, _, _, width = light_field.shape
-    block = (views_v, views_u, data.binning, 3, width)
-    first, last = np.empty((2, len(bands), *block), light_field.dtype)
+    dual = dual.reshape(*dual.shape[:4], -1)
+    flat = ahead.reshape(*ahead.shape[:3], -1)
+    furthest = int(stencils.reach[:, 1].max())
 
     def rows(band: int) -> None:
         begin, end = bands[band]
-        _sweep_band(data, steps, light_field, dual, begin, end, moved, first[band], last[band])
+        _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved)
 
-    def last_row(band: int) -> None:
-        inner = band + 1 < len(bands)
-        below = first[band + 1 if inner else band]
-        base = (bands[band, 1] - 1) * data.binning
-        _dual_rows(steps, last[band], below, inner, dual, base)
+    def last_rows(band: int) -> None:
+        begin, end = bands[band] * data.binning
+        _dual_rows(steps, stencils, flat, dual, max(begin, end - furthest), end)
 
-    for stage in (rows, last_row):
+    for stage in (rows, last_rows):
         for _ in run(stage, range(len(bands))):
             pass
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def total_variation_rows(light_field, metric, totals):
-    """Set totals (y,) to the total variation of every row of the light field."""
+def variation_rows(light_field, stencils, metric, totals):
+    """Set totals (y,) to DV_K of every row of a light field (v, u, y, colour, x)."""
     views_v, views_u, rows, _, width = light_field.shape
+    flat = light_field.reshape((views_v, views_u, rows, 3 * width))
     for y in prange(rows):
         square = np.empty(width, light_field.dtype)
-        step = np.empty((3, width), light_field.dtype)
+        lines = np.empty((3, width), light_field.dtype)
         total = 0.0
         for v in range(views_v):
             for u in range(views_u):
                 square[:] = 0
-                for direction in range(4):
-                    y_to = y + (direction == 1)
-                    u_to = u + (direction == 2)
-                    v_to = v + (direction == 3)
-                    if y_to == rows or u_to == views_u or v_to == views_v:
+                for index in range(len(stencils.reach)):
+                    if not _fits(light_field.shape, stencils.reach[index], v, u, y):
                         continue
-                    along = 1 if direction == 0 else 0
-                    for c in range(3):
-                        here, there = light_field[v, u, y, c], light_field[v_to, u_to, y_to, c]
-                        step[c, width - 1] = 0
-                        for x in range(width - along):
-                            step[c, x] = there[x + along] - here[x]
-                    mix(metric, step)
+                    _differentiate(flat, stencils, index, v, u, y, lines)
+                    mix(metric, lines)
                     for c in range(3):
                         for x in range(width):
-                            square[x] += step[c, x] ** 2
+                            square[x] += lines[c, x] ** 2
                 for x in range(width):
                     total += np.sqrt(square[x])
         totals[y] = total

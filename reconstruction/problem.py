@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from reconstruction import kernels
 from reconstruction.differences import planar_variation
 from reconstruction.errors import ReconstructionError
 from reconstruction.patch_term import PatchTerm
@@ -48,19 +47,11 @@ class Problem:
         """
         misfit = (self.psi.forward(light_field) - self.frames)[self.usable]
         planar = np.ascontiguousarray(rows_of_colours(light_field))
-        value = 0.5 * np.sum(np.square(misfit, dtype=np.float64)) + self.mu * self._variation(
-            planar
-        )
+        variation = planar_variation(planar, self.order, self.metric)
+        value = 0.5 * np.sum(np.square(misfit, dtype=np.float64)) + self.mu * variation
         if self.patch_term is not None:
             value += self.rho * self.patch_term.value(light_field)
         return float(value)
-
-    def _variation(self, planar: Array) -> float:
-        if self.order > 1:
-            return planar_variation(planar, self.order, self.metric)
-        rows = np.empty(planar.shape[2])
-        kernels.total_variation_rows(planar, self.metric, rows)
-        return float(rows.sum())
 
     def pixel_weight(self) -> NDArray[np.float64]:
         """Return rho W of the samples of each pixel, (pixel_y, pixel_x).

@@ -16,7 +16,6 @@ class Status(StrEnum):
     CONVERGED = "converged"
     STEP_LIMIT = "step limit reached"
     INCOMPLETE = "incomplete"
-    DOUBTFUL = "doubtful"
     IN_TILES = "in tiles"
 
 

@@ -209,7 +209,8 @@ class _Coder:
             for i in members:
                 code = solver(sensing.data[i], int(sensing.measured[i]))
                 codes.append(code)
-                bpdn.assemble(self.matrix, code.weights, patches[i])
+                used = np.flatnonzero(code.weights)
+                patches[i] = code.weights[used] @ self.matrix[used]
         return np.concatenate(work.members), patches, sensing.measured, codes
 
 

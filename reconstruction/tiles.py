@@ -23,9 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_order import ViewOrder
-from reconstruction.adaptive.edges import SIDES, dark_edges
-from reconstruction.adaptive.parsimony import may_be_grey
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
@@ -58,11 +55,6 @@ SAMPLE, SAMPLES = 96, 3
 SURE_PX, COVERED = 0.25, 99.0
 """Deviation of disparities below which they count for the halo, and percent of them that it covers:
 what lies further is seen by fewer readings of a block beside it, and averaged with that block's."""
-PLANAR_PX, ALIKE_PX = 1e-3, 0.06
-"""By how much a window's disparities may leave a plane that was taken for all of them; and windows
-the plane of all, half a step of the search."""
-EDGE_PX = 48
-"""Pixels beside a side of the light field in which a dark edge is looked for."""
 
 Array = NDArray[np.floating]
 Place = tuple[slice, slice]
@@ -89,17 +81,13 @@ class PsiSource(Protocol):
 @dataclass(frozen=True)
 class Block:
     """outer: rows and columns reconstructed; part: those that count, with what overlaps the
-    neighbours; inner: those nearer to it than to any other; all in the light field's samples.
-
-    sides: those of SIDES at which the light field ends.
-    """
+    neighbours; inner: those nearer to it than to any other; all in the light field's samples."""
 
     row: int
     column: int
     outer: Place
     part: Place
     inner: Place
-    sides: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -170,17 +158,14 @@ class Grid:
     def block(self, row: int, column: int) -> Block:
         """Return a block by its row and column in the grid."""
         halo = ceil(self.halo / self.multiple) * self.multiple
-        sides: list[str] = []
         places: list[list[slice]] = [[], [], []]
         for axis, at in enumerate((row, column)):
-            edges, length = self.edges[axis], self.size[axis]
-            first, last = edges[at], edges[at + 1]
-            sides += [SIDES[2 * axis]] if at == 0 else []
-            sides += [SIDES[2 * axis + 1]] if at == len(edges) - 2 else []
+            length = self.size[axis]
+            first, last = self.edges[axis][at : at + 2]
             for place, more in zip(places, (self._blend + halo, self._blend, 0), strict=True):
                 place.append(slice(max(first - more, 0), min(last + more, length)))
         outer, part, inner = ((rows, columns) for rows, columns in places)
-        return Block(row, column, outer, part, inner, tuple(sides))
+        return Block(row, column, outer, part, inner)
 
     def _weight(self, axis: int, at: int, place: slice) -> NDArray[np.float32]:
         """Return the weights along an axis of the at-th blocks, in a place."""
@@ -285,82 +270,17 @@ def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSet
     return lcm(2 * binning, settings.sparse.stride if dictionary is not None else 1)
 
 
-@dataclass(frozen=True)
-class SampleDisparity:
-    """What `adaptive-fast` estimates in a sample window.
-
-    largest_px: the largest disparity it is sure of. corners: (y, x, px) of the one plane that it
-    is, else none. silent: no patch preferred any disparity. order: of the views.
-    """
-
-    largest_px: float
-    corners: tuple[tuple[float, float, float], ...]
-    silent: bool
-    order: ViewOrder
-
-
-def _sample_disparity(
+def _largest_disparity(
     psi: ImagingMatrix,
     frames: Array,
     noise_sigma: float,
     usable: NDArray[np.bool_],
     settings: MethodSettings,
-    place: Place,
-) -> SampleDisparity:
-    """Return what a window at a place says; its corners are (y, x, px), in pixels of the whole."""
-    found = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable)
-    maps, silent = found.maps, not found.parameters.get("decided")
-    order = ViewOrder.numbered(found.parameters["view_order"])
-    disparity, k = maps["disparity"].astype(np.float64), psi.binning
-    sure = maps["disparity_sigma"] < SURE_PX
-    largest = float(np.percentile(np.abs(disparity[sure]), COVERED)) if sure.any() else 0.0
-    y, x = (part.ravel() / k for part in np.indices(disparity.shape))
-    system = np.stack([np.ones_like(y), y, x], axis=-1)
-    plane, *_ = np.linalg.lstsq(system, disparity.ravel(), rcond=None)
-    if np.abs(system @ plane - disparity.ravel()).max() > PLANAR_PX:
-        return SampleDisparity(largest, (), silent, order)
-    ends = product((0, psi.size[0] / k), (0, psi.size[1] / k))
-    top, left = (part.start / k for part in place)
-    corners = tuple((top + y, left + x, float(plane @ (1, y, x))) for y, x in ends)
-    return SampleDisparity(largest, corners, silent, order)
-
-
-def _joint_plane(
-    found: Iterable[SampleDisparity], size: tuple[int, int], binning: int
-) -> tuple[float, float, float] | None:
-    """Return middle, down and right of the plane that all windows lie on, if there is one."""
-    every = [one for one in found if not one.silent]
-    if not every or not all(one.corners for one in every):
-        return None
-    y, x, disparity = np.array([corner for one in every for corner in one.corners]).T
-    middle = [(length / binning - 1) / 2 for length in size]
-    system = np.stack([np.ones_like(y), y - 0.5 - middle[0], x - 0.5 - middle[1]], axis=-1)
-    plane, *_ = np.linalg.lstsq(system, disparity, rcond=None)
-    if np.abs(system @ plane - disparity).max() > ALIKE_PX:
-        return None
-    return tuple(0.0 if not disparity.any() else float(value) for value in plane)  # type: ignore[return-value]
-
-
-def _joint_order(found: Sequence[SampleDisparity]) -> ViewOrder:
-    """Return the order of views that most windows say."""
-    orders = [one.order for one in found]
-    return max(ViewOrder, key=orders.count)
-
-
-def _dark_sides(psi: PsiSource, frames: Array, usable: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the sides of the whole light field that views do not reach."""
-    k, found = psi.binning, []
-    for number, side in enumerate(SIDES):
-        axis, far = divmod(number, 2)
-        spans = [slice(0, length) for length in psi.size]
-        wide = min(EDGE_PX * k, psi.size[axis])
-        spans[axis] = slice(psi.size[axis] - wide, psi.size[axis]) if far else slice(0, wide)
-        part = psi.window(*spans)
-        seen = pixels_of((spans[0], spans[1]), k)
-        read = np.where(usable[seen], frames[seen], 0).astype(np.float32)
-        if dark_edges(flat_psi(part), read, usable[seen], (side,)) is not None:
-            found.append(side)
-    return tuple(found)
+) -> float:
+    """Return the largest disparity, in size, that `adaptive-fast` is sure of in a window."""
+    maps = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable).maps
+    sure = maps["disparity"][maps["disparity_sigma"] < SURE_PX]
+    return float(np.percentile(np.abs(sure), COVERED)) if sure.size else 0.0
 
 
 def surveyed(
@@ -402,31 +322,25 @@ def surveyed(
     patched = name == "adaptive" and takes_patches(mosaic, settings.adaptive)
     if method.settings is AdaptiveSettings:
         firsts = np.cumsum([0, *(one.frames_shape[2] for one in windows)])
-        disparities = []
-        for place, window, first in zip(places, windows, firsts, strict=False):
-            part = np.s_[:, :, first : first + window.frames_shape[2]]
-            if use[part].any():
-                disparities.append(
-                    _sample_disparity(window, read[part], noise_sigma, use[part], settings, place)
-                )
-        largest = max((one.largest_px for one in disparities), default=0.0)
+        parts = [
+            (window, np.s_[:, :, first : first + window.frames_shape[2]])
+            for window, first in zip(windows, firsts, strict=False)
+        ]
+        largest = max(
+            (
+                _largest_disparity(window, read[part], noise_sigma, use[part], settings)
+                for window, part in parts
+                if use[part].any()
+            ),
+            default=0.0,
+        )
         reach = PATCHED_REACH if patched else TEXTURE_REACH
         halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
         flat = flat_psi(mosaic)
         picture = smooth_guess(flat, read, use).astype(np.float32)
         noise = np.full(read.shape, noise_sigma**2)
-        plane = _joint_plane(disparities, psi.size, k) if settings.adaptive.parsimony else None
-        grey = settings.adaptive.parsimony and may_be_grey(picture)
-        adaptive = settings.adaptive.model_copy(
-            update={
-                "contrast": settings.adaptive.contrast
-                or contrast_of(flat, read, picture, noise, use),
-                "parsimony": plane is not None or grey,
-                "plane": plane,
-                "views": settings.adaptive.views or _joint_order(disparities),
-                "edges": _dark_sides(psi, frames, usable),
-            }
-        )
+        own = settings.adaptive.contrast or contrast_of(flat, read, picture, noise, use)
+        adaptive = settings.adaptive.model_copy(update={"contrast": own})
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
@@ -435,17 +349,6 @@ def surveyed(
         sparse = sparse_patches(settings.sparse, k)
     settled = _settled(mosaic, read, noise_sigma, use, settings, sparse)
     return Survey(settled, halo, left_out, gains, words, largest)
-
-
-def _of_block(settings: AdaptiveSettings, block: Block, size: tuple[int, int], k: int) -> dict:
-    """Return what of the settings is a block's own: its dark sides, and its part of the plane."""
-    own: dict[str, object] = {"edges": tuple(s for s in settings.edges if s in block.sides)}
-    if settings.plane is not None:
-        middle, down, right = settings.plane
-        off = [(part.start + part.stop - length) / 2 / k
-               for part, length in zip(block.outer, size, strict=True)]  # fmt: skip
-        own["plane"] = middle + down * off[0] + right * off[1], down, right
-    return own
 
 
 def _settled(
@@ -507,16 +410,8 @@ def solve_block(
         dark = np.zeros((*views, *(part.stop - part.start for part in block.part), 3), np.float32)
         result = Reconstruction(name, dark, Status.INCOMPLETE, "", 0, (), 0.0, {})
         return SolvedBlock({"light_field": dark}, result.without_light_field(), None)
-    own = _of_block(settings.adaptive, block, size, psi.binning)
-    adaptive = settings.adaptive.model_copy(update=own)
     result, verdict = reconstruct_judged(
-        name,
-        psi,
-        frames,
-        noise_sigma,
-        dictionary,
-        settings.model_copy(update={"adaptive": adaptive}),
-        usable,
+        name, psi, frames, noise_sigma, dictionary, settings, usable
     )
     place = within(block.part, block.outer)
     arrays = {"light_field": result.light_field[:, :, *place]}

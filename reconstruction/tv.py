@@ -13,10 +13,10 @@ to, z = (q / gamma + rho W M) / a, then z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I)
 per pixel. The paper's eq. 10-13 (`tests/full_splitting.py`) take gradients instead.
 
 Bytes of one step, float32, for N = v u y x c values, one stored colour of three and s shots:
-light field read and written 2 x 4N, dual variable read and written 2 x 16N, weights s x 4N/3; with
-patches their target read, 4N. Of DV_2 the dual variable is 10/4 as large, of DV_3 20/4, and a
-light field more is written, 4N; they are bound by operations, 2 x 36 and 2 x 120 multiplications
-and additions per value.
+light field read and written 2 x 4N, and once more written, 4N; dual variable read and written
+2 x 16N, weights s x 4N/3; with patches their target read, 4N. Of DV_2 the dual variable is 10/4 as
+large, of DV_3 20/4; they are bound by operations, 2 x 36 and 2 x 120 multiplications and additions
+per value.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pydantic import Field
 
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
-from reconstruction import difference_kernels, kernels
+from reconstruction import kernels
 from reconstruction.choices import (
     choose_mu,
     choose_primal_step,
@@ -181,10 +181,7 @@ def sweeping(
     dual_step = dtype.type(1 / (norm_squared * gamma))
     steps = kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
     bands = row_bands(psi.frames_shape[1], get_num_threads())
-    if order == 1:
-        dual = np.zeros((*light_field.shape[:3], 4, *light_field.shape[3:]), dtype=dtype)
-        return partial(kernels.sweep, fit, steps, light_field, dual), bands
     taps = stencils(order, (*light_field.shape[:3], light_field.shape[4]), dtype)
     dual = np.zeros((*light_field.shape[:3], len(taps.reach), *light_field.shape[3:]), dtype)
     ahead = np.empty_like(light_field)
-    return partial(difference_kernels.sweep, fit, steps, taps, light_field, dual, ahead), bands
+    return partial(kernels.sweep, fit, steps, taps, light_field, dual, ahead), bands

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from full_splitting import AXIS, adjoint, gradient
 
-from reconstruction import difference_kernels, kernels
+from reconstruction import kernels
 from reconstruction.differences import (
     fitting_indices,
     multi_indices,
@@ -197,10 +197,7 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
     taps = stencils(order, psi.light_field_shape, np.dtype(kind))
     shares = row_bands(psi.frames_shape[1], bands)
     for _ in range(count):
-        if order == 1:
-            kernels.sweep(data, steps, state, dual_state, shares, moved)
-        else:
-            difference_kernels.sweep(data, steps, taps, state, dual_state, room, shares, moved)
+        kernels.sweep(data, steps, taps, state, dual_state, room, shares, moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved
 
 

@@ -6,7 +6,9 @@ import sys
 import textwrap
 
 import pytest
+from pydantic import ValidationError
 
+from emmc_rig.model.errors import RemovedSettingWarning
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.dictionary import usual_patch
 from reconstruction.errors import ReconstructionError
@@ -105,3 +107,13 @@ def test_adaptive_takes_patches_from_two_shots_where_one_fits(
 def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(binning):
     stride = sparse_patches(SparseSettings(), binning).stride
     assert len(regular_grid((20 * binning,) * 2, usual_patch(binning), stride, binning)) > 1
+
+
+def test_settings_of_version_0_2_open_with_a_warning_for_what_is_gone():
+    old = {"adaptive": {"rest": False, "views": None, "stride": 5}}
+    with pytest.warns(RemovedSettingWarning, match="'(rest|views)' was removed") as seen:
+        settings = MethodSettings.model_validate(old)
+    assert len(seen) == 2
+    assert settings.adaptive == AdaptiveSettings(stride=5)
+    with pytest.raises(ValidationError, match="resst"):
+        MethodSettings.model_validate({"adaptive": {"resst": False}})

@@ -8,7 +8,6 @@ import pytest
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.edges import SIDES
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
@@ -53,13 +52,6 @@ def test_inner_parts_cover_every_sample_once_and_weights_of_parts_add_up_to_one(
             assert all(part.start >= 0 for part in within(place, other.part))
     np.testing.assert_array_equal(seen, 1)
     np.testing.assert_allclose(weights, 1, atol=1e-6)
-
-
-def test_only_blocks_at_the_border_may_have_dark_edges():
-    grid = Grid((90, 90), 2, 4, BlockSettings(whole=1, side=30, blend=2))
-    assert grid.block(1, 1).sides == ()
-    assert grid.block(0, 2).sides == ("top", "right")
-    assert {side for block in grid for side in block.sides} == set(SIDES)
 
 
 def test_sample_windows_lie_within_and_reach_all_corners():
@@ -132,7 +124,6 @@ def test_a_light_field_of_one_block_is_that_of_the_method_itself(random_psi):
     block = grid.block(0, 0)
     whole = (slice(0, 36), slice(0, 160))
     assert block.outer == block.part == block.inner == whole
-    assert block.sides == SIDES
 
 
 def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):

@@ -14,7 +14,7 @@ from programs import program
 
 import emmc_rig as emmc
 from emmc_rig.model.errors import ViewOrderWarning
-from emmc_rig.model.lightfield import load_views, psnr_db, save_views
+from emmc_rig.model.lightfield import load_views, save_views
 from emmc_rig.model.view_order import ViewOrder, order_of
 
 WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]
@@ -121,42 +121,3 @@ def test_commands_say_it_in_a_line(tmp_path: Path, truth: np.ndarray) -> None:
     said = [line for line in errors.splitlines() if ViewOrder.TRANSPOSED.words in line]
     assert len(said) == 1
     assert said[0].startswith("note:")
-
-
-def _found(light_field: np.ndarray, method: str, shots: int) -> emmc.Result:
-    camera = emmc.camera(f"rgbw-bayer-{shots}shot" + "s" * (shots > 1))
-    psi = camera.psi(light_field.shape[2:4])
-    return emmc.reconstruct(psi, camera.expose(light_field, 0, psi), method)
-
-
-@pytest.fixture(scope="module")
-def right(truth: np.ndarray) -> emmc.Result:
-    return _found(truth, "adaptive-fast", 1)
-
-
-@pytest.mark.parametrize("order", WRONG)
-def test_frames_tell_the_order_that_psi_does_not(
-    truth: np.ndarray, right: emmc.Result, order: ViewOrder
-) -> None:
-    named = order.named(truth)
-    wrong = _found(named, "adaptive-fast", 1)
-    assert psnr_db(wrong.light_field, named) > psnr_db(right.light_field, truth) - 0.2
-    assert wrong.verdict.level == "doubt"
-    assert order.words in wrong.verdict.words
-    assert not any(one.words in right.verdict.words for one in WRONG)
-    sigma = wrong.sigma
-    assert sigma is not None
-    square = np.square(wrong.light_field - named).mean(axis=-1)
-    seen, other = (
-        np.corrcoef(np.log(s.ravel() + 1e-9), np.log(square.ravel() + 1e-9))[0, 1]
-        for s in (sigma, order.named(sigma))
-    )
-    assert seen > other
-
-
-def test_sparse_patches_lie_in_the_same_order(truth: np.ndarray) -> None:
-    lying = truth[:, :, 32:96, 32:112]
-    named = ViewOrder.TRANSPOSED.named(lying)
-    right, wrong = _found(lying, "adaptive", 2), _found(named, "adaptive", 2)
-    assert ViewOrder.TRANSPOSED.words in wrong.verdict.words
-    assert psnr_db(wrong.light_field, named) > psnr_db(right.light_field, lying) - 0.2

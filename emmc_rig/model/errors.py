@@ -29,3 +29,7 @@ class SensingError(ModelError):
 
 class ViewOrderWarning(UserWarning):
     """Views of a light field were stored in another order than their names say, and put right."""
+
+
+class RemovedSettingWarning(UserWarning):
+    """A file holds a setting that this version no longer has; it is ignored."""

@@ -4,15 +4,33 @@ from __future__ import annotations
 
 import difflib
 import re
-from typing import Any, TypeVar, get_args
+import warnings
+from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
+from emmc_rig.model.errors import RemovedSettingWarning
+
 
 class Settings(BaseModel):
-    """Base of every configuration object: frozen, no unknown keys, no coercion of NaN."""
+    """Base of every configuration object: frozen, no unknown keys, no coercion of NaN.
+
+    removed: keys that files of earlier versions may hold; they are ignored, with a warning.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    removed: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_removed(cls, data: object) -> object:
+        """Drop keys that earlier versions had, and say so."""
+        if not isinstance(data, dict):
+            return data
+        for name in sorted(set(cls.removed).intersection(data)):
+            text = f"the setting '{name}' was removed in version 0.3 and is ignored"
+            warnings.warn(text, RemovedSettingWarning, stacklevel=2)
+        return {name: value for name, value in data.items() if name not in cls.removed}
 
     @model_validator(mode="before")
     @classmethod

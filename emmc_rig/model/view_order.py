@@ -50,16 +50,6 @@ class ViewOrder(StrEnum):
         }[self]
 
     @property
-    def number(self) -> float:
-        """Its place among the orders, for figures of a result; see `numbered`."""
-        return float(list(ViewOrder).index(self))
-
-    @classmethod
-    def numbered(cls, number: float) -> ViewOrder:
-        """Return the order of a number."""
-        return list(cls)[round(number)]
-
-    @property
     def interchanges(self) -> bool:
         """Whether rows of views are named as columns."""
         return self in (ViewOrder.TRANSPOSED, ViewOrder.TURNED)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive.joint import TextureSettings
 
 Length = Annotated[float, Field(gt=0)]
@@ -19,6 +18,8 @@ class AdaptiveSettings(Settings):
     Twice and half of each cost what docs/results/constants.csv says, most the lengths of textures
     and the chrominance and threshold of the shrinkage (0.3 to 0.8 dB).
     """
+
+    removed: ClassVar[tuple[str, ...]] = ("parsimony", "free", "rest", "views", "edges", "plane")
 
     furthest_px: float = Field(
         default=24.0, gt=0, description="largest disparity searched, to both sides"
@@ -52,37 +53,16 @@ class AdaptiveSettings(Settings):
         default="larger", description="disparity of what is in front; pictures may be flipped"
     )
     texture: TextureSettings = Field(default_factory=TextureSettings)
-    parsimony: bool = Field(
-        default=True, description="one plane, or no colour, where the whole scene needs no more"
-    )
     start_steps: int = Field(
         default=40, ge=1, description="of total variation, from which textures begin"
     )
-    free: bool = Field(
-        default=True, description="average with total variation where it explains the frames"
-    )
     patches: int | None = Field(
-        default=2, ge=1, description="shots from which sparse patches take its place; none: never"
-    )
-    rest: bool = Field(
-        default=True, description="add a light field of the residual, where held-out readings agree"
-    )
-    views: ViewOrder | None = Field(
-        default=None, description="how the views of Psi lie; None: as the frames say"
-    )
-    edges: tuple[Literal["top", "bottom", "left", "right"], ...] = Field(
-        default=("top", "bottom", "left", "right"),
-        description="sides that may be dark because views do not reach them",
+        default=2, ge=1, description="shots from which sparse patches are in the mean; none: never"
     )
     contrast: float | None = Field(
         default=None,
         gt=0,
         description="deviation of the values of the scene that this is a part of; None: its own",
-    )
-    plane: tuple[float, float, float] | None = Field(
-        default=None,
-        description="disparity, where parsimony is asked for and it is known to be one plane: in "
-        "the middle, px, and its change per pixel down and right",
     )
 
 

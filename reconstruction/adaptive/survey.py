@@ -1,4 +1,4 @@
-"""What is decided once for a whole scene: its contrast, disparities, weights, and models.
+"""What is decided once for a whole scene: its contrast, disparities and weights.
 
 All of it needs the whole picture, or is better known from it; a part of the picture is fitted with
 it as it stands (`fits`).
@@ -7,30 +7,17 @@ it as it stands (`fits`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import centre_view
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.given import Given
-from reconstruction.adaptive.joint import TextureSettings, solve
-from reconstruction.adaptive.parsimony import (
-    Plane,
-    colour_is_needed,
-    grey_bound_db,
-    grey_psi,
-    may_be_grey,
-    one_plane,
-    plane_bound_db,
-)
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
-from reconstruction.adaptive.views import in_order, order_by_evidence
 from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import FlatPsi, flat_psi
@@ -44,44 +31,27 @@ CONTRAST = 0.15
 settings are shares of that. Against a mean brightness of 0.25 in its place, on 96x96 crops of group
 A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and they gain nothing. 2x -0.01,
 0.5x 0.00 dB."""
-TRIAL_STEPS = 4
-"""Of the fits with colour and without that decide whether the scene has any. 2x 0.00, 0.5x 0.00 dB.
-"""
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """What is fitted: Psi, of one colour or three; the centre view's disparity (y, x) and picture
-    (y, x, c) to begin with; the steps; whether one plane is all there is."""
-
-    psi: ImagingMatrix
-    centre: Array
-    picture: Array
-    texture: TextureSettings
-    planar: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """given: as it was, but its views as they lie, in `order`. scale: of the scene's contrast;
-    bright: `given` over it. held: readings kept from every fit. unexplained: residual of the smooth
-    picture. volume: beliefs about disparities. unseen: variance by colours that frames do not show,
-    (y, x). mu: weight of total variation, plain: its light field. model: what is fitted, left_out:
-    in words, what the scene does not need.
+    """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
+    readings kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
+    disparities. unseen: variance by colours that frames do not show, (y, x). plain: light field of
+    total variation. centre, picture: the centre view's disparity (y, x) and picture (y, x, c), over
+    the scale, to begin with.
     """
 
     given: Given
-    order: ViewOrder
     scale: float
     bright: Given
     held: NDArray[np.bool_]
     unexplained: Array
     volume: search.Volume
     unseen: Array
-    mu: float
     plain: Array
-    model: Model
-    left_out: tuple[str, ...]
+    centre: Array
+    picture: Array
 
 
 def surveyed(
@@ -114,9 +84,7 @@ def surveyed(
         TexturePrior(length, tuple(finer), freedom=settings.freedom)
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
-    order = settings.views or order_by_evidence(data, fine)
-    psi = in_order(given.psi, order)
-    given, bright, data = replace(given, psi=psi), replace(bright, psi=psi), replace(data, psi=psi)
+    psi = given.psi
     volume = _searched(data, coarse, fine, settings, on_searched)
     centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     held = held_out(given.usable)
@@ -128,13 +96,7 @@ def surveyed(
     )
     plain = reconstruct_tv(psi, given.frames, given.typical, start, fitted).light_field
     begun = centre_view(plain) / np.float32(scale)
-    model, left_out = Model(psi, centre, begun, settings.texture), ()
-    if settings.parsimony:
-        model, left_out = _needed(model, volume, bright, held, settings)
-    return Survey(
-        given, order, scale, bright, held, data.readings, volume, unseen, mu, plain, model,
-        tuple(left_out),
-    )  # fmt: skip
+    return Survey(given, scale, bright, held, data.readings, volume, unseen, plain, centre, begun)
 
 
 def contrast_of(
@@ -167,53 +129,3 @@ def _searched(
     )
     on_searched(2)
     return volume
-
-
-def _needed(
-    model: Model,
-    volume: search.Volume,
-    bright: Given,
-    held: NDArray[np.bool_],
-    settings: AdaptiveSettings,
-) -> tuple[Model, list[str]]:
-    """Return the smallest model that the whole scene needs, and what of the full one it lacks."""
-    left_out = []
-    psi = model.psi
-    pixels = psi.frames_shape[1:]
-    plane = one_plane(volume, pixels) if settings.plane is None else Plane(*settings.plane)
-    if plane is not None:
-        bound = plane_bound_db(plane, volume, pixels, model.picture)
-        kept = "one picture for all views" if plane.is_static else "one plane for the whole scene"
-        left_out.append(f"relief: {kept} (at best {bound:.0f} dB)")
-        still = model.texture.model_copy(update={"refine_steps": 0, "sweeps": ()})
-        centre = plane.over(psi.size, psi.binning)
-        model = replace(model, centre=centre, texture=still, planar=True)
-    if may_be_grey(model.picture):
-        grey = replace(model, psi=grey_psi(psi), picture=model.picture.mean(axis=-1, keepdims=True))
-        residuals = [_trial(one, bright, held, settings)[held] for one in (model, grey)]
-        if not colour_is_needed(*residuals):
-            left_out.append(f"colour: one for all (at best {grey_bound_db(model.picture):.0f} dB)")
-            model = grey
-    return model, left_out
-
-
-def _trial(
-    model: Model, bright: Given, held: NDArray[np.bool_], settings: AdaptiveSettings
-) -> Array:
-    """Return the residual (shot, pixel_y, pixel_x) of a short fit of a model."""
-    quick = model.texture.model_copy(update={"steps": TRIAL_STEPS, "refine_steps": 0})
-    scene = solve(
-        model.psi,
-        model.centre,
-        in_front(settings),
-        bright.frames,
-        bright.precision(held, settings.misfits[-1]),
-        model.picture,
-        quick,
-    )
-    return bright.frames - scene.surfaces.forward(scene.texture)
-
-
-def in_front(settings: AdaptiveSettings) -> int:
-    """Return 1 where points of larger disparity are in front, -1 where they are behind."""
-    return 1 if settings.nearer == "larger" else -1

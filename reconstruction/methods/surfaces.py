@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_order import ViewOrder
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
-from reconstruction.adaptive.views import in_order
 from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
 from reconstruction.method import Given, Method, Sensitivity
 from reconstruction.methods import tv_dict
@@ -58,12 +56,9 @@ def _solve(
 ) -> Reconstruction:
     adaptive, psi = chosen(settings.adaptive), given.psi
 
-    def patches(usable: NDArray[np.bool_], order: ViewOrder) -> NDArray[np.float32]:
+    def patches(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
         atoms = _dictionary(psi.light_field_shape[:2], psi.binning)
-        lying = in_order(psi, order)
-        fitted = dataclasses.replace(
-            given, psi=lying, usable=usable, dictionary=atoms, on_step=None
-        )
+        fitted = dataclasses.replace(given, usable=usable, dictionary=atoms, on_step=None)
         sparse = sparse_patches(settings.sparse, psi.binning)
         unseen = settings.tv.model_copy(update={"objective_every": settings.tv.max_steps + 1})
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})

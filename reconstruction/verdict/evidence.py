@@ -82,8 +82,9 @@ class Evidence:
         return cls(**{key: _tupled(value) for key, value in figures.items()})
 
 
-TOLD = ("decided", "at_end", "share_free", "over_plain", "misfit", "misfit_row", "misfit_column",
-        "view_order")  # fmt: skip
+REPORTED_PARAMETERS = (
+    "decided", "at_end", "over_plain", "misfit", "misfit_row", "misfit_column"
+)  # fmt: skip
 """Parameters of a result that bear on whether it can be trusted."""
 
 
@@ -160,7 +161,9 @@ def gathered(
         noise_share=None if fits is None else fits.noise,
         beyond=None if fits is None else fits.beyond,
         colour_error=_colour_error(psi, frames, usable, found),
-        parameters={key: result.parameters[key] for key in TOLD if key in result.parameters},
+        parameters={
+            key: result.parameters[key] for key in REPORTED_PARAMETERS if key in result.parameters
+        },
         short=read.short,
     )
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from emmc_rig.model.view_order import ViewOrder
 from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
@@ -441,16 +440,6 @@ def _search(e: Evidence) -> Iterator[Reason]:
                 "more light, longer exposure or more shots",
                 "doubt",
             )
-    order = ViewOrder.numbered(e.parameters.get("view_order", 0.0))
-    if order != ViewOrder.AS_NAMED:
-        yield Reason(
-            f"{order.words}: so the parallax in the readings says, and so the light field was "
-            "found; it names its views as Psi does",
-            order.number,
-            "compare the order in which calibration opened the aperture with the sensor's rows and "
-            "columns, or the names of the scene's views with them",
-            "doubt",
-        )
     yield Reason(
         f"{at_end:.0%} of the patches fit best at the end of the range of disparities searched",
         at_end,
