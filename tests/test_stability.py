@@ -182,10 +182,10 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
 
 
 def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
-    missing = replace(METHODS["unrolled"], package="no_such_module")
-    monkeypatch.setitem(METHODS, "unrolled", missing)
-    outcome = run_stability(quick(methods=("tv", "unrolled")), tmp_path / "out", Silent())
-    assert outcome.left_out == ["unrolled needs no_such_module, which is not installed"]
+    missing = replace(METHODS["tv-dict"], package="no_such_module")
+    monkeypatch.setitem(METHODS, "tv-dict", missing)
+    outcome = run_stability(quick(methods=("tv", "tv-dict")), tmp_path / "out", Silent())
+    assert outcome.left_out == ["tv-dict needs no_such_module, which is not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 

@@ -76,8 +76,8 @@ def test_the_protocol_loses_by_mismatch_and_recovers_most_of_it(tmp_path, camera
     again = Counted()
     monkeypatch.setattr(Point, "trial", None)
     assert measure_mismatch(settings, tmp_path, again) == [row]
-    monkeypatch.setitem(METHODS, "unrolled", replace(METHODS["unrolled"], package="no_such_module"))
-    more = settings.model_copy(update={"methods": ("tv", "unrolled")})
+    monkeypatch.setitem(METHODS, "tv-dict", replace(METHODS["tv-dict"], package="no_such_module"))
+    more = settings.model_copy(update={"methods": ("tv", "tv-dict")})
     assert measure_mismatch(more, tmp_path, again) == [row]
     sections = mismatch_sections([row], tmp_path)
     assert f"{row.blind:.2f}" in sections[0].body

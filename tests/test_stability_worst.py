@@ -121,30 +121,30 @@ def test_the_command_says_what_harms_a_method_and_goes_on_where_it_stopped(run, 
 
 
 @pytest.fixture
-def without_torch(monkeypatch):
+def one_not_installed(monkeypatch):
     """Two methods, one of which is not installed."""
-    missing = replace(METHODS["unrolled"], package="no_such_module")
-    for name in set(METHODS) - {"tv", "unrolled"}:
+    missing = replace(METHODS["tv-dict"], package="no_such_module")
+    for name in set(METHODS) - {"tv", "tv-dict"}:
         monkeypatch.delitem(METHODS, name)
-    monkeypatch.setitem(METHODS, "unrolled", missing)
+    monkeypatch.setitem(METHODS, "tv-dict", missing)
 
 
 def test_every_method_is_measured_but_one_not_installed_which_is_named_once(
-    run, without_torch, tmp_path
+    run, one_not_installed, tmp_path
 ):
     command = ("stability", "--worst", "--fast", "--method", "all", "--size", "24x32")
     code, out, err = run(*command, "--out", "out")
     assert code == 0, err
     reported = " ".join((out + err).split())
-    assert reported.count("unrolled needs no_such_module, which is not installed") == 1
+    assert reported.count("tv-dict needs no_such_module, which is not installed") == 1
     with open(tmp_path / "out" / "worst.csv", newline="") as rows:
         assert {row["method"] for row in csv.DictReader(rows)} == {"tv"}
 
 
-def test_nothing_but_a_method_that_is_not_installed_is_one_line(run, without_torch):
-    code, _, err = run("stability", "--worst", "--fast", "--method", "unrolled", "--size", "24x32")
+def test_nothing_but_a_method_that_is_not_installed_is_one_line(run, one_not_installed):
+    code, _, err = run("stability", "--worst", "--fast", "--method", "tv-dict", "--size", "24x32")
     assert code == 1
-    assert "unrolled needs no_such_module" in err
+    assert "tv-dict needs no_such_module" in err
 
 
 @pytest.mark.parametrize(

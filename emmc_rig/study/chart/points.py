@@ -189,7 +189,7 @@ _FIXED = {
     "dict-admm": ("fast", {"sparse": _QUICK_PATCHES}),
 }
 """Settings whose work does not depend on how soon they converge, where there are such."""
-_NOT_SWEPT = (*SLOW_METHODS, "tv-dict", "unrolled")
+_NOT_SWEPT = (*SLOW_METHODS, "tv-dict")
 _NOT_SWEPT_FAST = ("dict-admm", "adaptive-fast")
 
 

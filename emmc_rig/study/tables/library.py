@@ -332,7 +332,7 @@ def check_not_trained_on(dictionary: Dictionary, spec: str, scenes: Sequence[str
     if names is None:
         raise AppError(
             f"--dictionary {spec}: does not say which scenes it was trained on, so nothing can be "
-            "scored with it; train it with `emmc-rig train`"
+            "scored with it; make it with benchmarks/train_dictionary.py"
         )
     leaked = [scene for scene in scenes if one_of(scene, names)]
     if leaked:
