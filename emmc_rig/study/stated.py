@@ -1,6 +1,6 @@
 """What a reconstruction states of itself against the truth: PSNR before, deviation after.
 
-The PSNR that a trial on the frames expects of each method (`emmc_rig.advice.trial`) is compared
+The PSNR that a trial on the frames expects of each method (`emmc_rig.study.prospects`) is compared
 with that of its reconstruction. Where a method states deviations, the errors within one and two of
 them are counted: 68 and 95 % are meant.
 """
@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from emmc_rig.advice.trial import SURE_DB, Prospect, prospects
 from emmc_rig.model.frames import Frames
 from emmc_rig.pages.page import number
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.guard import cases, key
+from emmc_rig.study.prospects import SURE_DB, Prospect, prospects
 from emmc_rig.study.trial import Capture, trial_of
 
 
