@@ -53,7 +53,7 @@ def capture():
 
 
 @pytest.mark.timing("compares two times")
-def test_the_time_of_a_window_foretells_that_of_the_whole(capture):
+def test_the_time_of_a_window_predicts_that_of_the_whole(capture):
     psi, frames = capture
     timed(psi, frames)  # compiles
     expected = timed(psi, frames)
