@@ -27,7 +27,6 @@ from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate
 from emmc_rig.commands.stability import stability
 from emmc_rig.commands.tables import tables
-from emmc_rig.commands.train import train
 from emmc_rig.errors import ERRORS, StoppedError, WrongUsageError
 from emmc_rig.model.errors import RemovedSettingWarning, ViewOrderWarning
 from emmc_rig.version import __version__
@@ -48,7 +47,7 @@ for name, group in (("devices", devices), ("session", session)):
         member.cls = ModalCommand
     app.add_typer(group, name=name)
 for command in (
-    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart, train,
+    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart,
     tables, stability, design,
 ):  # fmt: skip
     app.command(cls=ModalCommand)(command)

@@ -23,6 +23,7 @@ from reconstruction.errors import DictionaryError
 
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
 FORMAT = "emmc-rig dictionary 1"
+REMEDY = "benchmarks/train_dictionary.py makes a dictionary"
 _NORM_TOLERANCE = 1e-3
 _CHUNK_BYTES = 1 << 20
 
@@ -130,12 +131,12 @@ class Dictionary:
         Raises DictionaryError: no such file, not HDF5, cut short or damaged, or no dictionary.
         """
         path = Path(path)
-        with stored_arrays(path, DictionaryError, "`emmc-rig train` makes a dictionary") as stored:
+        with stored_arrays(path, DictionaryError, REMEDY) as stored:
             format_ = stored.attributes.get("format")
             if format_ != FORMAT:
                 raise DictionaryError(
                     f"{path}: not a dictionary of this program (format {format_!r}, "
-                    f"needs {FORMAT!r}); `emmc-rig train` makes one"
+                    f"needs {FORMAT!r}); benchmarks/train_dictionary.py makes one"
                 )
             atoms, kind = stored.array("atoms"), str(stored.attributes["kind"])
             provenance = stored.text("provenance")

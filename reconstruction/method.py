@@ -51,7 +51,7 @@ class Given:
         """Return the dictionary; raises ReconstructionError when there is none."""
         if self.dictionary is None:
             raise ReconstructionError(
-                f"'{method}' needs a dictionary: `emmc-rig train` makes one, --dictionary names it"
+                f"'{method}' needs a dictionary: give --dictionary lambertian, or a file"
             )
         return self.dictionary
 

@@ -5,17 +5,18 @@ import pickle
 
 import numba
 
+from emmc_rig.processing.pool import Pool
+
 
 class StoppedHereError(Exception):
     """Somebody stopped the tasks."""
 
 
-class Here:
+class Here(Pool):
     """A pool that computes in this process, first things last if asked to, until it is stopped."""
 
-    size = 1
-
     def __init__(self, backwards=False, stop_after=None):
+        super().__init__(1)
         self.backwards, self.stop_after, self.done = backwards, stop_after, []
 
     def run(self, task, items):
@@ -25,12 +26,6 @@ class Here:
                 raise StoppedHereError
             self.done.append(item)
             yield item, task(item)
-
-    def fit(self, task_bytes):
-        self.needed = task_bytes
-
-    def end(self):
-        pass
 
 
 class Posting(Here):

@@ -44,7 +44,7 @@ GUARDED = {
     "OpenEXR": (CHILD,),
     "zarr": ("emmc_rig/files/shards.py",),
     "numpy.load": ("emmc_rig/pages/pictures.py",),  # what a study keeps for itself
-    "torch.load": ("reconstruction/unrolled/learning.py",),  # its own checkpoints, weights alone
+    "torch.load": (),
     "pickle.load": (),
 }
 """By decoder, the modules that may call it."""

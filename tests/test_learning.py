@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from emmc_rig.model.settings import validated
-from reconstruction import learning, separable
+from reconstruction import learning
 from reconstruction.batch_omp import NO_ATOM, batch_omp
-from reconstruction.checkpoint import load_checkpoint, save_checkpoint
 from reconstruction.errors import DictionaryError
 from reconstruction.learning import (
     LearningSettings,
@@ -15,14 +14,6 @@ from reconstruction.learning import (
     flat_atoms,
     ksvd_step,
     learn_ksvd,
-)
-from reconstruction.online import OnlineState, learn_online
-from reconstruction.separable import (
-    SeparableSettings,
-    SeparableState,
-    learn_separable,
-    separable_dictionary,
-    separable_step,
 )
 from reconstruction.training_patches import (
     PatchSettings,
@@ -227,26 +218,6 @@ def test_a_planted_dictionary_is_recovered(seed):
     assert recovered(truth, state.atoms) >= 0.95
 
 
-def test_a_planted_dictionary_is_recovered_online():
-    truth, patches = planted(3000, noise=0.03)
-    state = learn_online(patches, SHAPE, settings_of(iterations=25))
-    assert recovered(truth, state.atoms) >= 0.95
-
-
-def test_online_learning_reaches_the_error_of_scikit_learn_s():
-    decomposition = pytest.importorskip("sklearn.decomposition")
-    _, patches = planted(2000, noise=0.03)
-    ours = learn_online(patches, SHAPE, settings_of(iterations=15)).atoms
-    theirs = decomposition.MiniBatchDictionaryLearning(
-        n_components=60, alpha=0.3, batch_size=200, max_iter=10, random_state=0
-    ).fit(patches)
-    error = {}
-    for name, atoms in {"ours": ours, "theirs": unit(theirs.components_)}.items():
-        codes = dense(*batch_omp(atoms, patches, 3), 60)
-        error[name] = np.square(patches - codes @ atoms).mean()
-    assert error["ours"] <= 1.05 * error["theirs"]
-
-
 def test_atoms_unused_or_doubled_are_replaced_by_what_is_worst_coded():
     _, patches = planted(200, noise=0.1)
     settings = settings_of()
@@ -275,50 +246,31 @@ def test_flat_atoms_stay_and_span_the_flat_colours():
     rng = np.random.default_rng(0)
     patches = rng.random((200, 144)).astype(np.float32)
     flat = flat_atoms(shape)
-    for learn in (learn_ksvd, learn_online):
-        settings = settings_of(atoms=20, flat_atoms=True, iterations=2)
-        np.testing.assert_array_equal(learn(patches, shape, settings).atoms[:3], flat)
+    settings = settings_of(atoms=20, flat_atoms=True, iterations=2)
+    np.testing.assert_array_equal(learn_ksvd(patches, shape, settings).atoms[:3], flat)
     for colour in np.eye(3):
         patch = np.broadcast_to(colour, shape).ravel()
         np.testing.assert_allclose(flat.T @ (flat @ patch), patch, atol=1e-6)
-
-
-LEARNERS = {
-    "ksvd": (learn_ksvd, settings_of, LearningState),
-    "online": (learn_online, settings_of, OnlineState),
-    "separable": (
-        learn_separable,
-        lambda iterations=5, seed=0: SeparableSettings(
-            pairs=3, sparsity=4, iterations=iterations, seed=seed
-        ),
-        SeparableState,
-    ),
-}
 
 
 def arrays(state):
     return {k: v for k, v in vars(state).items() if k != "history"}
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_resumed_training_is_the_undisturbed_one(name, tmp_path):
-    learn, settings, kind = LEARNERS[name]
+def test_a_resumed_training_is_the_undisturbed_one():
     _, patches = planted(300, noise=0.1)
-    whole = learn(patches, SHAPE, settings(iterations=5))
-    save_checkpoint(tmp_path / "c.h5", learn(patches, SHAPE, settings(iterations=2)), {"a": 1})
-    kept = load_checkpoint(tmp_path / "c.h5", kind, {"a": 1})
-    resumed = learn(patches, SHAPE, settings(iterations=5), kept)
+    whole = learn_ksvd(patches, SHAPE, settings_of(iterations=5))
+    kept = learn_ksvd(patches, SHAPE, settings_of(iterations=2))
+    resumed = learn_ksvd(patches, SHAPE, settings_of(iterations=5), kept)
     assert resumed.history == whole.history
     for key, array in arrays(whole).items():
         np.testing.assert_array_equal(array, arrays(resumed)[key])
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_the_same_seed_gives_the_same_result_and_another_another(name):
-    learn, settings, _ = LEARNERS[name]
+def test_the_same_seed_gives_the_same_result_and_another_another():
     _, patches = planted(300, noise=0.1)
     one, same, other = (
-        learn(patches, SHAPE, settings(iterations=2, seed=seed)) for seed in (5, 5, 6)
+        learn_ksvd(patches, SHAPE, settings_of(iterations=2, seed=seed)) for seed in (5, 5, 6)
     )
     assert one.history == same.history
     for key, array in arrays(one).items():
@@ -352,10 +304,9 @@ def test_every_step_is_seen_and_steps_do_not_change_their_input():
 )
 def test_patches_that_teach_nothing_are_refused(change, reported):
     _, patches = planted(100)
-    for learn in (learn_ksvd, learn_online):
-        with pytest.raises(DictionaryError) as fault:
-            learn(change(patches), SHAPE, settings_of())
-        assert reported in str(fault.value)
+    with pytest.raises(DictionaryError) as fault:
+        learn_ksvd(change(patches), SHAPE, settings_of())
+    assert reported in str(fault.value)
 
 
 def test_settings_that_fit_no_patches_are_refused():
@@ -368,90 +319,10 @@ def test_settings_that_fit_no_patches_are_refused():
         validated(LearningSettings, {"sparsty": 3}, "settings", DictionaryError)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_state_of_another_training_is_refused(name):
-    learn, settings, _ = LEARNERS[name]
-    state = learn(planted(300)[1], SHAPE, settings(iterations=1))
+def test_a_state_of_another_training_is_refused():
+    state = learn_ksvd(planted(300)[1], SHAPE, settings_of(iterations=1))
     with pytest.raises(DictionaryError, match="other patches or settings"):
-        learn(planted(300, samples=36)[1], (2, 2, 3, 3, 1), settings(iterations=2), state)
-
-
-def test_checkpoints_are_whole_or_absent_and_say_what_differs(tmp_path):
-    path = tmp_path / "c.h5"
-    state = learn_ksvd(planted(100)[1], SHAPE, settings_of(iterations=1))
-    save_checkpoint(path, state, {"scenes": ["a"], "seed": 1})
-    assert [p.name for p in tmp_path.iterdir()] == ["c.h5"]
-    with pytest.raises(DictionaryError, match=r"seed 1 \(now 2\)"):
-        load_checkpoint(path, LearningState, {"scenes": ["a"], "seed": 2})
-    with pytest.raises(DictionaryError, match="no checkpoint"):
-        load_checkpoint(tmp_path / "none.h5", LearningState, {})
-    whole = path.read_bytes()
-    for part in (0, 100, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:part])
-        with pytest.raises(DictionaryError, match=r"c\.h5"):
-            load_checkpoint(path, LearningState, {})
-
-
-def test_a_planted_ensemble_of_separable_bases_is_learnt():
-    rng = np.random.default_rng(0)
-
-    def bases(size):
-        return [np.linalg.qr(rng.standard_normal((size, size)))[0] for _ in range(2)]
-
-    views, samples = bases(4), bases(12)
-    patches = np.zeros((1200, 48), np.float32)
-    for i in range(len(patches)):
-        codes = np.zeros(48)
-        codes[rng.choice(48, 3, replace=False)] = rng.standard_normal(3)
-        patches[i] = (views[i % 2] @ codes.reshape(4, 12) @ samples[i % 2].T).ravel()
-    settings = SeparableSettings(pairs=2, sparsity=3, iterations=25, atoms=96)
-    state = learn_separable(patches, SHAPE, settings)
-    errors = [done.coded_rmse for done in state.history]
-    assert (np.diff(errors) <= 1e-3 * errors[0]).all()
-    assert errors[-1] < 0.02 * errors[0]
-    dictionary = separable_dictionary(state, patches, SHAPE, settings)
-    assert dictionary.kind == "separable"
-    codes = dense(*batch_omp(dictionary.matrix, patches, 3), dictionary.size)
-    assert np.square(patches - codes @ dictionary.matrix).mean() < 1e-3 * np.square(patches).mean()
-
-
-def test_the_largest_values_are_kept_whatever_their_sign_and_ties():
-    rng = np.random.default_rng(0)
-    values = rng.standard_normal((40, 30)).astype(np.float32)
-    values[0] = 1
-    values[1, :20] = -2
-    values[1, 20:] = 2
-    values[1, 25] = 3
-    plain = np.zeros_like(values)
-    for row, kept in zip(values, plain, strict=True):
-        largest = np.argsort(-np.abs(row), kind="stable")[:7]
-        kept[largest] = row[largest]
-    energies = np.empty(40)
-    separable._keep_largest_rows(values, 7, energies)
-    np.testing.assert_array_equal(values, plain)
-    np.testing.assert_allclose(energies, np.square(plain).sum(axis=1), rtol=1e-6)
-
-
-def test_separable_bases_stay_orthonormal():
-    _, patches = planted(200, noise=0.1)
-    settings = SeparableSettings(pairs=3, sparsity=4, iterations=3)
-    state = learn_separable(patches, SHAPE, settings)
-    for basis in (*state.view_bases, *state.sample_bases):
-        np.testing.assert_allclose(basis @ basis.T, np.eye(len(basis)), atol=1e-5)
-    again = separable_step(state, patches.reshape(200, 4, 12), settings)
-    assert again.history[-1].coded_rmse <= state.history[-1].coded_rmse
-
-
-def test_separable_training_refuses_what_teaches_nothing():
-    _, patches = planted(100)
-    settings = SeparableSettings(pairs=4)
-    for wrong, reported in (
-        (patches[:, 1:], "needs"),
-        (patches[:3], "3 patches for 4 pairs"),
-        (patches * np.nan, "not finite"),
-    ):
-        with pytest.raises(DictionaryError, match=reported):
-            learn_separable(wrong, SHAPE, settings)
+        learn_ksvd(planted(300, samples=36)[1], (2, 2, 3, 3, 1), settings_of(iterations=2), state)
 
 
 def ramp_scene(views=(3, 3), size=(12, 14), colours=3):

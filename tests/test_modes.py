@@ -55,8 +55,7 @@ def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
         for name, other, parameter in CASES:
             if (name, other) != (command, mode) or parameter.name in earlier:
                 continue
-            out = ["--out", "new.h5"] if command == "train" else []
-            code, _, err = program(command, *typed(own), *typed(parameter), *out)
+            code, _, err = program(command, *typed(own), *typed(parameter))
             assert code == 2, (mode, parameter.name, err)
             assert "no effect" in err.replace("\n", " ")
     assert not list(tmp_path.iterdir())
@@ -68,8 +67,7 @@ def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
 def test_an_option_without_the_one_that_it_needs_is_refused(command, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     own = next(one for one in COMMANDS[command].params if one.name == name)
-    out = ["--out", "new.h5"] if command == "train" else []
-    code, _, err = program(command, *typed(own), *out)
+    code, _, err = program(command, *typed(own))
     assert code == 2
     assert "no effect without" in err.replace("\n", " ")
     assert not list(tmp_path.iterdir())

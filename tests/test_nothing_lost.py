@@ -25,8 +25,6 @@ RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
     "session export",
-    "train",
-    "train --network",
     "devices scale",
     "devices serve",
 }
@@ -73,9 +71,6 @@ WRITERS = {
     "stability --verdicts": ("--fast",),
     "stability --worst": ("--fast",),
     "tables": ("--fast",),
-    "train": ("--scenes", "scene.h5", "--atoms", 8, "--patch", "4x4", "--patches", 40,
-              "--sparsity", 2, "--iterations", 1),
-    "train --network": ("--steps", 1),
 }  # fmt: skip
 READERS = {
     "devices camera", "devices conform", "devices home", "devices info", "devices jog",
@@ -253,8 +248,6 @@ AT_ONCE = {"capture --new", "devices live", "devices scale", "devices serve"}
 @pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed not in AT_ONCE])
 def test_every_command_states_its_stage_before_its_work_begins(world, tmp_path, monkeypatch, typed):
     """The first event of --json is a stage; there the test stops it."""
-    if typed == "train --network":
-        pytest.importorskip("torch", reason="train --network refuses without torch")
     monkeypatch.chdir(world)
     print_event, events = output.emit, []
 

@@ -222,5 +222,5 @@ def test_a_misspelt_method_names_the_nearest():
 
 def test_a_missing_dictionary_says_how_to_make_one(random_psi):
     psi = random_psi()
-    with pytest.raises(ReconstructionError, match="emmc-rig train"):
+    with pytest.raises(ReconstructionError, match="--dictionary lambertian"):
         reconstruct("dict-omp", psi, np.zeros(psi.frames_shape), 0.0)

@@ -17,7 +17,6 @@ from emmc_rig.errors import ERRORS
 
 TIMED = {"camera", "size", "repeats", "out"}
 STUDIED = {"scene", "camera", "size", "out"}
-LEARNED = {"scenes", "leave_out", "camera", "views", "steps", "minutes", "seed", "resume", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
@@ -58,10 +57,6 @@ MODES: dict[str, dict[str, set[str]]] = {
         "verdicts": STUDIED | {"fast", "fault", "method", "seed", "constants"},
         "worst": STUDIED | {"fast", "method", "dictionary", "seed"},
     },
-    "train": {
-        "aperture": {"camera", "seed", "out"},
-        "network": LEARNED,
-    },
 }
 """By command and mode, as its function names them: what else may be given."""
 NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
@@ -70,7 +65,6 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
     "chart": {"until": "next_shot"},
     "export": {"truth": "result"},
     "stability": {"constants": "verdicts"},
-    "train": {"camera": ("network", "aperture"), "steps": "network", "minutes": "network"},
 }
 """By command, an option and the one, or those, without which it does nothing."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")

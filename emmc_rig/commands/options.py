@@ -42,7 +42,7 @@ ClusterOption = Annotated[
 ]
 DictionaryOption = Annotated[
     str | None,
-    typer.Option("--dictionary", help="a file of `emmc-rig train`, or: lambertian, dct"),
+    typer.Option("--dictionary", help="a dictionary's file, or: lambertian, dct"),
 ]
 ScenesOption = Annotated[
     list[str] | None,

@@ -60,9 +60,6 @@ def reconstruct(
     budget: Annotated[
         str | None, typer.Option("--budget", help="choose the best method for a time, as 30s")
     ] = None,
-    want: Annotated[
-        str | None, typer.Option("--want", help="choose the quickest method for a PSNR, as 28dB")
-    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
     ] = False,
@@ -90,14 +87,13 @@ def reconstruct(
     if memory is not None and cluster is not None:
         raise typer.BadParameter("--memory is of this machine; a cluster's workers have their own")
     chosen, why = load_settings(settings), None
-    if budget is not None or want is not None:
+    if budget is not None:
         if method is not None or settings is not None:
-            raise typer.BadParameter("--budget and --want choose the method and its settings")
-        from emmc_rig.advice.recommend import advice_for
+            raise typer.BadParameter("--budget chooses the method and its settings")
+        from emmc_rig.processing.budget import method_within
         from emmc_rig.processing.inputs import open_frames
 
-        advice = advice_for(*open_frames(frames[0], psi), budget, want)
-        method, why = advice.method, advice.why
+        method, why = method_within(*open_frames(frames[0], psi), budget)
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     if dictionary is not None and not find_method(method).needs_dictionary:

@@ -2,7 +2,7 @@
 
     KEPT/                       see `emmc_rig.files.folders.kept_folder`
         job.json                what the blocks are of, and what was settled for all of them
-        frames.h5               the frames as the blocks get them
+        frames.h5               the frames
         block-000-001.h5        the arrays of a block's part
         block-000-001.json      their SHA-256, the block's figures and evidence: the block is done
 
@@ -16,7 +16,7 @@ import json
 import os
 import pickle
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -62,14 +62,16 @@ from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 
 FRAMES, JOB = "frames.h5", "job.json"
-AGAIN = "the same command computes it again"
+REMEDY = "the same command computes it again"
+EVERYWHERE = (slice(None),) * 3
 
 
 @dataclass(frozen=True)
-class Capture:
+class BlockJob:
     """What the blocks of a capture are computed from; picklable, so that workers get it.
 
     psi_path, kept: absolute, on a disk that all workers share. dictionary: see `open_dictionary`.
+    fingerprint: see `fingerprint_of`.
     """
 
     kept: Path
@@ -91,18 +93,24 @@ class Capture:
             return None
         return open_dictionary(self.dictionary, self.psi.views, self.psi.binning)
 
+    def frames(self, pixels: Any) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+        """Return readings and usable at some pixels."""
+        with stored_arrays(self.kept / FRAMES, AppError, REMEDY) as stored:
+            usable = stored.dataset("usable")[pixels].astype(bool)
+            return stored.dataset("readings")[pixels], usable
+
 
 @dataclass(frozen=True)
 class BlockTask:
-    """A block of a capture, with the settings that the survey settled."""
+    """A block of a capture, with what the survey settled for all of them."""
 
-    capture: Capture
-    settings: MethodSettings
+    job: BlockJob
+    survey: Survey
     block: Block
 
     def path(self, suffix: str) -> Path:
         """Return the file of the block with this suffix."""
-        return self.capture.kept / f"{self.block.name}.{suffix}"
+        return self.job.kept / f"{self.block.name}.{suffix}"
 
 
 def fingerprint_of(
@@ -129,13 +137,14 @@ def _write_json(path: Path, content: object) -> None:
         os.fsync(file.fileno())
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
-    """Return what a file of a job says; None where it is missing or damaged."""
+def _read_json(path: Path, fingerprint: str) -> dict[str, Any] | None:
+    """Return what a file of a job holds; None where it is missing, damaged or of another job."""
     try:
         content = parse_json(path.read_bytes(), path.name, ValueError)
     except (OSError, ValueError):
         return None
-    return content if isinstance(content, dict) else None
+    is_ours = isinstance(content, dict) and content.get("fingerprint") == fingerprint
+    return content if is_ours else None
 
 
 def _sha256(path: Path) -> str:
@@ -157,29 +166,15 @@ def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
         return _sha256(partial)
 
 
-def survey_task(capture: Capture) -> tuple[dict[str, Any], float]:
-    """Settle in a worker what holds for the whole capture; return it as plain data, and its CPU."""
+def survey_task(job: BlockJob) -> tuple[Survey, float]:
+    """Settle in a worker what holds for the whole capture; return it, and its CPU seconds."""
     started = time.process_time()
-    readings, usable = _frames(capture.kept / FRAMES, np.s_[:, :, :])
+    readings, usable = job.frames(EVERYWHERE)
     survey = surveyed(
-        capture.method, capture.psi, readings, capture.noise_sigma, usable,
-        capture.opened_dictionary(), capture.settings,
+        job.method, job.psi, readings, job.noise_sigma, usable, job.opened_dictionary(),
+        job.settings,
     )  # fmt: skip
-    return _plain(survey), time.process_time() - started
-
-
-def _plain(survey: Survey) -> dict[str, Any]:
-    return {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
-
-
-def _survey(found: Mapping[str, Any]) -> Survey:
-    plain = {key: tuple(one) if isinstance(one, list) else one for key, one in found.items()}
-    return Survey(**{**plain, "settings": MethodSettings.model_validate(found["settings"])})
-
-
-def _frames(path: Path, seen: Any) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    with stored_arrays(path, AppError, AGAIN) as stored:
-        return stored.dataset("readings")[seen], stored.dataset("usable")[seen].astype(bool)
+    return survey, time.process_time() - started
 
 
 def block_task(task: BlockTask) -> None:
@@ -200,7 +195,7 @@ def block_task(task: BlockTask) -> None:
     _write_json(
         task.path("json"),
         {
-            "fingerprint": task.capture.fingerprint,
+            "fingerprint": task.job.fingerprint,
             "sha256": _write_arrays(task.path("h5"), solved.arrays),
             "result": {
                 key: getattr(result, key)
@@ -224,19 +219,12 @@ def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
 
 
 def _solved(task: BlockTask) -> SolvedBlock:
-    capture, block = task.capture, task.block
-    readings, usable = _frames(capture.kept / FRAMES, pixels_of(block.outer, capture.psi.binning))
+    job, block = task.job, task.block
+    readings, usable = task.survey.applied(*job.frames(pixels_of(block.outer, job.psi.binning)))
     return solve_block(
-        capture.method,
-        capture.psi.window(*block.outer),
-        readings,
-        capture.noise_sigma,
-        usable,
-        block,
-        capture.psi.size,
-        task.settings,
-        capture.opened_dictionary(),
-    )
+        job.method, job.psi.window(*block.outer), readings, job.noise_sigma, usable, block,
+        job.psi.size, task.survey.settings, job.opened_dictionary(),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -253,69 +241,68 @@ class DoneBlock:
 
 def done_block(task: BlockTask) -> DoneBlock | None:
     """Return a block that is done and whole on the disk, else None."""
-    kept = _read_json(task.path("json"))
-    if kept is None or kept.get("fingerprint") != task.capture.fingerprint:
-        return None
-    if "cpu_seconds" not in kept:  # of an earlier version
-        return None
-    if kept.get("sha256") != _sha256(task.path("h5")):
+    kept = _read_json(task.path("json"), task.job.fingerprint)
+    if kept is None or kept["sha256"] != _sha256(task.path("h5")):
         return None
     figures = {**kept["result"], "left_out": tuple(kept["result"]["left_out"])}
     figures["status"] = Status(figures["status"])
     result = Reconstruction(
-        method=task.capture.method,
+        method=task.job.method,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         objective=(),
         seconds=kept["seconds"],
         **figures,
     )
-    verdict = (
-        None if kept["evidence"] is None else verdict_from(Evidence.from_dict(kept["evidence"]))
-    )
+    evidence = kept["evidence"]
+    verdict = None if evidence is None else verdict_from(Evidence.from_dict(evidence))
     measured = (kept[key] for key in ("variance", "seconds", "cpu_seconds", "peak_mib"))
     return DoneBlock(result, verdict, *measured)
 
 
-def _settle(capture: Capture, frames: Frames, pool: Pool, alone: bool) -> Survey:
+def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> tuple[Survey, float]:
     """Return what holds for all blocks, from an earlier run where it is of the same capture.
 
-    alone: there is one block, which settles everything by itself.
+    Frames are on the disk then. alone: there is one block, which settles everything by itself.
+    Returns the survey and its CPU seconds.
     """
-    job = _read_json(capture.kept / JOB)
-    if job is None or job.get("fingerprint") != capture.fingerprint:
-        for path in capture.kept.iterdir():
-            path.unlink()
-        _write_arrays(capture.kept / FRAMES, {"readings": frames.readings, "usable": frames.usable})
-        if alone:
-            found, cpu_s = _plain(Survey.of_one_block(capture.settings, len(frames.readings))), 0.0
-        else:
-            ((_, (found, cpu_s)),) = pool.run(survey_task, [capture])
-        survey = _survey(found)
-        readings, usable = survey.applied(frames.readings, frames.usable)
-        sha256 = _write_arrays(capture.kept / FRAMES, {"readings": readings, "usable": usable})
-        job = {
-            "fingerprint": capture.fingerprint, "frames": sha256, "survey": found,
+    arrays = {"readings": frames.readings, "usable": frames.usable}
+    kept = _read_json(job.kept / JOB, job.fingerprint)
+    if kept is not None:
+        if _sha256(job.kept / FRAMES) != kept["frames"]:
+            _write_arrays(job.kept / FRAMES, arrays)
+        survey = {k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()}
+        survey["settings"] = MethodSettings.model_validate(survey["settings"])
+        return Survey(**survey), kept["survey_cpu_seconds"]
+    for path in job.kept.iterdir():
+        path.unlink()
+    sha256 = _write_arrays(job.kept / FRAMES, arrays)
+    if alone:
+        survey, cpu_s = Survey.of_one_block(job.settings, len(frames.readings)), 0.0
+    else:
+        ((_, (survey, cpu_s)),) = pool.run(survey_task, [job])
+    plain = {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
+    _write_json(
+        job.kept / JOB,
+        {
+            "fingerprint": job.fingerprint, "frames": sha256, "survey": plain,
             "survey_cpu_seconds": cpu_s,
-        }  # fmt: skip
-        _write_json(capture.kept / JOB, job)
-    survey = _survey(job["survey"])
-    if _sha256(capture.kept / FRAMES) != job["frames"]:
-        readings, usable = survey.applied(frames.readings, frames.usable)
-        _write_arrays(capture.kept / FRAMES, {"readings": readings, "usable": usable})
-    return survey
+        },
+    )  # fmt: skip
+    return survey, cpu_s
 
 
 @dataclass(frozen=True)
 class Blocks:
     """The blocks of a capture, all done: their grid, what was settled, and what each says.
 
-    workers: how many computed at a time.
+    done: in the order of the grid. workers: how many computed at a time.
     """
 
+    job: BlockJob
     grid: Grid
     survey: Survey
-    tasks: Mapping[str, BlockTask]
-    done: Mapping[str, DoneBlock]
+    survey_cpu_s: float
+    done: Sequence[DoneBlock]
     seconds: float
     workers: int
 
@@ -325,116 +312,106 @@ class Blocks:
         peak_gib: the largest resident memory of a worker, workers: at a time, program_peak_gib: of
         this process, task_bytes: that travel to a worker for a block, all measured.
         """
-        job = _read_json(self.kept / JOB) or {}
+        task = BlockTask(self.job, self.survey, self.grid.block(0, 0))
         return {
             "blocks": list(self.grid.shape),
             "stated_db": self.stated_db,
-            "block_seconds": [one.seconds for one in self.done.values()],
-            "block_cpu_seconds": [one.cpu_seconds for one in self.done.values()],
-            "survey_cpu_seconds": job.get("survey_cpu_seconds"),
-            "task_bytes": len(pickle.dumps(next(iter(self.tasks.values())))),
+            "block_seconds": [block.seconds for block in self.done],
+            "block_cpu_seconds": [block.cpu_seconds for block in self.done],
+            "survey_cpu_seconds": self.survey_cpu_s,
+            "task_bytes": len(pickle.dumps(task)),
             "workers": self.workers,
-            "peak_gib": max(one.peak_mib for one in self.done.values()) / 2**10,
+            "peak_gib": max(block.peak_mib for block in self.done) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
 
     @property
     def stated_db(self) -> float | None:
         """The PSNR that the deviations of all blocks stand for; None where one has none."""
-        each = [one.variance for one in self.done.values()]
-        views = int(np.prod(next(iter(self.tasks.values())).capture.psi.views))
-        if None in each:
+        variances = [block.variance for block in self.done]
+        if None in variances:
             return None
-        mean = sum(one for one in each if one is not None) / (views * np.prod(self.grid.size))
-        return float(-10 * np.log10(mean))
+        samples = np.prod(self.job.psi.views) * np.prod(self.grid.size)
+        return float(-10 * np.log10(sum(v for v in variances if v is not None) / samples))
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""
-        method = next(iter(self.tasks.values())).capture.method
-        results = [one.result for one in self.done.values()]
-        return summed_up(method, results, self.survey, self.seconds)
+        results = [block.result for block in self.done]
+        return summed_up(self.job.method, results, self.survey, self.seconds)
 
-    def verdict(self, binning: int) -> Verdict:
+    def verdict(self) -> Verdict:
         """Return the verdict on all blocks; raises AppError where none could be judged."""
-        found = [
-            judged_block(one.verdict, self.tasks[name].block, binning)
-            for name, one in self.done.items()
-            if one.verdict is not None
+        judged = [
+            judged_block(said.verdict, block, self.job.psi.binning)
+            for block, said in zip(self.grid, self.done, strict=True)
+            if said.verdict is not None
         ]
-        if not found:
+        if not judged:
             raise AppError("no usable pixel: every one is saturated or excluded")
-        return judged_together(found)
+        return judged_together(judged)
 
     def shapes(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Return shape and type of the arrays of the whole, by name, which all blocks have."""
-        each: list[dict[str, tuple[tuple[int, ...], np.dtype]]] = []
-        for task in self.tasks.values():
-            with stored_arrays(task.path("h5"), AppError, AGAIN) as stored:
+        every: list[dict[str, tuple[tuple[int, ...], np.dtype]]] = []
+        for block in self.grid:
+            with stored_arrays(self.job.kept / f"{block.name}.h5", AppError, REMEDY) as stored:
                 parts = {name: stored.dataset(name) for name in map(str, stored.file)}
-                each.append({name: (part.shape, part.dtype) for name, part in parts.items()})
-        found = {}
-        for name, (shape, dtype) in each[0].items():
-            if all(name in one for one in each):
+                every.append({name: (part.shape, part.dtype) for name, part in parts.items()})
+        whole = {}
+        for name, (shape, dtype) in every[0].items():
+            if all(name in arrays for arrays in every):
                 axes = AXES.get(name, 0)
-                found[name] = (*shape[:axes], *self.grid.size, *shape[axes + 2 :]), dtype
-        return found
+                whole[name] = (*shape[:axes], *self.grid.size, *shape[axes + 2 :]), dtype
+        return whole
 
     def write(self, name: str, out: Any) -> None:
         """Write an array of the whole into an array or dataset, blocks in a fixed order."""
-        axes = AXES.get(name, 0)
         for block in self.grid:
-            out[(slice(None),) * axes + block.inner] = _assembled(
-                self.grid, self.kept, name, out.dtype, block.inner
-            )
-
-    @property
-    def kept(self) -> Path:
-        """The folder that the blocks lie in."""
-        return next(iter(self.tasks.values())).capture.kept
+            shard_task(ShardTask(self.grid, self.job.kept, name, block.inner), out)
 
     def write_shards(self, folder: Path, pool: Pool) -> None:
         """Write all arrays into a Zarr group by the workers of a pool, a shard each."""
-        tasks = []
-        group = created_group(folder)
+        tasks, group = [], created_group(folder)
         for name, (shape, dtype) in self.shapes().items():
-            places = create_array(group, name, shape, dtype, AXES.get(name, 0))
-            tasks += [ShardTask(self.grid, self.kept, folder.absolute(), name, at) for at in places]
+            for place in create_array(group, name, shape, dtype, AXES.get(name, 0)):
+                tasks.append(ShardTask(self.grid, self.job.kept, name, place, folder.absolute()))
         for _ in pool.run(shard_task, tasks):
             pass
 
 
 @dataclass(frozen=True)
 class ShardTask:
-    """A shard of an array of a Zarr group, of blocks that are all done."""
+    """A place of an array of the whole, to assemble from blocks that are all done.
+
+    folder: the Zarr group to write it into.
+    """
 
     grid: Grid
     kept: Path
-    folder: Path
     name: str
     place: Place
+    folder: Path = Path()
 
 
-def shard_task(task: ShardTask) -> None:
-    """Write a shard in a worker."""
-    array = opened_array(task.folder, task.name, "r+")
-    values = _assembled(task.grid, task.kept, task.name, array.dtype, task.place)
-    array[(slice(None),) * AXES.get(task.name, 0) + task.place] = values
+def shard_task(task: ShardTask, out: Any = None) -> None:
+    """Write a place into an array or dataset `out`; by default the one of the task's Zarr group."""
+    array = opened_array(task.folder, task.name, "r+") if out is None else out
+    axes = AXES.get(task.name, 0)
 
-
-def _assembled(grid: Grid, kept: Path, name: str, dtype: np.dtype, place: Place) -> NDArray:
     def part(block: Block, at: tuple) -> NDArray:
-        with stored_arrays(kept / f"{block.name}.h5", AppError, AGAIN) as stored:
-            return stored.dataset(name)[at]
+        with stored_arrays(task.kept / f"{block.name}.h5", AppError, REMEDY) as stored:
+            return stored.dataset(task.name)[at]
 
-    return assembled(grid, place, AXES.get(name, 0), dtype, part)
+    values = assembled(task.grid, task.place, axes, array.dtype, part)
+    array[(slice(None),) * axes + task.place] = values
 
 
-def run_capture(
-    capture: Capture,
+def compute_blocks(
+    job: BlockJob,
     frames: Frames,
     pool: Pool,
     group: int | None = None,
-    on_block: Callable[[int, int], None] | None = None,
+    on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
@@ -443,29 +420,29 @@ def run_capture(
     done and their number. Raises WorkersError, AppError, and what a block raises.
     """
     started = time.perf_counter()
-    psi, dictionary = capture.psi, capture.opened_dictionary()
-    multiple = multiple_of(psi.binning, dictionary, capture.settings)
-    grid = Grid(psi.size, multiple, 0, capture.settings.blocks)
+    psi, dictionary = job.psi, job.opened_dictionary()
+    multiple = multiple_of(psi.binning, dictionary, job.settings)
+    grid = Grid(psi.size, multiple, 0, job.settings.blocks)
     pool.fit(task_bytes(psi, grid))
-    survey = _settle(capture, frames, pool, len(grid) == 1)
+    survey, survey_cpu_s = _settled(job, frames, pool, len(grid) == 1)
     grid = replace(grid, halo=survey.halo)
     pool.fit(task_bytes(psi, grid))
-    tasks = {block.name: BlockTask(capture, survey.settings, block) for block in grid}
-    done = {name: one for name, task in tasks.items() if (one := done_block(task)) is not None}
-    left = [task for name, task in tasks.items() if name not in done]
+    tasks = [BlockTask(job, survey, block) for block in grid]
+    done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
+    left = [task for task in tasks if task.block.name not in done]
     if group is not None:
         left.sort(key=lambda task: [part.start // group for part in task.block.inner])
-    if on_block is not None and done:
+    if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):
-        one = done_block(task)
-        if one is None:
+        said = done_block(task)
+        if said is None:
             raise AppError(
                 f"{task.path('h5')}: a worker wrote it, but it cannot be read here; put frames, "
                 "Psi and --out on a disk that all workers share"
             )
-        done[task.block.name] = one
-        if on_block is not None:
-            on_block(len(done), len(tasks))
-    ordered = {name: done[name] for name in tasks}
-    return Blocks(grid, survey, tasks, ordered, time.perf_counter() - started, pool.size)
+        done[task.block.name] = said
+        on_block(len(done), len(tasks))
+    ordered = [done[block.name] for block in grid]
+    took_s = time.perf_counter() - started
+    return Blocks(job, grid, survey, survey_cpu_s, ordered, took_s, pool.size)

@@ -1,8 +1,9 @@
 """Workers for independent tasks: processes of this machine, or those of a Dask cluster.
 
 A task is a function of one value, both picklable, that writes its result to a disk all workers
-share; what it returns is small. Every process computes with one thread, so that nothing
-oversubscribes and a result does not depend on how many there are.
+share; what it returns is small. Either kind of workers is a `concurrent.futures.Executor`. Every
+worker computes with one thread, so that nothing oversubscribes and a result does not depend on how
+many there are.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import platform
 import resource
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
-from multiprocessing.process import BaseProcess
-from typing import Any, Protocol, TypeVar
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import one_line
@@ -38,13 +39,25 @@ class WorkersError(AppError):
     """Workers that are not there, do not fit this program, or were lost."""
 
 
-class Pool(Protocol):
-    """Workers that share tasks."""
+class Pool:
+    """Workers that share tasks; safe to use from several threads. size: tasks at a time."""
 
-    @property
-    def size(self) -> int:
-        """How many tasks are computed at a time."""
-        ...
+    losses: tuple[type[BaseException], ...] = ()
+    """What tells that workers were lost, see `_mend`."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._lock = threading.Lock()
+        self._executor: Executor | None = None
+        self._losses_in_a_row = 0
+
+    def _start(self) -> Executor:
+        """Return what runs tasks; raises WorkersError."""
+        raise NotImplementedError
+
+    def _mend(self, executor: Executor, fault: BaseException) -> None:
+        """Replace an executor that lost workers; raises WorkersError where it cannot."""
+        raise NotImplementedError
 
     def run(
         self, task: Callable[[Item], Result], items: Sequence[Item]
@@ -53,25 +66,41 @@ class Pool(Protocol):
 
         Tasks whose worker was lost are done again. Raises WorkersError, and what a task raises.
         """
-        ...
+        left = list(items)
+        while left:
+            futures = {}
+            with self._lock:
+                executor = self._executor = self._executor or self._start()
+            try:
+                with self._lock:
+                    futures |= {executor.submit(task, item): item for item in left}
+                for future in as_completed(futures):
+                    result, item = future.result(), futures[future]
+                    left.remove(item)
+                    self._losses_in_a_row = 0
+                    yield item, result
+            except self.losses as fault:
+                self._mend(executor, fault)
+            finally:
+                for future in futures:
+                    future.cancel()
 
     def fit(self, task_bytes: int) -> None:
         """Compute from here on only as many tasks at a time as a ceiling of memory allows.
 
         task_bytes: what a worker needs for one. Raises AppError where none fits.
         """
-        ...
 
     def end(self) -> None:
         """Stop what is computed; later tasks are refused."""
-        ...
 
 
-def _begin(most_bytes: int | None) -> None:
+def _begin(program: Connection, most_bytes: int | None) -> None:
     """Prepare a process of the pool: it ends with the program, which alone hears Ctrl-C.
 
-    most_bytes: of data it may map, so that allocating more raises MemoryError. What is mapped but
-    never touched (220 MiB) outweighs the pages of libraries (150 MiB) that do not count.
+    program: read until it is closed. most_bytes: of data the process may map, so that allocating
+    more raises MemoryError. What is mapped but never touched (220 MiB) outweighs the pages of
+    libraries (150 MiB) that do not count.
     """
     import cv2
 
@@ -80,72 +109,36 @@ def _begin(most_bytes: int | None) -> None:
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, hard))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
 
     def follow() -> None:
-        parent.join()
+        with suppress(EOFError, OSError):
+            program.recv_bytes()
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
 
 
-class Processes:
-    """A pool of processes of this machine; safe to use from several threads.
+class Processes(Pool):
+    """Processes of this machine, at most `size`.
 
-    size: at most so many. ceiling: of their memory and this program's, kept by fewer processes.
+    ceiling: of their memory and this program's, kept by fewer processes.
     """
 
+    # CancelledError: another thread ended the executor, to start one of fewer processes.
+    # RuntimeError: it did so before the tasks were submitted.
+    losses = BrokenProcessPool, MemoryError, CancelledError, RuntimeError
+
     def __init__(self, size: int, ceiling: Ceiling | None = None) -> None:
-        self.size, self.ceiling = size, ceiling
-        self._lock = threading.Lock()
-        self._executor: ProcessPoolExecutor | None = None
-        self._mine: set[BaseProcess] = set()
-        self._losses = 0
-        self._ended = False
+        super().__init__(size)
+        self.ceiling = ceiling
+        self._theirs, self._mine = multiprocessing.Pipe(duplex=False)
 
-    def _submitted(
-        self, task: Callable[[Item], Result], items: Iterable[Item]
-    ) -> tuple[ProcessPoolExecutor, dict[Future[Result], Item]]:
-        with self._lock:
-            if self._ended:
-                raise WorkersError("the workers were stopped")
-            if self._executor is None:
-                share = None if self.ceiling is None else self.ceiling.share(self.size)
-                self._executor = ProcessPoolExecutor(
-                    self.size, multiprocessing.get_context("spawn"), _begin, (share,)
-                )
-            before = set(multiprocessing.active_children())
-            futures = {self._executor.submit(task, item): item for item in items}
-            self._mine |= set(multiprocessing.active_children()) - before
-            return self._executor, futures
-
-    def run(
-        self, task: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, see `Pool.run`."""
-        left = list(items)
-        while left:
-            try:
-                executor, futures = self._submitted(task, left)
-            except BrokenProcessPool as fault:
-                self._replace(self._executor, fault)
-                continue
-            try:
-                for future in as_completed(futures):
-                    result, item = future.result(), futures[future]
-                    left.remove(item)
-                    self._losses = 0
-                    yield item, result
-            except BrokenProcessPool as fault:
-                self._replace(executor, fault)
-            except MemoryError as fault:
-                self._fewer(executor, fault)
-            except CancelledError:
-                continue  # another thread made the workers fewer
-            finally:
-                for future in futures:
-                    future.cancel()
+    def _start(self) -> Executor:
+        if self._mine.closed:
+            raise WorkersError("the workers were stopped")
+        share = None if self.ceiling is None else self.ceiling.share(self.size)
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(self.size, context, _begin, (self._theirs, share))
 
     def fit(self, task_bytes: int) -> None:
         """Let fewer processes share the ceiling where a task needs more, see `Pool.fit`."""
@@ -155,51 +148,47 @@ class Processes:
         with self._lock:
             if count < self.size:
                 self.size = count
-                self._restart()
+                self._shut_down()
 
-    def _restart(self) -> None:
+    def _mend(self, executor: Executor, fault: BaseException) -> None:
+        with self._lock:
+            if self._executor is not executor:
+                return  # another thread has mended it
+            if isinstance(fault, MemoryError):
+                if self.size == 1 or self.ceiling is None:
+                    limit = (
+                        "" if self.ceiling is None else f" {self.ceiling.share(1) / 2**20:.0f} MiB"
+                    )
+                    raise WorkersError(
+                        f"one worker alone needs more memory than the{limit} there is: give more "
+                        "by --memory, or smaller blocks by --settings (blocks: side, whole); the "
+                        "same command goes on"
+                    ) from fault
+                self.size -= 1
+            elif isinstance(fault, BrokenProcessPool):
+                self._losses_in_a_row += 1
+                if self._losses_in_a_row >= MOST_LOSSES:
+                    raise WorkersError(
+                        f"workers were killed {self._losses_in_a_row} times in a row, as when "
+                        "memory runs out: give fewer --workers, or --memory; the same command "
+                        "goes on"
+                    ) from fault
+            else:
+                raise fault
+            self._shut_down()
+
+    def _shut_down(self) -> None:
         """End the processes once their tasks are done; the next task starts others."""
         if self._executor is not None:
             self._executor.shutdown(wait=True, cancel_futures=True)
             self._executor = None
 
-    def _fewer(self, executor: ProcessPoolExecutor, fault: MemoryError) -> None:
-        """Give the workers more memory each, after a task needed more than its share."""
-        with self._lock:
-            if self._executor is not executor:
-                return
-            if self.size == 1 or self.ceiling is None:
-                limit = "" if self.ceiling is None else f" {self.ceiling.share(1) / 2**20:.0f} MiB"
-                raise WorkersError(
-                    f"one worker alone needs more memory than the{limit} there is: give more by "
-                    "--memory, or smaller blocks by --settings (blocks: side, whole); the same "
-                    "command goes on"
-                ) from fault
-            self.size -= 1
-            self._restart()
-
-    def _replace(self, broken: ProcessPoolExecutor | None, fault: BrokenProcessPool) -> None:
-        """Give up an executor that lost a process; all threads that used it come here."""
-        with self._lock:
-            if self._executor is broken and broken is not None:
-                self._restart()
-                self._losses += 1
-        if self._losses >= MOST_LOSSES:
-            raise WorkersError(
-                f"workers were killed {self._losses} times in a row, as when memory runs out: "
-                "give fewer --workers, or --memory; the same command goes on"
-            ) from fault
-
     def end(self) -> None:
         """Stop the processes, whatever they do."""
-        self._ended = True
-        # Before the lock, too: its holder may wait for a task.
-        for process in list(self._mine):
-            process.terminate()
+        # Before the lock, whose holder may wait for a task.
+        self._mine.close()
         with self._lock:
-            for process in self._mine:
-                process.terminate()
-            self._restart()
+            self._shut_down()
 
 
 def fingerprint() -> dict[str, str]:
@@ -215,22 +204,37 @@ def _on_one_thread(task: Callable[[Item], Result], item: Item) -> Result:
     return task(item)
 
 
-class Cluster:
-    """A pool of the workers of a Dask cluster."""
+class Cluster(Pool):
+    """The workers of a Dask cluster, whose memory is the cluster's own concern."""
 
     def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+        from distributed import CancelledError as Cancelled
+        from distributed import KilledWorker
+        from distributed.comm.core import CommClosedError
 
-    @property
-    def size(self) -> int:
-        """Threads of all workers."""
-        return max(sum(self._client.nthreads().values()), 1)
+        super().__init__(max(sum(client.nthreads().values()), 1))
+        self._client, self._address = client, address
+        self.losses = KilledWorker, Cancelled, CancelledError, CommClosedError
+
+    def _start(self) -> Executor:
+        return self._client.get_executor(pure=False)
+
+    def _mend(self, executor: Executor, fault: BaseException) -> None:
+        raise WorkersError(
+            f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
+        ) from fault
+
+    def run(
+        self, task: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Yield each item with its result, see `Pool.run`."""
+        return super().run(partial(_on_one_thread, task), items)
 
     def check(self) -> None:
         """Raise WorkersError where there are no workers, or some with other versions."""
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
-            found: Mapping[str, dict[str, str]] = self._client.run(fingerprint)
+            by_worker: Mapping[str, dict[str, str]] = self._client.run(fingerprint)
         except Exception as fault:  # whatever a worker without this program raises
             kind = type(fault).__name__
             raise WorkersError(
@@ -238,39 +242,16 @@ class Cluster:
                 f"({kind}: {one_line(fault)}); install emmc-rig {__version__} where the workers run"
             ) from fault
         own = fingerprint()
-        for worker, theirs in found.items():
+        for worker, theirs in by_worker.items():
             if theirs != own:
-                what = ", ".join(f"{key} {value}" for key, value in theirs.items())
-                mine = ", ".join(f"{key} {value}" for key, value in own.items())
+                what, mine = (
+                    ", ".join(f"{key} {value}" for key, value in versions.items())
+                    for versions in (theirs, own)
+                )
                 raise WorkersError(
                     f"--cluster {self._address}: the worker {worker} has {what}, this program "
                     f"{mine}: install the same there"
                 )
-
-    def run(
-        self, task: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, see `Pool.run`."""
-        from distributed import CancelledError, KilledWorker
-        from distributed import as_completed as completed
-        from distributed.comm.core import CommClosedError
-
-        futures = self._client.map(partial(_on_one_thread, task), list(items), pure=False)
-        of = dict(zip((future.key for future in futures), items, strict=True))
-        try:
-            for future in completed(futures, loop=self._client.loop):
-                yield of[future.key], future.result()
-                future.release()
-        except (KilledWorker, CancelledError, CommClosedError) as fault:
-            raise WorkersError(
-                f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
-            ) from fault
-        finally:
-            with suppress(Exception):
-                self._client.cancel(futures)
-
-    def fit(self, task_bytes: int) -> None:
-        """Leave memory to the cluster, which sets that of its workers."""
 
     def end(self) -> None:
         """Leave the cluster, which goes on."""
@@ -292,7 +273,13 @@ def _connected(address: str) -> Cluster:
             f"--cluster {address}: no Dask scheduler answers there; start one by `dask scheduler`, "
             "or see docs/scale.md"
         ) from fault
-    return Cluster(client, address)
+    cluster = Cluster(client, address)
+    try:
+        cluster.check()
+    except BaseException:
+        cluster.end()
+        raise
+    return cluster
 
 
 @contextmanager
@@ -303,23 +290,14 @@ def opened_pool(
 
     Processes start with the first task. ceiling: of memory, see `Processes`. Raises WorkersError.
     """
-    if cluster is not None:
-        pool = _connected(cluster)
-        try:
-            pool.check()
-            yield pool
-        finally:
-            pool.end()
-        return
     before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    processes = Processes(workers, ceiling)
+    pool = Processes(workers, ceiling) if cluster is None else _connected(cluster)
+    if cluster is None:
+        os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
-        yield processes
+        yield pool
     finally:
-        processes.end()
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        pool.end()
+        for name in THREADS:
+            os.environ.pop(name, None)
+        os.environ.update({name: value for name, value in before.items() if value is not None})

@@ -27,7 +27,7 @@ from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
-from emmc_rig.processing.block_tasks import Capture, fingerprint_of, run_capture
+from emmc_rig.processing.block_tasks import BlockJob, compute_blocks, fingerprint_of
 from emmc_rig.processing.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.processing.inputs import stored_frames
 from emmc_rig.processing.pool import Pool, opened_pool
@@ -188,7 +188,7 @@ def reconstruct_folder(
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    tile: see `run_capture`. as_zarr: write light field and maps as one Zarr group, by the pool, and
+    tile: see `compute_blocks`. as_zarr: write light field and maps as one Zarr group, by the pool, and
     no pictures.
     """
     find_method(method)
@@ -205,7 +205,7 @@ def reconstruct_folder(
         return _written(result, {"chosen": chosen}, out, session, truth)
     saved.verify()
     check_frames(saved.frames_shape, frames.readings)
-    capture = Capture(
+    job = BlockJob(
         kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
         frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
     )  # fmt: skip
@@ -215,10 +215,10 @@ def reconstruct_folder(
             on_step(Progress(done, None, None, of))
 
     with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
-        blocks = run_capture(capture, frames, workers, tile, on_block)
+        blocks = compute_blocks(job, frames, workers, tile, on_block)
         if as_zarr:
             blocks.write_shards(out / RESULT_GROUP, workers)
-    solved, verdict = blocks.result(), blocks.verdict(saved.binning)
+    solved, verdict = blocks.result(), blocks.verdict()
     if one_block and not as_zarr:
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():

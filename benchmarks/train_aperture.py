@@ -1,4 +1,6 @@
-"""Learn the transmittances of a coded aperture, jointly with the best linear decoder of patches.
+"""Makes the camera `learned-aperture`: transmittances learned with the best linear decoder.
+
+    python benchmarks/train_aperture.py --out mine.yaml
 
 A monochrome pixel behind masks in the plane of the lens reads y_s = sum over views of a_sv l_v, the
 same for every pixel. Of patches with mean m and covariance C the best linear decoder misses, at the
@@ -9,7 +11,9 @@ decoder cannot profit from views that are left out. [34] learns the decoder as a
 
 from __future__ import annotations
 
+import argparse
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,18 +21,16 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from random_worlds import DARKEST, world
 from scipy.optimize import minimize
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.cameras import camera_file
-from emmc_rig.files.folders import new_file
+from emmc_rig.files.folders import new_file, refuse_new_file
 from emmc_rig.files.results import command_line
 from emmc_rig.model.camera import Camera, load_camera, pixel_light
 from emmc_rig.model.masks import Parameters
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.processing.network_training import DARKEST, world
-from emmc_rig.processing.training import check_new_file
-from emmc_rig.progress import Watcher
 from reconstruction.training_patches import cut_patches
 
 Array = NDArray[np.float64]
@@ -41,14 +43,16 @@ ALIKE = 1e-3
 """Relative variation of Psi over its pixels, from which on a mask is not in the lens plane."""
 
 
-@dataclass(frozen=True)
-class ApertureTraining:
-    """What to train, and where to write the camera."""
-
-    out: Path
-    camera: str
-    worlds: int = 32
-    seed: int = 0
+def main() -> None:
+    """Train as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--camera", default="learned-aperture", help="a name or a file")
+    parser.add_argument("--out", type=Path, default=Path("aperture.yaml"))
+    parser.add_argument("--worlds", type=int, default=32)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--smallest", action="store_true", help="one world")
+    options = parser.parse_args()
+    train(options.camera, options.out, 1 if options.smallest else options.worlds, options.seed)
 
 
 @dataclass(frozen=True)
@@ -150,19 +154,17 @@ def aperture_of(camera: Camera) -> Aperture:
     return Aperture(camera, masks, tuple(shapes), basis, light)
 
 
-def patch_moments(training: ApertureTraining, views: tuple[int, int], watcher: Watcher) -> Moments:
+def patch_moments(worlds: int, seed: int, views: tuple[int, int]) -> Moments:
     """Return mean and covariance of grey patches of random worlds, mirrored at random."""
-    rng = np.random.default_rng([training.seed, 2])
-    watcher.begin("render", training.worlds)
+    rng = np.random.default_rng([seed, 2])
     patches = []
-    for number in range(training.worlds):
-        grey = world(training.seed, number, views).mean(axis=-1, keepdims=True)
+    for number in range(worlds):
+        grey = world(seed, number, views).mean(axis=-1, keepdims=True)
         light = np.exp(rng.uniform(np.log(DARKEST), 0))
         corners = rng.integers(np.array(grey.shape[2:4]) - PATCH_PX + 1, size=(PATCHES, 2))
         symmetries = rng.integers(8 if views[0] == views[1] else 4, size=PATCHES)
         cut = cut_patches(grey, corners, symmetries, (PATCH_PX, PATCH_PX))
         patches.append(light * cut.reshape(PATCHES, math.prod(views), PATCH_PX**2))
-        watcher.step(f"world {number}")
     every = np.concatenate(patches).astype(np.float64)
     mean = every.mean(axis=0)
     flat = (every - mean).reshape(len(every), -1)
@@ -170,48 +172,56 @@ def patch_moments(training: ApertureTraining, views: tuple[int, int], watcher: W
     return Moments(mean[:, PATCH_PX**2 // 2], covariance)
 
 
-def learned_cells(
-    aperture: Aperture, moments: Moments, seed: int, watcher: Watcher
-) -> tuple[Array, list[float]]:
+def learned_cells(aperture: Aperture, moments: Moments, seed: int) -> tuple[Array, list[float]]:
     """Return the cells of least error, and the error that every start ends at, the best first."""
     rng = np.random.default_rng([seed, 3])
     own = np.clip(aperture.cells(), 0, 1)
-    starts = [own, *(rng.uniform(0, 1, own.size) for _ in range(STARTS))]
-    watcher.begin("learn", len(starts))
     ends = []
-    for start in starts:
+    for start in (own, *(rng.uniform(0, 1, own.size) for _ in range(STARTS))):
         # The logarithm, for errors of 1e-4 would be below the minimiser's tolerance.
-        found = minimize(
+        least = minimize(
             lambda cells: math.log(aperture.error(cells, moments)),
             start,
             method="L-BFGS-B",
             bounds=[(0, 1)] * own.size,
         )
-        ends.append((math.exp(found.fun), found.x))
-        watcher.step(f"{-10 * found.fun / math.log(10):.2f} dB")
+        ends.append((math.exp(least.fun), least.x))
     ends.sort(key=lambda end: end[0])
     return ends[0][1], [error for error, _ in ends]
 
 
-def train_aperture(training: ApertureTraining, watcher: Watcher) -> dict[str, Any]:
-    """Learn a camera's aperture and write the camera with it to `training.out`; return figures.
+def train(camera_name: str, out: Path, worlds: int, seed: int) -> None:
+    """Learn a camera's aperture and write the camera with it to `out`.
 
     Raises AppError for cameras of which nothing can be learned and files in the way, CameraError.
     """
-    check_new_file(training.out, "a camera's", (".yaml", ".yml"))
-    path = camera_file(training.camera)
+    if out.suffix not in (".yaml", ".yml"):
+        raise AppError(f"--out {out}: a camera's file ends in .yaml")
+    refuse_new_file(out)
+    path = camera_file(camera_name)
     camera = load_camera(path)
     aperture = aperture_of(camera)
-    moments = patch_moments(training, camera.views, watcher)
-    cells, errors = learned_cells(aperture, moments, training.seed, watcher)
+    moments = patch_moments(worlds, seed, camera.views)
+    cells, errors = learned_cells(aperture, moments, seed)
     own = aperture.error(aperture.cells(), moments)
-    before, *after = (-10 * math.log10(error) for error in (own, *errors))
+    before, after, *others = (-10 * math.log10(error) for error in (own, *errors))
     text: Any = read_yaml(path, AppError)
     for name, rows in aperture.split(cells).items():
         text["masks"][name]["pattern"]["cells"] = rows
-    head = f"# Cells learned by: {command_line()}\n"
-    with new_file(training.out) as written:
+    with new_file(out) as written:
         written.write_text(
-            head + yaml.safe_dump(text, sort_keys=False, default_flow_style=None), encoding="utf-8"
+            f"# Cells learned by: {command_line()}\n"
+            + yaml.safe_dump(text, sort_keys=False, default_flow_style=None),
+            encoding="utf-8",
         )
-    return {"before_db": before, "after_db": after[0], "ends_db": after}
+    print(
+        f"wrote {out}: the best linear decoder makes {after:.2f} dB, {before:.2f} dB before; from "
+        f"other starts {', '.join(f'{end:.2f}' for end in others)}"
+    )
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ERRORS as fault:
+        sys.exit(str(fault))

@@ -17,15 +17,15 @@ from dataclasses import dataclass
 from math import prod
 
 import numpy as np
-import torch  # pyright: ignore[reportMissingImports]
+import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn  # pyright: ignore[reportMissingImports]
-from torch.nn import functional as F  # noqa: N812  # pyright: ignore[reportMissingImports]
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
 
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig_unrolled.weights import Architecture, NetworkWeights
 from reconstruction.choices import smooth_guess
 from reconstruction.errors import ReconstructionError
-from reconstruction.unrolled.weights import Architecture, NetworkWeights
 
 Array = NDArray[np.floating]
 INPUTS = 13
@@ -187,7 +187,7 @@ class Unrolled(nn.Module):
         return torch.cat([coverage, guess - 1, noise], 1)
 
 
-def applied(
+def estimated(
     weights: NetworkWeights,
     psi: ImagingMatrix,
     frames: Array,

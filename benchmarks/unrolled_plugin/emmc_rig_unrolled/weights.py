@@ -20,7 +20,7 @@ from emmc_rig.model.settings import Settings, validated
 from reconstruction.errors import ReconstructionError
 
 FORMAT = "emmc-rig network 1"
-REMEDY = "`emmc-rig train --network` makes one"
+REMEDY = "`benchmarks/train_network.py` makes one"
 
 
 class Architecture(Settings):

@@ -5,15 +5,32 @@ Unlike the built-in scenes they picture nothing, so that no scene that is scored
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from simulators import textures
-from simulators.raycaster import Ball, Card, World
+from simulators.raycaster import Ball, Card, World, tabulated
+from simulators.scenes import rendered
 
 SIDE = 256
 """Texels along a texture: enough for pictures of some 200 pixels."""
 DEEPEST_PX = 0.2, 4.0
 """Range from which the largest disparity of a world is drawn, log-uniformly, as quoted."""
+
+WORLD_SIZE = 128, 160
+"""Rows and columns of a rendered world: its disparities are 5/8 of those quoted."""
+WORLDS_AT_HAND = 32
+DARKEST = 0.3
+"""Least factor on a world's light, drawn log-uniformly up to 1."""
+
+
+@lru_cache(maxsize=2 * WORLDS_AT_HAND)
+def world(seed: int, number: int, views: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the light field of a random world (v, u, y, x, c), of WORLD_SIZE pixels."""
+    rng = np.random.default_rng([seed, 0, number])
+    return rendered(tabulated(random_world(rng)), views, WORLD_SIZE).light_field
 
 
 def random_world(rng: np.random.Generator) -> World:

@@ -1,63 +1,51 @@
-"""The method `unrolled`: a learned denoiser between exact data steps (extra `learned`)."""
+"""The method `unrolled`: a learned denoiser between exact data steps, Psi as an input (PyTorch)."""
 
 from __future__ import annotations
 
-from importlib import import_module, resources
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
+from emmc_rig_unrolled.weights import NetworkWeights
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.method import Given, Method
 from reconstruction.result import Reconstruction, Status
-from reconstruction.unrolled.weights import NetworkWeights
 
 if TYPE_CHECKING:
     from reconstruction.methods import MethodSettings
+
+SHIPPED = Path(__file__).with_name("any-psi.h5")
 
 
 class UnrolledSettings(Settings):
     """Which network."""
 
     weights: Path | None = Field(
-        default=None, description="a file of `emmc-rig train --network`; None: the shipped one"
+        default=None,
+        description="a file of `benchmarks/train_network.py`; None: the one that comes with it",
     )
 
 
-def with_torch(module: str) -> ModuleType:
-    """Return a module of `reconstruction.unrolled` that needs PyTorch, or say how to get that."""
-    try:
-        import_module("torch")
-    except ImportError as fault:
-        raise ReconstructionError(
-            "'unrolled' needs PyTorch: pip install 'emmc-rig[learned]'"
-        ) from fault
-    return import_module(f"reconstruction.unrolled.{module}")
-
-
-def shipped_weights() -> Path:
-    """Return the file of the weights that come with the program."""
-    return Path(str(resources.files("reconstruction.unrolled") / "any-psi.h5"))
-
-
 def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
-    started, psi, network = given.clock(), given.psi, with_torch("network")
+    # PyTorch takes seconds to import, which a command with another method need not wait for.
+    from emmc_rig_unrolled.network import estimated
+
+    started, psi = given.clock(), given.psi
     typical, variance = checked_noise(psi, given.noise_sigma, given.usable)
     frames, usable = checked_inputs(psi, given.frames, typical, given.usable)
-    path = settings.of(UnrolledSettings).weights or shipped_weights()
+    path = settings.of(UnrolledSettings).weights or SHIPPED
     weights = NetworkWeights.load(path)
     trained, views = weights.architecture.views, psi.light_field_shape[:2]
     if trained != views:
         raise ReconstructionError(
             f"{path.name}: a network for {trained[0]}x{trained[1]} views, Psi has "
-            f"{views[0]}x{views[1]}: train one with `emmc-rig train --network`"
+            f"{views[0]}x{views[1]}: train one with `benchmarks/train_network.py`"
         )
-    light_field = network.applied(weights, psi, frames, variance, usable)
+    light_field = estimated(weights, psi, frames, variance, usable)
     return Reconstruction(
         method="unrolled",
         light_field=np.clip(light_field, 0, 1),

@@ -1,28 +1,17 @@
-"""`emmc-rig train --aperture`: what is learned, what the error is, and what is refused."""
+"""The learned aperture: what is learned, what the error is, and what is refused."""
 
 import math
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from train_aperture import PATCH_PX, Moments, aperture_of, learned_cells, patch_moments, train
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import camera_file, find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import load_camera
-from emmc_rig.processing.aperture_training import (
-    PATCH_PX,
-    ApertureTraining,
-    Moments,
-    aperture_of,
-    learned_cells,
-    patch_moments,
-    train_aperture,
-)
 from emmc_rig.processing.reconstructing import reconstruct
-from emmc_rig.progress import Silent
 
 VIEWS = 25
 
@@ -30,9 +19,7 @@ VIEWS = 25
 @pytest.fixture(scope="module")
 def moments():
     """Of patches of three worlds."""
-    return patch_moments(
-        ApertureTraining(Path("unused.yaml"), "learned-aperture", worlds=3), (5, 5), Silent()
-    )
+    return patch_moments(3, 0, (5, 5))
 
 
 @pytest.fixture
@@ -79,7 +66,7 @@ def test_the_error_is_that_of_the_best_linear_decoder_on_simulated_patches(momen
 
 def test_learning_beats_every_random_aperture_and_leaves_little_light_out(moments):
     aperture = aperture_of(find_camera("learned-aperture"))
-    cells, errors = learned_cells(aperture, moments, 0, Silent())
+    cells, errors = learned_cells(aperture, moments, 0)
     rng = np.random.default_rng(7)
     random = [aperture.error(rng.uniform(0, 1, cells.size), moments) for _ in range(20)]
     assert errors == sorted(errors)
@@ -100,19 +87,13 @@ def test_one_view_of_no_noise_is_known_and_nothing_else_of_independent_views():
     assert aperture.error(cells, alone) == pytest.approx(1e6 * (VIEWS - 2) / VIEWS, rel=1e-4)
 
 
-def test_the_command_writes_a_camera_that_other_commands_take(run, monkeypatch, tmp_path):
-    from emmc_rig.processing import aperture_training
-
-    monkeypatch.setattr(aperture_training, "ApertureTraining", partial(ApertureTraining, worlds=2))
-    code, out, err = run("train", "--aperture", "--out", "a.yaml", "--seed", 1)
-    assert code == 0, err
-    assert "expected by the best linear decoder" in out
-    camera = load_camera(tmp_path / "a.yaml")
-    assert "train --aperture" in (tmp_path / "a.yaml").read_text()
-    assert camera.psi((8, 8)).light_efficiency() > 0.3
-    code, _, err = run("train", "--aperture", "--out", "a.yaml")
-    assert code == 1
-    assert "a.yaml" in err
+def test_the_camera_written_is_one_that_commands_take(tmp_path):
+    train("learned-aperture", tmp_path / "a.yaml", 2, 1)
+    assert load_camera(tmp_path / "a.yaml").psi((8, 8)).light_efficiency() > 0.3
+    with pytest.raises(AppError, match="exists already"):
+        train("learned-aperture", tmp_path / "a.yaml", 2, 1)
+    with pytest.raises(AppError, match=r"ends in \.yaml"):
+        train("learned-aperture", tmp_path / "a.h5", 2, 1)
 
 
 def no_parameters(text):
@@ -142,16 +123,8 @@ def coloured(text):
 def test_what_cannot_be_learned_is_refused_by_name(edited, tmp_path, change, named):
     out = tmp_path / "out.yaml"
     with pytest.raises(AppError, match=named):
-        train_aperture(ApertureTraining(out, str(edited(change))), Silent())
+        train(str(edited(change)), out, 1, 0)
     assert not out.exists()
-
-
-def test_a_name_that_is_no_camera_file_and_two_cameras_are_refused(run):
-    assert run("train", "--aperture", "--out", "a.h5")[0] == 1
-    twice = ("--camera", "learned-aperture", "--camera", "rgbw-mono")
-    assert run("train", "--aperture", *twice, "--out", "a.yaml")[0] == 2
-    assert run("train", "--camera", "rgbw-mono", "--out", "d.h5")[0] == 2
-    assert run("train", "--aperture", "--steps", 3, "--out", "a.yaml")[0] == 2
 
 
 def decibels(mean_square):
@@ -166,8 +139,7 @@ def random_aperture(camera):
 
 
 def test_the_shipped_aperture_is_better_than_a_random_one_by_the_moments_of_other_worlds():
-    other = ApertureTraining(Path("unused.yaml"), "learned-aperture", worlds=3, seed=1)
-    moments = patch_moments(other, (5, 5), Silent())
+    moments = patch_moments(3, 1, (5, 5))
     shipped = find_camera("learned-aperture")
     learned, random = (
         decibels(one.error(one.cells(), moments))
@@ -194,11 +166,3 @@ def test_the_shipped_aperture_is_better_where_neither_worlds_nor_a_linear_decode
         for one in (shipped, random_aperture(shipped))
     )
     assert learned > random + 1
-
-
-def test_the_folder_of_the_new_file_is_made_as_for_other_trainings(run, monkeypatch, tmp_path):
-    from emmc_rig.processing import aperture_training
-
-    monkeypatch.setattr(aperture_training, "ApertureTraining", partial(ApertureTraining, worlds=1))
-    assert run("train", "--aperture", "--out", "made/a.yaml")[0] == 0
-    assert load_camera(tmp_path / "made/a.yaml").title

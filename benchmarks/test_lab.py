@@ -1,0 +1,28 @@
+"""Every script of the lab that has a smallest size runs at it, in a folder of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LAB = Path(__file__).parent
+SCRIPTS = [path for path in sorted(LAB.glob("*.py")) if '"--smallest"' in path.read_text("utf-8")]
+SCRIPTS.remove(Path(__file__))
+NEEDS = {"train_network": "torch"}
+"""By script, a package beyond the extra `lab`."""
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_a_script_runs_at_its_smallest_size(script, tmp_path):
+    if script.stem in NEEDS:
+        pytest.importorskip(NEEDS[script.stem])
+    paths = os.pathsep.join([str(LAB.parent), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, str(script), "--smallest"],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True,
+        timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert any(tmp_path.iterdir()), "wrote nothing"

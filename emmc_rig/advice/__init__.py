@@ -1,1 +1,0 @@
-"""Which method to take, by a trial on the frames at hand."""

@@ -1,1 +1,0 @@
-"""An unrolled network: data steps by Psi itself, and between them a small learned denoiser."""
