@@ -20,9 +20,8 @@ from pydantic import TypeAdapter
 
 from calibration.shadow import shadow_mask
 from emmc_rig.acquisition.assessment import METHOD, Assessment, assessed
-from emmc_rig.acquisition.command import Wish, run_capture
+from emmc_rig.acquisition.command import CaptureRequest, FrontEnd, run_capture
 from emmc_rig.acquisition.plan import Plan, PlannedShot, planned_camera
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
@@ -115,9 +114,11 @@ def captured(plan: Plan, rig: ImagedRig, folder: Path) -> Session:
     """
     text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
     described = rig_description(SIMULATED, rig)
-    wish = Wish(folder / "plan.yaml", plan, text, planned_camera(plan), folder, described)
+    request = CaptureRequest(
+        folder / "plan.yaml", plan, text, planned_camera(plan), folder, described
+    )
     with held(folder):
-        taken = run_capture(wish, CaptureWatcher(), _nobody)
+        taken = run_capture(request, FrontEnd(ask=_nobody))
     assert taken is not None
     session, outcome = taken
     if not outcome.complete:
