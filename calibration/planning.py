@@ -36,7 +36,7 @@ MOST_FRAMES = 400
 MODEL_ERROR = 0.0022
 """Of Psi, relative: what the fitted mask with its defects misses on the bench as it is shipped.
 
-`calibrate --check psi --size 64x80 --rays 8192`: 0.223 % by the mixed route. With fewer rays it is
+`benchmarks/calibration_checks.py psi --size 64x80 --rays 8192`: 0.223 % by the mixed route. With fewer rays it is
 the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
 """
 
@@ -44,7 +44,7 @@ the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
 FEW_MODEL_ERROR = 0.0043
 """The same where parts of the aperture are opened: views never opened alone take up what is missed.
 
-All that `calibrate --check few --size 96x128 --rays 4096` is off by, its noise with it.
+All that `benchmarks/calibration_checks.py few` is off by, its noise with it.
 """
 
 

@@ -3,7 +3,7 @@
 A quick look that needs no model of the scene. With one to three shots many light fields explain any
 frames, so it is the scene that sets the level: one shot's total-variation residuals on three real
 scenes are 0.10, 0.21 and 1.60 of the noise's variance with a Psi that fits, 2.22, 0.52 and 4.67
-with one that is off by half a pixel (`emmc-rig calibrate --check drift`), and no whiter. Compare
+with one that is off by half a pixel (`benchmarks/calibration_checks.py drift`), and no whiter. Compare
 captures of one scene with it; whether Psi fits at all is for the evidence of `drift` to say.
 """
 

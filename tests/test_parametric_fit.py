@@ -5,6 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from moved_mask import CAMERA
+from whiteboard_bench import (
+    ORDINARY_BENCH,
+    BenchTruth,
+    Setting,
+    WhiteboardBench,
+)
 
 from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
@@ -18,12 +24,6 @@ from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.processing.bench import (
-    ORDINARY_BENCH,
-    BenchTruth,
-    Setting,
-    WhiteboardBench,
-)
 from simulators.bench import MountingErrors
 
 SIZE = (44, 60)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,15 +123,16 @@ class SessionCalibration:
         with result_folder(Path(out), "calibrate", belongs_to=place) as folder:
             self.write(folder)
 
-    def write(self, folder: Path) -> None:
-        """Write the same files into an existing folder."""
+    def write(self, folder: Path, truth: Mapping[str, float] | None = None) -> None:
+        """Write the same files into an existing folder; truth: parameters of a simulated bench."""
         save_outcome(folder, self.outcome, self.calibration)
         stage = self.stage
         write_calibration_report(
             folder / REPORT,
             self.outcome,
             self.metrics,
-            sensor=self.sensor,
+            truth,
+            self.sensor,
             stage=None if stage is None else stage.map,
             places=() if stage is None else stage.rows(),
         )

@@ -27,7 +27,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, Scene, fine_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.processing.bench import WhiteboardBench
 from emmc_rig.processing.board_plan import capture_plan, parametric_plan, plan_light
 from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.progress import Watcher
@@ -100,7 +99,7 @@ def candidate_plan(camera_name: str, camera: Camera, size: tuple[int, int]) -> P
     several = camera.with_shots(PLANNED)
     settings = CalibrateSettings(camera_name, several, size)
     mask = shadow_mask(several, size)
-    light = plan_light(WhiteboardBench(several, size, settings.truth), mask)
+    light = plan_light(several, mask)
     plan = capture_plan(settings, parametric_plan(several, mask, light, settings.target))
     exposure_s = (float(camera.exposures_s()[0]),)
     shots = tuple(PlannedShot(exposure_s=exposure_s) for _ in several.shots)
