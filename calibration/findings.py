@@ -98,8 +98,8 @@ left out of the plan (48x64, 1024 rays) the effects of these names in `simulator
 
 def unwatched(missing: Sequence[str]) -> list[str]:
     """Return what these whiteboards were not there to tell, and how much that may cost."""
-    told = (UNWATCHED[name] for name in missing)
-    return [f"not measured: {what}; it costs {cost}" for what, cost in told]
+    lacking = (UNWATCHED[name] for name in missing)
+    return [f"not measured: {what}; it costs {cost}" for what, cost in lacking]
 
 
 def angle_findings(board: BoardAngle) -> list[str]:

@@ -16,10 +16,11 @@ from calibration.planning import (
     FEW_MODEL_ERROR,
     MODEL_ERROR,
     MOST_FRAMES,
+    REFERENCE_FRAMES,
     Kind,
     Light,
     PlannedFrames,
-    plan_free,
+    plan_combined,
     plan_parametric,
 )
 from calibration.shadow import ShadowMask, shadow_mask
@@ -97,7 +98,7 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
             views="all" if every else tuple(sorted(through)),
             shots=(0,),
             repeats=repeats,
-            references=max(2, planned.reference_frames),
+            references=REFERENCE_FRAMES,
             open=(*fitted, *judging),
             lamp_checks=0 if "lamp" in settings.leave_out else LAMP_CHECKS,
             response=() if "response" in settings.leave_out else SERIES_SHARES,
@@ -143,7 +144,7 @@ def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -
             f"and takes {others} frames beside: name at least {len(views) + others}, or --leave-out"
         )
     soft = soft_design(camera, mask)
-    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    planned = plan_combined(mask, soft, light, target, most)
     if planned.expected_error > target:
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached"

@@ -263,8 +263,7 @@ def _stage_of(session: Session, outcome: Outcome) -> SessionStage:
     seen = each_reading(boards, layout, outcome.good)
     places = [locate(board, shadow.mask, shadow.placement) for board in seen]
     sent = [one.stage_um for one in boards.frames]
-    # The rig's stages end every move upwards.
-    found = stage_map(sent, [(1, 1)] * len(sent), places)
+    found = stage_map(sent, places)
     read = [_read_um(session, one) for one in planned]
     return SessionStage(found, tuple(one.id for one in planned), sent, read, places)
 
