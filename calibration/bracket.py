@@ -3,7 +3,7 @@
 The best unbiased estimate weighs each frame by the inverse of its variance. That variance is
 taken from the sensor's noise model at the fused rate, never from the pixel's own noisy value, which
 would favour those that happen to be low (Granados et al., CVPR 2010, Section 3). For the same
-reason whether a longer exposure saturates is foretold from the shorter ones.
+reason whether a longer exposure saturates is predicted from the shorter ones.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LinearFrame:
 
     dn_per_s: where the shortest exposure is saturated, the least that it can be. variance: of
     `dn_per_s`, (DN/s)^2; infinite where nothing is usable. usable: at least one exposure was
-    neither saturated nor foretold to be.
+    neither saturated nor predicted to be.
     """
 
     dn_per_s: NDArray[np.float32]
@@ -50,7 +50,6 @@ def fuse(
     darks: Sequence[MeanFrame],
     gain: SensorGain,
     white_level_dn: int,
-    dead: NDArray[np.bool_] | None = None,
 ) -> LinearFrame:
     """Return the linear frame of a bracket: frames (y, x), repeats of one exposure too.
 
@@ -58,8 +57,7 @@ def fuse(
     of another exposure, what dark current adds is not known: the deviation counts
     DARK_ELECTRONS_PER_S. gain: its variance in the dark is that of the shortest dark.
 
-    dead: pixels that no exposure can use. Raises CalibrationError for no frame, or for frames of
-    another size than the dark one.
+    Raises CalibrationError for no frame, or for frames of another size than the dark one.
     """
     if not frames_dn or len(frames_dn) != len(exposures_s):
         raise CalibrationError("a bracket needs frames, and an exposure for each")
@@ -77,8 +75,6 @@ def fuse(
     unclipped = [frames_dn[i] < white_level_dn for i in order]
     room_dn = [white_level_dn - own for own in own_dn]
     used = _used(signals, unclipped, times_s, gain, room_dn, current_dn)
-    if dead is not None:
-        used = [one & ~dead for one in used]
     rate = _pooled(signals, used, times_s)
     for _ in range(ROUNDS):
         weights = _weights(rate, used, times_s, gain, current_dn)
@@ -96,8 +92,6 @@ def fuse(
     unknown_dn = [_unknown_dn(darks, time_s, gain) for time_s in times_s]
     variance = variance + sum(dn * lever for dn, lever in zip(unknown_dn, levers, strict=True)) ** 2
     clipped = ~(seen | unclipped[0])
-    if dead is not None:
-        clipped &= ~dead
     rate = np.where(clipped, np.maximum(signals[0], 0) / times_s[0], rate)
     return LinearFrame(
         rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen
@@ -124,7 +118,7 @@ def _used(
     room_dn: Sequence[Array],
     current_dn: Sequence[Array],
 ) -> list[NDArray[np.bool_]]:
-    """Return where each frame is used: the shortest where not clipped, others as foretold."""
+    """Return where each frame is used: the shortest where not clipped, others as predicted."""
     used = []
     collected = np.zeros_like(signals[0])
     collected_s = np.zeros_like(signals[0])
@@ -135,12 +129,12 @@ def _used(
         known = collected_s > 0
         safe_s = np.where(known, collected_s, 1.0)
         rate = np.maximum(collected / safe_s, 0)
-        foretold_dn = rate * time_s
+        expected_dn = rate * time_s
         spread = gain.gain_dn_per_electron * collected + count * gain.dark_variance_dn2
         variance = np.maximum(spread, 0) / safe_s**2 * time_s**2 + gain.variance_dn2(
-            foretold_dn + current
+            expected_dn + current
         )
-        fits = foretold_dn + SAFETY_SIGMAS * np.sqrt(variance) < room
+        fits = expected_dn + SAFETY_SIGMAS * np.sqrt(variance) < room
         shortest = time_s == times_s[0]
         use = whole if shortest else whole & known & fits
         used.append(use)

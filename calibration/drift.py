@@ -13,7 +13,6 @@ is no place of the mask.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -361,7 +360,6 @@ def find_drift(
     placement: Placement,
     stages: Stages,
     settings: DriftSettings | None = None,
-    on_step: Callable[[float], None] = lambda value: None,
 ) -> Drift:
     """Return how the mask has moved between the calibration and these captures.
 
@@ -392,7 +390,7 @@ def find_drift(
 
     def climbed(blocks: _Blocks, start: Array) -> tuple[Array, int, bool]:
         search.begin(blocks, start, settings.candidates)
-        return _climb(search, start, settings.tolerance, on_step)
+        return _climb(search, start, settings.tolerance)
 
     half_px, widest_px = START_PX / 2, max(taken.readings.shape[1:]) / 2
     blocks = _blocks(taken, side, settings.coarse_blocks, rng, half_px)
@@ -512,9 +510,7 @@ def _recognised(
     return float((search.total(drift) - np.mean(evidence)) / max(np.std(evidence), 1e-9))
 
 
-def _climb(
-    search: _Search, drift: Array, tolerance: float, on_step: Callable[[float], None]
-) -> tuple[Array, int, bool]:
+def _climb(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int, bool]:
     """Return the drift after Gauss-Newton steps on the blocks' scores, their count, converged."""
     for taken in range(1, MOST_STEPS + 1):
         slopes = search.scores(drift, central=False)
@@ -533,7 +529,6 @@ def _climb(
                 return drift, taken, True
             found = search.posterior(drift + move)
         drift = drift + move
-        on_step(found)
         if np.max(np.abs(move) / deviations) < tolerance:
             return drift, taken, True
     return drift, MOST_STEPS, False

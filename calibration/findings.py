@@ -91,15 +91,15 @@ UNWATCHED = {
         "0.25 % of Psi for every 1 % of unevenness over the aperture",
     ),
 }
-"""What no whiteboard shows, and what that costs: `calibrate --check lamp,response,crosstalk,board
---leave-out lamp,response,colours,turned --size 48x64 --rays 1024` misses 1.27, 0.36, 6.76, 2.54 %
-of Psi at 2, 1, 5, 10 %, where `shipped` has 0.32 %."""
+"""What no whiteboard shows, and what that costs: with lamp, response, colours and the turned board
+left out of the plan (48x64, 1024 rays) the effects of these names in `simulators.effects` make Psi
+1.27, 0.36, 6.76 and 2.54 % wrong at 2, 1, 5 and 10 %; an ordinary bench has 0.32 %."""
 
 
 def unwatched(missing: Sequence[str]) -> list[str]:
     """Return what these whiteboards were not there to tell, and how much that may cost."""
-    told = (UNWATCHED[name] for name in missing)
-    return [f"not measured: {what}; it costs {cost}" for what, cost in told]
+    lacking = (UNWATCHED[name] for name in missing)
+    return [f"not measured: {what}; it costs {cost}" for what, cost in lacking]
 
 
 def angle_findings(board: BoardAngle) -> list[str]:

@@ -11,7 +11,7 @@ Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -143,14 +143,13 @@ def _samples(
         if len(chosen) > limit:
             chosen = np.sort(rng.choice(chosen, limit, replace=False))
         pixels = np.stack(np.unravel_index(chosen, board.reading.shape), axis=1)
-        flat = chosen
         found.append(
             _Sample(
                 board,
                 pixels,
-                board.channels.ravel()[flat],
-                board.reading.ravel()[flat].astype(np.float64),
-                np.sqrt(board.variance.ravel()[flat].astype(np.float64)),
+                board.channels.ravel()[chosen],
+                board.reading.ravel()[chosen].astype(np.float64),
+                np.sqrt(board.variance.ravel()[chosen].astype(np.float64)),
             )
         )
     return found
@@ -275,9 +274,7 @@ def fit_placement(
     camera: Camera,
     mask: ShadowMask,
     settings: FitSettings | None = None,
-    tolerances: Tolerances | None = None,
     start: Placement | None = None,
-    on_step: Callable[[float], None] | None = None,
 ) -> Fit:
     """Return the placement that explains the whiteboards.
 
@@ -285,7 +282,7 @@ def fit_placement(
     without whiteboards, for a mask that is not the design's (with the correlation found), and
     where the fit does not explain what it was given. Not converging is a status.
     """
-    settings, tolerances = settings or FitSettings(), tolerances or Tolerances()
+    settings, tolerances = settings or FitSettings(), Tolerances()
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
     designed = designed_placement(camera)
@@ -308,7 +305,7 @@ def fit_placement(
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
         placement, taken, converged, normal = _descend(
-            mask, placement, samples, prior, centre, settings, history, on_step
+            mask, placement, samples, prior, centre, settings, history
         )
         steps += taken
     assert normal is not None
@@ -323,12 +320,12 @@ def fit_placement(
             f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use the free route"
         )
-    told = _told(placement, covariance, tolerances)
+    shares = _shares_of_prior(placement, covariance, tolerances)
     undecided = tuple(
-        name for name, share in zip(labels(camera.views), told, strict=True) if share > DECIDED
+        name for name, share in zip(labels(camera.views), shares, strict=True) if share > DECIDED
     )
     # Precision beyond the prior's grows with the number of whiteboards.
-    have = np.maximum(1 / np.maximum(told, 1e-6) ** 2 - 1, 1e-9)
+    have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
     lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
     kept = max(normal.kept, 1)
@@ -350,7 +347,7 @@ def fit_placement(
     )
 
 
-def _told(
+def _shares_of_prior(
     placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
 ) -> NDArray[np.float64]:
     """Return every parameter's deviation over that of the prior, by their labels.
@@ -394,7 +391,6 @@ def _descend(
     centre: Array,
     settings: FitSettings,
     history: list[float],
-    on_step: Callable[[float], None] | None,
 ) -> tuple[Placement, int, bool, _Normal]:
     """Return the placement after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
@@ -417,8 +413,6 @@ def _descend(
             placement = trial
         normal = _normal(mask, placement, samples)
         history.append(normal.spread)
-        if on_step is not None:
-            on_step(normal.spread)
         if size < settings.tolerance or value - found < LEAST_GAIN:
             return placement, step + 1, True, normal
     return placement, settings.max_steps, False, normal

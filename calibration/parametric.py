@@ -145,9 +145,3 @@ def psi_information(
         matrix += slopes.T @ slopes
         squares += float(values @ values)
     return matrix / pixels, squares / pixels
-
-
-def expected_psi_error(shadow: Shadow, covariance: NDArray[np.float64]) -> float:
-    """Return the expected relative Frobenius error of Psi from the placement's covariance."""
-    matrix, squares = psi_information(shadow)
-    return float(np.sqrt(max(np.trace(matrix @ covariance), 0) / squares))

@@ -36,15 +36,15 @@ MOST_FRAMES = 400
 MODEL_ERROR = 0.0022
 """Of Psi, relative: what the fitted mask with its defects misses on the bench as it is shipped.
 
-`calibrate --check psi --size 64x80 --rays 8192`: 0.223 % by the mixed route. With fewer rays it is
-the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
+`benchmarks/calibration_checks.py psi --size 64x80 --rays 8192`: 0.223 % by the mixed route. With
+fewer rays it is the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
 """
 
 
 FEW_MODEL_ERROR = 0.0043
 """The same where parts of the aperture are opened: views never opened alone take up what is missed.
 
-All that `calibrate --check few --size 96x128 --rays 4096` is off by, its noise with it.
+All that `benchmarks/calibration_checks.py few` is off by, its noise with it.
 """
 
 
@@ -86,13 +86,6 @@ class PlannedFrames:
 
     counts: Mapping[Kind, int]
     expected_error: float
-    dark_frames: int = DARK_FRAMES
-    reference_frames: int = REFERENCE_FRAMES
-
-    @property
-    def exposures(self) -> int:
-        """All frames."""
-        return sum(self.counts.values()) + self.dark_frames + self.reference_frames
 
 
 def dark_variance(kind: Kind, light: Light) -> float:
@@ -132,7 +125,6 @@ def plan_parametric(
     kinds: Sequence[Kind],
     light: Light,
     target: float,
-    tolerances: Tolerances | None = None,
     most: int = MOST_FRAMES,
     model_error: float = MODEL_ERROR,
 ) -> PlannedFrames:
@@ -141,10 +133,9 @@ def plan_parametric(
     The first frame is always the first kind, which the fit registers. Stops at `most` frames:
     the error expected then is in the result.
     """
-    tolerances = tolerances or Tolerances()
     matrix, squares = psi_information(Shadow(mask, placement))
     each = {kind: information_of(mask, placement, kind, light) for kind in kinds}
-    total = np.diag(1 / tolerances.deviations(mask.views) ** 2) + sum(each.values())
+    total = np.diag(1 / Tolerances().deviations(mask.views) ** 2) + sum(each.values())
     counts = dict.fromkeys(kinds, 1)
 
     def error(information: NDArray[np.float64]) -> float:
@@ -196,22 +187,14 @@ def free_noise(mask: ShadowMask, placement: Placement, light: Light) -> FreeNois
     return FreeNoise(pinhole / squares, white / squares)
 
 
-def plan_free(
-    mask: ShadowMask,
-    placement: Placement,
-    light: Light,
-    target: float,
-    shots: int,
-    most: int = MOST_FRAMES,
-    modelled: bool = False,
+def plan_combined(
+    mask: ShadowMask, placement: Placement, light: Light, target: float, most: int = MOST_FRAMES
 ) -> PlannedFrames:
-    """Return frames through the pinhole, the same number before every view and for every shot.
+    """Return frames through the pinhole, the same number before every view, for both routes in one.
 
-    At most `most` before each: the error expected then is in the result. modelled: with the fitted
-    mask as well, which makes it surer.
+    At most `most` before each: the error expected then is in the result.
     """
     noise = free_noise(mask, placement, light)
-    error = noise.with_model if modelled else noise.error
-    repeats = next((n for n in range(1, most) if error(n) <= target), most)
-    counts = {Kind((v, u)): repeats * shots for v, u in np.ndindex(mask.views)}
-    return PlannedFrames(counts, error(repeats))
+    repeats = next((n for n in range(1, most) if noise.with_model(n) <= target), most)
+    counts = dict.fromkeys(map(Kind, np.ndindex(mask.views)), repeats)
+    return PlannedFrames(counts, noise.with_model(repeats))

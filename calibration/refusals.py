@@ -222,13 +222,13 @@ def _raise_dim_references(clear: float) -> None:
     )
 
 
-def refuse_odd_fit(fit: Fit, boards: Sequence[Board], tolerances: Tolerances) -> None:
+def refuse_odd_fit(fit: Fit, boards: Sequence[Board]) -> None:
     """Raise CalibrationError for a fit that no bench has, and for whiteboards unlike the others."""
     at = fit.placement
     if at.clear > max(CLEAREST, 1 + SURE * fit.deviation("clear")):
         _raise_dim_references(at.clear)
     usual = Placement(aperture=at.aperture).vector()[: len(SCALARS)]
-    off = (at.vector()[: len(SCALARS)] - usual) / tolerances.deviations((1, 1))[: len(SCALARS)]
+    off = (at.vector()[: len(SCALARS)] - usual) / Tolerances().deviations((1, 1))[: len(SCALARS)]
     worst = int(np.argmax(np.abs(off)))
     if abs(off[worst]) > UNLIKELY:
         raise CalibrationError(

@@ -33,7 +33,7 @@ from calibration.combine import combined
 from calibration.defects import View, find_defects, loss_variance
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
-from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, FitSettings, fit_placement
+from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, measured_misfit
@@ -44,7 +44,6 @@ from calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
-from calibration.placement import Tolerances
 from calibration.refusals import (
     FREE_GRADIENT,
     refuse_another_bench,
@@ -112,8 +111,6 @@ def calibrate(
     held_out: BoardSet,
     few: BoardSet | None = None,
     pinholes: BoardSet | None = None,
-    fit_settings: FitSettings | None = None,
-    tolerances: Tolerances | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
     turned: Mapping[float, BoardSet] | None = None,
     empty: NewArray = in_memory,
@@ -170,13 +167,13 @@ def calibrate(
             refuse_without_mask(board)
         plain = shadow_mask(camera, layout.size)
         mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
-        fit = fit_placement(seen, camera, mask, fit_settings, tolerances)
+        fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
-        refuse_odd_fit(fit, seen, tolerances or Tolerances())
+        refuse_odd_fit(fit, seen)
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and layout.binning == 1:
             on_stage("defects of the mask")
-            mixed = with_misfit(_mixed(seen, camera, parametric, fit_settings, tolerances), seen)
+            mixed = with_misfit(_mixed(seen, camera, parametric), seen)
         for name, one in (("parametric", parametric), ("mixed", mixed)):
             if one is not None:
                 one = replace(one, of_defects=_missed_at_defects(one, [*seen, *judges]))
@@ -307,25 +304,19 @@ def _unlike_the_design(
     seen = [*seen, *judges]
     start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
     fit = fit_placement(seen, camera, mask, start=start)
-    refuse_odd_fit(fit, seen, Tolerances())
+    refuse_odd_fit(fit, seen)
     refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
     # Finer than that, Psi as measured is what counts, and few whiteboards do not determine it well.
     return mask_findings(fit, ("distance_share", "clear"))
 
 
-def _mixed(
-    seen: Sequence[Board],
-    camera: Camera,
-    parametric: Parametric,
-    settings: FitSettings | None,
-    tolerances: Tolerances | None,
-) -> Parametric:
+def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
     start = parametric.fit.placement
     defects = find_defects(seen, parametric.mask, start)
     if defects.count == 0:
         return Parametric(parametric.fit, parametric.mask, defects)
-    fit = fit_placement(seen, camera, defects.mask, settings, tolerances, start=start)
+    fit = fit_placement(seen, camera, defects.mask, start=start)
     return Parametric(fit, parametric.mask, find_defects(seen, parametric.mask, fit.placement))
 
 

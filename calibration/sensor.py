@@ -113,16 +113,6 @@ class SensorSheet:
     saturated: bool = True
     quantised: bool = False
 
-    @property
-    def dsnu_electrons(self) -> float:
-        """Dark signal nonuniformity, of all pixels."""
-        return self.dsnu.figure("total", 1 / self.gain_dn_per_electron)[0]
-
-    @property
-    def prnu_percent(self) -> float:
-        """Photo response nonuniformity, of all pixels."""
-        return self.prnu.figure("total", 100.0)[0]
-
     def rows(self) -> list[tuple[str, float, float | None, str]]:
         """Return (quantity, value, standard deviation or None, unit) for a table."""
         found = []

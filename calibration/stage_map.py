@@ -1,8 +1,8 @@
-"""The mask stage as the sensor sees it: scale, rotation, orthogonality, backlash, repeatability.
+"""The mask stage as the sensor sees it: scale, rotation, orthogonality, repeatability.
 
 Every whiteboard shows where its mask stood, by the fitted shadow, to thousandths of a pixel. Those
-places are a linear map of the positions commanded, plus half the backlash with the sign of the
-direction from which each axis came.
+places are a linear map of the positions commanded; all are approached from one side, so that
+backlash does not show.
 """
 
 from __future__ import annotations
@@ -73,13 +73,11 @@ class StageMap:
     """What the stage really does.
 
     matrix: (2, 2), from commanded to real moves, x and y. repeatability_um: of one approach, x
-    and y. backlash_um: NaN along an axis whose places were all approached from one side.
-    residual_um: (place, 2), what the map leaves of each place.
+    and y. residual_um: (place, 2), what the map leaves of each place.
     """
 
     matrix: NDArray[np.float64]
     offset_um: tuple[float, float]
-    backlash_um: tuple[float, float]
     repeatability_um: tuple[float, float]
     deviations: dict[str, float]
     residual_um: NDArray[np.float64]
@@ -100,12 +98,6 @@ class StageMap:
         y_axis = np.degrees(np.arctan2(self.matrix[1, 1], self.matrix[0, 1]))
         return float(y_axis - self.rotation_deg - 90)
 
-    def real_um(self, commanded_um: tuple[float, float]) -> tuple[float, float]:
-        """Return where the mask stands for a commanded position approached from below."""
-        at = self.matrix @ np.array(commanded_um) + np.array(self.offset_um)
-        at = at + np.nan_to_num(self.backlash_um) / 2
-        return float(at[0]), float(at[1])
-
     def rows(self) -> list[tuple[str, float, float, str]]:
         """Return (quantity, value, standard deviation, unit) for a table."""
         values = {
@@ -113,32 +105,21 @@ class StageMap:
             "Scale, y": (self.scale[1], "scale_y", ""),
             "Rotation": (self.rotation_deg, "rotation_deg", "degrees"),
             "Orthogonality": (self.orthogonality_deg, "orthogonality_deg", "degrees off 90"),
-            "Backlash, x": (self.backlash_um[0], "backlash_x_um", "um"),
-            "Backlash, y": (self.backlash_um[1], "backlash_y_um", "um"),
             "Repeatability, x": (self.repeatability_um[0], "repeatability_x_um", "um"),
             "Repeatability, y": (self.repeatability_um[1], "repeatability_y_um", "um"),
         }
         return [
-            (name, value, self.deviations[key], unit)
-            for name, (value, key, unit) in values.items()
-            if not np.isnan(value)
+            (name, value, self.deviations[key], unit) for name, (value, key, unit) in values.items()
         ]
 
 
 @one_blas_thread()
-def stage_map(
-    commanded_um: Sequence[tuple[float, float]],
-    came_from: Sequence[tuple[int, int]],
-    places: Sequence[Place],
-) -> StageMap:
-    """Return the map from where the stage was sent, and from which side, to where the mask stood.
+def stage_map(commanded_um: Sequence[tuple[float, float]], places: Sequence[Place]) -> StageMap:
+    """Return the map from where the stage was sent to where the mask stood.
 
-    came_from: +1 where an axis moved up to its place, -1 down; from one side alone, backlash is
-    not determined and does not matter. Raises CalibrationError for too few moves, and moves along
-    one line.
+    Raises CalibrationError for too few moves, and moves along one line.
     """
     commanded = np.array(commanded_um, dtype=np.float64)
-    sides = np.array(came_from, dtype=np.float64)
     real = np.array([(place.x_um, place.y_um) for place in places])
     if len(commanded) < FEWEST:
         raise CalibrationError(
@@ -148,26 +129,16 @@ def stage_map(
     scale = np.array([max(np.ptp(commanded[:, 0]), 1e-9), max(np.ptp(commanded[:, 1]), 1e-9), 1])
     if np.linalg.matrix_rank(rows / scale, tol=1e-6) < 3:
         raise CalibrationError("the stage positions lie on one line: move along x and along y")
-    matrix, offset, backlash, spread = np.empty((2, 2)), [], [], []
-    covariances, left = [], np.empty(real.shape)
-    for axis in (0, 1):
-        both_sides = np.ptp(sides[:, axis]) > 0
-        basis = np.column_stack([rows, *([sides[:, axis] / 2] if both_sides else [])])
-        found, *_ = np.linalg.lstsq(basis, real[:, axis], rcond=None)
-        left[:, axis] = residual = real[:, axis] - basis @ found
-        variance = float(residual @ residual) / max(len(residual) - basis.shape[1], 1)
-        matrix[axis] = found[:2]
-        offset.append(float(found[2]))
-        backlash.append(float(found[3]) if both_sides else np.nan)
-        spread.append(float(np.sqrt(variance)))
-        covariances.append(np.linalg.inv(basis.T @ basis) * variance)
-    deviations = _deviations(covariances, spread, len(commanded))
+    found, *_ = np.linalg.lstsq(rows, real, rcond=None)
+    left = real - rows @ found
+    variance = np.square(left).sum(axis=0) / max(len(left) - 3, 1)
+    covariances = [np.linalg.inv(rows.T @ rows) * one for one in variance]
+    spread_x, spread_y = (float(one) for one in np.sqrt(variance))
     return StageMap(
-        matrix,
-        (offset[0], offset[1]),
-        (backlash[0], backlash[1]),
-        (spread[0], spread[1]),
-        deviations,
+        found[:2].T,
+        (float(found[2, 0]), float(found[2, 1])),
+        (spread_x, spread_y),
+        _deviations(covariances, (spread_x, spread_y), len(commanded)),
         left,
     )
 
@@ -184,8 +155,6 @@ def _deviations(
         "scale_y": float(np.sqrt(along_y[1, 1])),
         "rotation_deg": float(turn[0]),
         "orthogonality_deg": float(np.hypot(*turn)),
-        "backlash_x_um": float(np.sqrt(along_x[-1, -1])),
-        "backlash_y_um": float(np.sqrt(along_y[-1, -1])),
         "repeatability_x_um": spread[0] / freedom,
         "repeatability_y_um": spread[1] / freedom,
     }

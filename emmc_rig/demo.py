@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,14 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.frames import MeanFrame
-from calibration.whiteboard import (
-    Calibration,
-    ideal_boards,
-    lamps_needed,
-    measure_psi,
-)
-from emmc_rig.acquisition.direct import capture_shots, capture_whiteboards, whiteboard_exposures
-from emmc_rig.bench.hardware import simulated_rig
+from calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
+from emmc_rig.acquisition.command import CaptureRequest, planned_frames
+from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
+from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
@@ -36,12 +32,23 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
+from emmc_rig.processing.simulated import place_rig, simulated_session
 from emmc_rig.progress import Silent, Watcher
+from emmc_rig.session.readings import (
+    Scale,
+    decoded,
+    scaled_readings,
+    session_darks,
+    shot_frames,
+    whiteboards,
+)
+from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.missed import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
+from simulators.bench import Bench
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
@@ -114,30 +121,26 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         if find_method(settings.method).needs_dictionary:
             dictionary = open_dictionary(settings.dictionary, camera.views, camera.sensor.binning)
         rig, bench = simulated_rig(camera, fine.samples, size, settings.seed)
-    lamps = lamps_needed(design)
-    seen: dict[tuple[int, int, int, str], Array] = {}
-    exposures = whiteboard_exposures(camera, lamps, settings.whiteboard_repeats)
-    with stages("whiteboards", exposures):
-        boards = capture_whiteboards(
-            rig,
-            camera,
-            lamps,
-            settings.whiteboard_repeats,
-            on_frame=watcher.step,
-            on_setting=lambda key: seen.__setitem__(key, bench.readings()),
-        )
-    with stages("psi"):
+    plan = demo_plan(settings)
+    frames = planned_frames(CaptureRequest(Path(), plan, "", camera, Path(), {}), rig)
+    shown = ExitStack()
+    with stages("capture", len(frames)):
+        session = shown.enter_context(simulated_session(plan, camera, rig, watcher))
+    with shown, stages("psi"):
+        boards = whiteboards(session)
         calibration = measure_psi(boards, design)
-        exact = measure_psi(ideal_boards(seen, lamps, design), design).psi
-        psi_error = calibration.psi.relative_difference(exact)
-        design_error = design.relative_difference(exact)
-    with stages("capture", design.shots):
-        frames_dn, exposures_s = capture_shots(rig, camera, watcher.step)
+        lamps = lamps_needed(design)
+        exact = measure_psi(ideal_boards(_noise_free(session, rig, bench), lamps, design), design)
+        psi_error = calibration.psi.relative_difference(exact.psi)
+        design_error = design.relative_difference(exact.psi)
+        darks, good = session_darks(session), np.ones(design.frames_shape[1:], dtype=bool)
+        scale = Scale(calibration.psi, calibration.white_dn_per_s, darks, calibration.gain, good)
+        taken = scaled_readings(session, scale, range(design.shots))
+        of_shots = [some[0] for some in shot_frames(session).values()]
+        shots_dn, shots_s = zip(*decoded(session, of_shots), strict=True)
+        frames_dn, exposures_s = np.stack([one.mosaic for one in shots_dn]), np.array(shots_s)
     with stages("reconstruct"):
-        readings = calibration.readings(frames_dn, exposures_s)
-        usable = frames_dn < camera.sensor.noise.white_level_dn
-        variance = calibration.reading_variance(frames_dn, exposures_s)
-        sigma = float(np.sqrt(variance[usable].mean())) if usable.any() else 0.0
+        readings, usable, sigma = taken.readings, taken.usable, taken.noise_sigma
 
         def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
             return reconstruct_judged(
@@ -155,7 +158,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     exact_psnr = None
     if settings.exact_psi:
         with stages("exact Psi, for comparison"):
-            compared, _ = light_field(exact)
+            compared, _ = light_field(exact.psi)
             exact_psnr = psnr_db(compared.light_field, truth)
     with stages("evaluate"):
         estimate = result.light_field
@@ -177,7 +180,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "calibration_cost_db": None if exact_psnr is None else exact_psnr - psnr,
             "noise_sigma": sigma,
             "saturated_share": float(1 - usable.mean()),
-            "whiteboard_frames": exposures,
+            "whiteboard_frames": len(frames) - design.shots,
             "method": result.method,
             "status": result.status,
             "advice": result.advice,
@@ -198,7 +201,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             frames_dn,
             readings,
             exposures_s,
-            deviation=np.sqrt(variance),
+            deviation=np.sqrt(taken.variance),
             usable=usable,
         )
         calibration.psi.save(folder / "psi.h5")
@@ -223,6 +226,29 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     metrics["seconds"] = dict(stages.seconds)
     write_metrics(folder, metrics)
     return metrics
+
+
+def demo_plan(settings: DemoSettings) -> Plan:
+    """Return the plan of a demo: the pinhole before every view of every shot, then the shots."""
+    return Plan(
+        title="demo",
+        camera=settings.camera_name,
+        shots=tuple(PlannedShot() for _ in settings.camera.shots),
+        whiteboards=Boards(repeats=settings.whiteboard_repeats),
+        darks=Darks(),
+        # The scene is exposed as its camera says, whatever that saturates.
+        checks=Checks(largest_saturated_share=1.0, smallest_signal=0.0),
+    )
+
+
+def _noise_free(session: Session, rig: Rig, bench: Bench) -> dict[tuple[int, int, int, str], Array]:
+    """Return what pixels read through the pinhole without noise, by shot, view and lamp."""
+    seen = {}
+    for frame in session.frames:
+        if frame.view is not None and frame.repeat == 0:
+            place_rig(rig, frame)
+            seen[frame.bench.shot, *frame.view, frame.bench.lamp] = bench.readings()
+    return seen
 
 
 def _progress_words(progress: Progress) -> str:

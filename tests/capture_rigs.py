@@ -12,7 +12,7 @@ import yaml
 
 from drivers.camera import CameraIdentity, RawFileCamera
 from drivers.dng import encode_dng
-from emmc_rig.acquisition.command import Wish, new_session, planned_frames
+from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.bench.hardware import Rig
 from simulators.clock import ManualClock
@@ -101,13 +101,13 @@ def plan_and_camera(text=PLAN_YAML):
     return plan, planned_camera(plan)
 
 
-def wish_for(folder, text=PLAN_YAML):
+def request_for(folder, text=PLAN_YAML):
     """Return what a plan asks for, without a plan file."""
     plan, camera = plan_and_camera(text)
-    return Wish(folder / "plan.yaml", plan, text, camera, folder / "s", {"kind": "x"})
+    return CaptureRequest(folder / "plan.yaml", plan, text, camera, folder / "s", {"kind": "x"})
 
 
 def begun(folder, disk, rig, text=PLAN_YAML):
     """Return a new session on a disk, and its plan."""
-    wish = wish_for(folder, text=text)
-    return new_session(wish, planned_frames(wish, rig), disk), wish.plan
+    request = request_for(folder, text=text)
+    return new_session(request, planned_frames(request, rig), disk), request.plan

@@ -112,18 +112,6 @@ def test_a_pixel_saturated_in_every_exposure_is_not_usable():
     assert fused.dn_per_s[3, 4] == pytest.approx(fills, rel=0.01)
 
 
-def test_a_dead_pixel_says_nothing_however_bright_it_is():
-    rng = np.random.default_rng(2)
-    readings = np.full((8, 8), 50.0)
-    dead = np.zeros((8, 8), bool)
-    dead[3, 4] = True
-    darks = dark_frames((8, 8), rng)
-    frames = bracket_of(readings, rng)
-    fused = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn, dead)
-    assert fused.dn_per_s[3, 4] == 0
-    assert (fused.dn_per_s[~dead] > 0).all()
-
-
 def test_repeats_of_one_exposure_divide_the_variance():
     rng = np.random.default_rng(3)
     readings = np.full((40, 50), 0.2)

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from capture_rigs import begun, plan_and_camera, still_rig, wish_for
+from capture_rigs import begun, plan_and_camera, request_for, still_rig
 
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
@@ -490,8 +490,8 @@ def test_a_read_only_disk_is_reported_in_one_line():
 
 def test_a_disk_that_is_too_small_is_reported_before_anything_is_made():
     rig = still_rig()
-    wish = wish_for(Path("/"))
-    expected = estimated(planned_frames(wish, rig), wish.plan, rig)
+    request = request_for(Path("/"))
+    expected = estimated(planned_frames(request, rig), request.plan, rig)
     refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1e12))
     with pytest.raises(AppError, match="frames need about"):
         refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1000))
@@ -516,11 +516,11 @@ def test_an_exposure_beyond_the_camera_is_reported_before_anything_moves():
 
 def test_frames_of_another_rig_are_refused(tmp_path):
     rig = still_rig()
-    wish = wish_for(tmp_path, text=ONE_SHOT)
-    session = new_session(wish, planned_frames(wish, rig))
-    other = replace(wish, rig={"kind": "y"})
+    request = request_for(tmp_path, text=ONE_SHOT)
+    session = new_session(request, planned_frames(request, rig))
+    other = replace(request, rig={"kind": "y"})
     assert begun_session(other) is not None
-    Sequencer(session, wish.plan, rig).run()
+    Sequencer(session, request.plan, rig).run()
     with pytest.raises(AppError, match="another rig"):
         begun_session(other)
 

@@ -90,7 +90,7 @@ def test_the_measured_psi_is_saved_with_its_camera(demo):
 
 def test_the_watcher_sees_every_stage_and_exposure(demo):
     _, metrics, watcher = demo
-    assert watcher.stages[:3] == ["scene", "design", "whiteboards"]
+    assert watcher.stages[:3] == ["scene", "design", "capture"]
     assert list(metrics["seconds"]) == watcher.stages
     assert watcher.steps > metrics["whiteboard_frames"] + metrics["shots"]
 

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from moved_mask import CAMERA
+from whiteboard_bench import BenchTruth, WhiteboardBench
 
 from calibration.drift import (
     KINDS,
@@ -33,7 +34,6 @@ from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
-from emmc_rig.processing.bench import BenchTruth, WhiteboardBench
 from simulators.bench import MountingErrors
 from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import begun, plan_and_camera, wish_for
+from capture_rigs import begun, plan_and_camera, request_for
 
 from drivers.errors import CameraSettingError
 from emmc_rig.acquisition.amend import amendment
@@ -168,10 +168,10 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     Sequencer(session, plan, rig, StopsAfter("shot-0-e0-r0", control), control).run()
     text = AUTO + "metering: {level: 0.35}\n"
     edited, camera = plan_and_camera(text)
-    planned = planned_frames(wish_for(Path("/disk"), text), rig)
+    planned = planned_frames(request_for(Path("/disk"), text), rig)
     edit = amendment(session, edited, camera, session.rig, planned)
     assert edit is not None
-    session = session.amend(_frozen(wish_for(Path("/disk"), text), edit.frames), edit.changes)
+    session = session.amend(_frozen(request_for(Path("/disk"), text), edit.frames), edit.changes)
     assert Sequencer(session, edited, rig).run().complete
     taken_s = [session.stored[f"shot-{shot}-e0-r0"]["exposure_s"] for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)

@@ -34,7 +34,6 @@ WRITERS = {
     "capture --new": ("rgbw-mono",),
     "calibrate": (*SIZE,),
     "calibrate SESSION": ("made-session",),
-    "calibrate --check": ("psi", *SIZE),
     "calibrate --drift": ("frames", "--known", "frames"),
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
@@ -78,7 +77,6 @@ READERS = {
     "session prune", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
-    "calibrate --check": "checks.jsonl",
     "chart --ablation": "ablation.jsonl",
     "chart --constants": "constants.jsonl",
     "chart": "points.jsonl",

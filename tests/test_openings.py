@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 import yaml
+from whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
 from calibration.openings import parts, views_open, window_place_um
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.processing.bench import BenchTruth, Setting, WhiteboardBench
 
 CAMERA = find_camera("rgbw-bayer-1shot")
 

@@ -5,6 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from moved_mask import CAMERA
+from whiteboard_bench import (
+    ORDINARY_BENCH,
+    BenchTruth,
+    Setting,
+    WhiteboardBench,
+)
 
 from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
@@ -12,18 +18,12 @@ from calibration.defects import View, find_defects, loss_variance, mask_with_los
 from calibration.errors import CalibrationError
 from calibration.fit import FitSettings, fit_placement
 from calibration.openings import CENTRED, parts, views_open
-from calibration.parametric import expected_psi_error, psi_at, psi_deviation, shot_stages
+from calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
 from calibration.placement import SCALARS, designed_placement, labels
 from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.processing.bench import (
-    ORDINARY_BENCH,
-    BenchTruth,
-    Setting,
-    WhiteboardBench,
-)
 from simulators.bench import MountingErrors
 
 SIZE = (44, 60)
@@ -314,7 +314,8 @@ def test_the_expected_error_of_psi_is_the_error_of_psi(design):
         fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, mask, start=truth)
         psi = psi_at(Shadow(mask, fit.placement), design.layout, shot_stages(CAMERA))
         squares.append(psi.relative_difference(exact) ** 2)
-        expected.append(expected_psi_error(Shadow(mask, fit.placement), fit.covariance) ** 2)
+        matrix, power = psi_information(Shadow(mask, fit.placement))
+        expected.append(np.trace(matrix @ fit.covariance) / power)
     assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.35)
 
 

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 from moved_mask import CAMERA
+from whiteboard_bench import BenchTruth, Setting, WhiteboardBench, held_out_settings
 
 from calibration.errors import CalibrationError
 from calibration.routes import calibrate
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.processing.bench import BenchTruth, Setting, WhiteboardBench
-from emmc_rig.processing.board_plan import STAGE_KINDS_UM, held_out_settings
+from emmc_rig.processing.board_plan import STAGE_KINDS_UM
 from simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)
@@ -19,7 +19,7 @@ TRUTH = BenchTruth(rays_per_view=128)
 VIEW = (0, 1)
 OPEN = [Setting(stage_um=stage_um) for stage_um in STAGE_KINDS_UM]
 PINHOLES = [Setting(pinhole=view, repeats=1) for view in np.ndindex(CAMERA.views)]
-HELD_OUT = held_out_settings(CAMERA)
+HELD_OUT = held_out_settings()
 ROUTES = ("parametric", "mixed", "free", "combined")
 
 

@@ -1,4 +1,4 @@
-"""The page of a running capture, and what it does to it: pause, retake, edit the plan, finish."""
+"""The page of a running capture, and what it does to it: pause, retake, finish."""
 
 import http.client
 import json
@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.command import capture_session
+from emmc_rig.acquisition.command import FrontEnd, capture_session
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError
@@ -61,7 +61,8 @@ class Acting(SessionPage):
             self.actions["stop"]()
 
     def run(self, plan):
-        done = capture_session(plan, rig(), None, None, self, nobody, control=self.control)
+        front = FrontEnd(self, nobody, control=self.control)
+        done = capture_session(plan, rig(), None, None, front)
         assert done is not None
         return done
 
@@ -78,47 +79,6 @@ def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_wh
     state = page.state()
     assert state["done"] == state["planned"] == len(session.needed)
     assert Session(session.folder).is_complete
-
-
-def test_an_edited_plan_holds_from_the_next_frame_on_and_is_written_to_the_users_file(plan):
-    text = plan.read_text()
-    edited = text.replace("repeats: 2", "repeats: 3")
-    said = []
-
-    def edit(page):
-        said.append(page.actions["preview"](edited)["changes"])
-        page.actions["amend"](edited)
-
-    page = Acting(plan.with_name("plan-session"), edit)
-    session, outcome = page.run(plan)
-    assert outcome.complete
-    assert session.amendments == 1
-    assert sum(frame.kind == "dark" for frame in session.needed) == 3
-    assert "darks.repeats is 3, not 2" in said[0]
-    assert plan.read_text() == edited
-
-
-def test_an_edit_that_frames_contradict_changes_nothing_and_the_capture_goes_on(plan):
-    text = plan.read_text()
-
-    def refused(page):
-        with pytest.raises(AppError, match="gain"):
-            page.actions["preview"](text.replace("exposure_s: 0.02", "gain: 2"))
-        with pytest.raises(AppError, match="exposure"):
-            page.actions["amend"]("camera: rgbw-bayer-2shots\nshots: [{exposure: 1}]\n")
-        page.actions["retake"](["shot-0-e0-r0"])
-
-    def changed_meanwhile(page):
-        plan.write_text(text + "# and another editor\n")
-        page.actions["amend"](text.replace("repeats: 2", "repeats: 3"))
-
-    page = Acting(plan.with_name("plan-session"), refused, changed_meanwhile)
-    session, outcome = page.run(plan)
-    assert outcome.complete
-    assert session.amendments == 0
-    said = page.state()["messages"]
-    assert any("changed meanwhile" in line for line in said)
-    assert plan.read_text() == text + "# and another editor\n"
 
 
 def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan):
@@ -176,7 +136,8 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     page._computes = True
     page.start()
     try:
-        capture_session(path, rig((32, 40)), None, None, page, nobody, control=page.control)
+        front = FrontEnd(page, nobody, control=page.control)
+        capture_session(path, rig((32, 40)), None, None, front)
     finally:
         page.close()
     reported = page.state()["light_field"]

@@ -7,7 +7,7 @@ import yaml
 from browsers import MARKS, complaints, open_browser
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.command import capture_session
+from emmc_rig.acquisition.command import FrontEnd, capture_session
 from emmc_rig.acquisition.control import Control
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
@@ -37,7 +37,7 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
     page = SessionPage(folder, control)
     run = threading.Thread(
         target=lambda: capture_session(
-            plan, rig.description, None, None, page, print, control=control
+            plan, rig.description, None, None, FrontEnd(page, print, control=control)
         ),
         daemon=True,
     )

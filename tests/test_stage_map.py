@@ -22,14 +22,13 @@ CAMERA = Camera.model_validate(
     }
 )
 SCALE, TURN, SKEW = (1.003, 0.998), np.deg2rad(0.4), np.deg2rad(0.15)
-BACKLASH, REPEATABILITY = (3.0, 1.5), 0.12
+REPEATABILITY = 0.12
 
 
 def visited(count=40, seed=0):
-    """Return positions sent to, the sides they were approached from, and where the mask stood."""
+    """Return positions sent to, and where the mask stood."""
     rng = np.random.default_rng(seed)
     sent = rng.uniform(-400, 400, (count, 2))
-    sides = rng.choice([-1, 1], (count, 2))
     y_axis = TURN + SKEW
     matrix = np.array(
         [
@@ -37,17 +36,17 @@ def visited(count=40, seed=0):
             [SCALE[0] * np.sin(TURN), SCALE[1] * np.cos(y_axis)],
         ]
     )
-    real = sent @ matrix.T + (4.0, -2.0) + sides * np.array(BACKLASH) / 2
-    return sent, sides, real + rng.normal(0, REPEATABILITY, real.shape)
+    real = sent @ matrix.T + (4.0, -2.0)
+    return sent, real + rng.normal(0, REPEATABILITY, real.shape)
 
 
 def mapped(count=40, seed=0):
-    sent, sides, real = visited(count, seed)
+    sent, real = visited(count, seed)
     places = [Place(float(x), float(y), 0.01) for x, y in real]
-    return stage_map([(x, y) for x, y in sent], [(a, b) for a, b in sides], places)
+    return stage_map([(x, y) for x, y in sent], places)
 
 
-def test_scale_rotation_orthogonality_backlash_and_repeatability_come_out():
+def test_scale_rotation_orthogonality_and_repeatability_come_out():
     found = mapped()
     assert found.scale == pytest.approx(SCALE, abs=4 * found.deviations["scale_x"])
     turn = np.degrees(TURN)
@@ -55,7 +54,6 @@ def test_scale_rotation_orthogonality_backlash_and_repeatability_come_out():
     skew = np.degrees(SKEW)
     limit = 4 * found.deviations["orthogonality_deg"]
     assert found.orthogonality_deg == pytest.approx(skew, abs=limit)
-    assert found.backlash_um == pytest.approx(BACKLASH, abs=4 * found.deviations["backlash_x_um"])
     assert found.repeatability_um == pytest.approx((REPEATABILITY,) * 2, rel=0.5)
 
 
@@ -64,18 +62,13 @@ def test_the_stated_deviations_are_those_of_repeated_maps():
     for values, key in (
         ([one.scale[0] for one in found], "scale_x"),
         ([one.rotation_deg for one in found], "rotation_deg"),
-        ([one.backlash_um[1] for one in found], "backlash_y_um"),
     ):
         stated = np.mean([one.deviations[key] for one in found])
         assert np.std(values, ddof=1) / stated == pytest.approx(1, abs=0.35)
 
 
-def test_the_map_says_where_a_position_really_is():
-    found = mapped()
-    sent, sides, real = visited(30, seed=5)
-    up = [i for i in range(30) if (sides[i] == 1).all()]
-    reported = np.array([found.real_um((sent[i, 0], sent[i, 1])) for i in up])
-    assert np.abs(reported - real[up]).max() < 5 * REPEATABILITY
+def test_what_the_map_leaves_of_each_place_is_the_repeatability():
+    assert np.abs(mapped().residual_um).max() < 5 * REPEATABILITY
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.37, -0.81), (6.0, 9.0), (-14.0, 3.0)])
@@ -106,24 +99,11 @@ def test_a_whiteboard_shows_where_its_mask_stood_to_a_hundredth_of_a_pixel(x, y)
     assert error < 0.01 * 24
 
 
-def test_from_one_side_the_map_is_the_same_and_backlash_is_not_stated():
-    sent, _, real = visited(40)
-    sides = np.ones_like(sent)
-    real += (1 - visited(40)[1]) * np.array(BACKLASH) / 2
-    places = [Place(float(x), float(y), 0.01) for x, y in real]
-    found = stage_map([(x, y) for x, y in sent], [(1, 1)] * len(sides), places)
-    assert found.scale == pytest.approx(SCALE, abs=4 * found.deviations["scale_x"])
-    assert not [name for name, *_ in found.rows() if "Backlash" in name]
-    there = found.real_um((100.0, -50.0))
-    assert there == pytest.approx(mapped(400).real_um((100.0, -50.0)), abs=0.2)
-    assert np.abs(found.residual_um).max() < 5 * REPEATABILITY
-
-
 def test_too_few_moves_and_one_line_are_refused():
-    sent, sides, real = visited(20)
+    sent, real = visited(20)
     places = [Place(float(x), float(y), 0.01) for x, y in real]
-    pairs, ways = [(x, y) for x, y in sent], [(a, b) for a, b in sides]
+    pairs = [(x, y) for x, y in sent]
     with pytest.raises(CalibrationError, match="needs 3 more"):
-        stage_map(pairs[:5], ways[:5], places[:5])
+        stage_map(pairs[:5], places[:5])
     with pytest.raises(CalibrationError, match="lie on one line"):
-        stage_map([(x, 2 * x) for x, _ in pairs], ways, places)
+        stage_map([(x, 2 * x) for x, _ in pairs], places)

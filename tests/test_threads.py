@@ -55,16 +55,14 @@ def solved(method):
 print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
 """
 ROUTES = """
-from emmc_rig.processing.bench import BenchTruth
 from emmc_rig.processing.calibration_settings import CalibrateSettings
-from emmc_rig.processing.simulated import run_calibration
+from emmc_rig.processing.simulated import calibrate_simulated
 from emmc_rig.model.camera import Camera
 
 camera = Camera.model_validate_json(sys.argv[1])
 
 def calibrated():
-    truth = BenchTruth(rays_per_view=64)
-    run = run_calibration(CalibrateSettings("small", camera, (32, 40), truth=truth))
+    run = calibrate_simulated(CalibrateSettings("small", camera, (32, 40), rays=64)).found
     stated = {name: value for name, value in run.metrics.items() if "seconds" not in name}
     return {"stated": repr(stated)} | {
         name: digests(one.psi.weights, one.deviation) for name, one in

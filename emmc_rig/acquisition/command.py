@@ -9,13 +9,12 @@ import errno
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
-from emmc_rig.acquisition.amend import Amendment, amendment
+from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.estimate import (
     Estimate,
@@ -41,12 +40,10 @@ from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
-from emmc_rig.files.replaced import replace_text
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.arguments import NAMES, path_of, required
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.model.reading import parse_yaml
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
 from emmc_rig.session.lock import held
@@ -63,8 +60,13 @@ from emmc_rig.session.storage import SYSTEM_DISK, Disk
 DISK_RESERVE_BYTES = 100_000_000
 
 
+def ask_at_prompt(what: str) -> None:
+    """Ask a person to do something at the bench, and wait until Enter is pressed."""
+    input(f"please {what}, then press Enter ")
+
+
 @dataclass(frozen=True)
-class Wish:
+class CaptureRequest:
     """What to capture and where to; rig: see `emmc_rig.bench.rig_config`, None on resuming alike.
 
     until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
@@ -79,6 +81,22 @@ class Wish:
     until_db: float | None = None
 
 
+@dataclass(frozen=True)
+class FrontEnd:
+    """Who asks for a capture and follows it: the command line, a page, a program.
+
+    ask: does what no axis of the rig does: lamp, board, masks. agreed: gets what the capture will
+    take, once nothing speaks against it; where it says no, nothing is made or moved. suspend: says
+    before each frame why the capture has to wait, "" to go on.
+    """
+
+    watcher: CaptureWatcher = field(default_factory=CaptureWatcher)
+    ask: Ask = ask_at_prompt
+    agreed: Callable[[Estimate], bool] = lambda expected: True
+    control: Control = field(default_factory=Control)
+    suspend: Suspend | None = None
+
+
 def session_folder(plan_path: Path) -> Path:
     """Return the folder of a plan's session unless another is named."""
     return plan_path.with_name(f"{plan_path.stem}-session")
@@ -89,78 +107,83 @@ def asked_folder(plan: Path, out: Path | None) -> Path:
     return out or (plan if is_session(plan) else session_folder(plan))
 
 
-def wish_from_plan(
+def request_from_plan(
     plan_path: Path, out: Path, rig: Mapping[str, Any], until_db: float | None = None
-) -> Wish:
+) -> CaptureRequest:
     """Return what a plan file asks for; raises AppError."""
     plan = load_plan(plan_path)
     camera = planned_camera(plan, plan_path.parent)
     text = plan_path.read_text(encoding="utf-8")
-    return Wish(plan_path, plan, text, camera, out, rig, until_db)
+    return CaptureRequest(plan_path, plan, text, camera, out, rig, until_db)
 
 
-def wish_from_session(
+def request_from_session(
     folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
-) -> Wish:
+) -> CaptureRequest:
     """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
     session = Session(folder)
     plan = validated(Plan, session.plan_data(), str(folder), AppError)
     camera = validated(Camera, session.camera, str(folder), CameraError)
-    return Wish(folder, plan, session.plan_yaml, camera, out, rig or session.rig, until_db)
+    rig = rig or session.rig
+    return CaptureRequest(folder, plan, session.plan_yaml, camera, out, rig, until_db)
 
 
-def planned_frames(wish: Wish, rig: Rig) -> tuple[PlannedFrame, ...]:
-    """Return every frame of a wish in the order of the capture."""
+def planned_frames(request: CaptureRequest, rig: Rig) -> tuple[PlannedFrame, ...]:
+    """Return every frame of a request in the order of the capture."""
     return ordered(
-        expand(wish.plan, wish.camera, rig.window_um, rig.window_side_um), wish.plan.order
+        expand(request.plan, request.camera, rig.window_um, rig.window_side_um), request.plan.order
     )
 
 
-def still_possible(wish: Wish, session: Session) -> tuple[PlannedFrame, ...]:
+def still_possible(request: CaptureRequest, session: Session) -> tuple[PlannedFrame, ...]:
     """Return the frames that going on may take; another target asks for spared shots again."""
-    other_target = wish.until_db not in (None, session.target_db)
+    other_target = request.until_db not in (None, session.target_db)
     frames = session.frames if other_target else session.needed
     return tuple(frame for frame in frames if frame.id not in session.stored)
 
 
-def begun_session(wish: Wish, disk: Disk = SYSTEM_DISK) -> Session | None:
-    """Return the session that the wish goes on with; None where it is to be begun.
+def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session | None:
+    """Return the session that the request goes on with; None where it is to be begun.
 
     Raises AppError when the folder is in the way, or frames were taken by another rig.
     """
-    if is_session(wish.out):
-        session = Session(wish.out, disk)
-        if session.stored and json.loads(json.dumps(dict(wish.rig))) != session.rig:
+    if is_session(request.out):
+        session = Session(request.out, disk)
+        if session.stored and json.loads(json.dumps(dict(request.rig))) != session.rig:
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
                 f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
             )
         return session
-    if (wish.out / HEADER).is_file():
+    if (request.out / HEADER).is_file():
         raise AppError(
-            f"{wish.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
+            f"{request.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
         )
-    if wish.out.exists() and (wish.out.is_file() or any(wish.out.iterdir())):
-        raise AppError(f"--out {wish.out}: holds something else than a session; name another --out")
-    refuse_inside_session(wish.out)
+    if request.out.exists() and (request.out.is_file() or any(request.out.iterdir())):
+        raise AppError(
+            f"--out {request.out}: holds something else than a session; name another --out"
+        )
+    refuse_inside_session(request.out)
     return None
 
 
-def new_session(wish: Wish, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK) -> Session:
-    """Begin the wish's session; raises AppError where it cannot be made."""
+def new_session(
+    request: CaptureRequest, frames: tuple[PlannedFrame, ...], disk: Disk = SYSTEM_DISK
+) -> Session:
+    """Begin the requested session; raises AppError where it cannot be made."""
     about = {
-        "title": wish.plan.title or wish.plan_path.stem,
+        "title": request.plan.title or request.plan_path.stem,
         "created": wall_time(),
         "command": command_line(),
         "versions": versions(),
-        **({} if wish.until_db is None else {"until_db": wish.until_db}),
+        **({} if request.until_db is None else {"until_db": request.until_db}),
     }
-    return Session.create(wish.out, _frozen(wish, frames), about, disk)
+    return Session.create(request.out, _frozen(request, frames), about, disk)
 
 
-def _frozen(wish: Wish, frames: tuple[PlannedFrame, ...]) -> Frozen:
-    camera = wish.camera.model_dump(mode="json")
-    return Frozen(wish.plan_yaml, camera, dict(wish.rig), frames)
+def _frozen(request: CaptureRequest, frames: tuple[PlannedFrame, ...]) -> Frozen:
+    camera = request.camera.model_dump(mode="json")
+    return Frozen(request.plan_yaml, camera, dict(request.rig), frames)
 
 
 def estimated(
@@ -224,7 +247,7 @@ def disk_faults_named(session: Session) -> Iterator[None]:
 
 
 @contextmanager
-def way_on_named(wish: Wish, session: Session) -> Iterator[None]:
+def way_on_named(request: CaptureRequest, session: Session) -> Iterator[None]:
     """Say with a fault how to go on; a session without a frame goes, for there is nothing to keep.
 
     A fault of the plan's is mended in the plan, which may hold for a session that has begun.
@@ -239,40 +262,32 @@ def way_on_named(wish: Wish, session: Session) -> Iterator[None]:
             raise
         if not is_session(session.folder):
             way = "nothing was captured; mend it, then run the same command"
-        elif is_session(wish.plan_path):
+        elif is_session(request.plan_path):
             way = (
                 f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
-                f"the plan that you edited: emmc-rig capture COPY.yaml --out {wish.out}"
+                f"the plan that you edited: emmc-rig capture COPY.yaml --out {request.out}"
             )
         else:
             way = f"{kept} frames are kept: mend it, then run the same command"
         raise AppError(f"{fault}; {way}") from fault
 
 
-def run_capture(
-    wish: Wish,
-    watcher: CaptureWatcher,
-    ask: Ask,
-    agreed: Callable[[Estimate], bool] = lambda expected: True,
-    control: Control | None = None,
-    suspend: Suspend | None = None,
-) -> tuple[Session, RunEnd] | None:
-    """Capture what is missing of a wish; nothing is made or moved unless `agreed` says yes.
+def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunEnd] | None:
+    """Capture what is missing; None, and nothing made or moved, unless the front end agrees.
 
-    agreed: gets what it will take, once nothing speaks against it. Raises AppError or a
-    `DriverError`.
+    Raises AppError or a `DriverError`.
     """
-    control = control or Control()
-    if wish.until_db is not None:
-        refuse_without_choice(wish.plan, wish.camera)
+    watcher, plan = front.watcher, request.plan
+    if request.until_db is not None:
+        refuse_without_choice(plan, request.camera)
     with ExitStack() as open_things:
-        session = begun_session(wish)
-        rig = open_things.enter_context(opened_rig(wish.rig, wish.camera, ask))
-        planned = planned_frames(wish, rig)
+        session = begun_session(request)
+        rig = open_things.enter_context(opened_rig(request.rig, request.camera, front.ask))
+        planned = planned_frames(request, rig)
         edit = None
         if session is None:
             frames = tuple(frame for frame in planned if not frame.is_optional)
-        elif edit := amendment(session, wish.plan, wish.camera, wish.rig, planned):
+        elif edit := amendment(session, plan, request.camera, request.rig, planned):
             watcher.tell(edit.words(len(session.stored)))
             frames = tuple(
                 frame
@@ -280,7 +295,7 @@ def run_capture(
                 if frame.id not in session.stored and not frame.is_optional
             )
         else:
-            frames = still_possible(wish, session)
+            frames = still_possible(request, session)
         recording: Mapping[str, Recorded] | None = None
         if isinstance(rig.camera, FolderCamera):
             folder = rig.camera.folder
@@ -289,95 +304,54 @@ def run_capture(
                 watcher.tell(words)
         refuse_impossible(rig, frames)
         details = getattr(rig.camera, "details", dict)
-        suspended = suspended_by(wish.plan.suspend, details, suspend)
+        suspended = suspended_by(plan.suspend, details, front.suspend)
         if session is not None:
             refuse_other_camera(session, rig)
-        earlier = last_session(wish.out, wish.rig)
-        expected = estimated(frames, wish.plan, rig, session, earlier)
-        refuse_small_disk(wish.out, expected)
-        if not agreed(expected):
+        earlier = last_session(request.out, request.rig)
+        expected = estimated(frames, plan, rig, session, earlier)
+        refuse_small_disk(request.out, expected)
+        if not front.agreed(expected):
             return None
         if session is None:
-            session = new_session(wish, planned)
+            session = new_session(request, planned)
             open_things.enter_context(held(session.folder))
-        exposures = Exposures(wish.plan, earlier)
-        with interruptible(control, watcher.tell):
-            while True:
-                with disk_faults_named(session):
-                    if edit is not None:
-                        session = session.amend(_frozen(wish, edit.frames), edit.changes)
-                    with way_on_named(wish, session):
-                        if wish.until_db not in (None, session.target_db):
-                            session.note("until", target_db=wish.until_db, wall=wall_time())
-                        control.preview = partial(_edit_words, wish, session, rig)
-                        choose = None if recording is None else there(session, recording)
-                        if session.target_db is not None:
-                            choose = Until(session, watcher)
-                        run = Sequencer(
-                            session,
-                            wish.plan,
-                            rig,
-                            watcher,
-                            control,
-                            choose,
-                            exposures=exposures,
-                            suspended=suspended,
-                        ).run()
-                text, control.edited = control.edited, None
-                if text is None:
-                    return session, run
-                edit = None
-                try:
-                    wish, edit = edited_plan(wish, session, rig, text)
-                except AppError as fault:
-                    watcher.tell(f"the plan stays as it was: {fault}")
-
-
-def edited_plan(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
-    """Write an edited plan in place of the wish's, and return what follows for its session.
-
-    Raises AppError, nothing written, for a plan that the session or the rig contradicts, and where
-    the file was changed meanwhile.
-    """
-    other, edit = _edit(wish, session, rig, text)
-    refuse_impossible(
-        rig, tuple(f for f in (edit.frames if edit else ()) if f.id not in session.stored)
-    )
-    if not is_session(wish.plan_path):
-        replace_text(wish.plan_path, wish.plan_yaml, text)
-    return other, edit
-
-
-def _edit(wish: Wish, session: Session, rig: Rig, text: str) -> tuple[Wish, Amendment | None]:
-    source = "the edited plan"
-    plan = validated(Plan, parse_yaml(text, source, AppError), source, AppError)
-    camera = planned_camera(plan, wish.plan_path.parent)
-    other = replace(wish, plan=plan, plan_yaml=text, camera=camera)
-    edit = amendment(session, plan, camera, wish.rig, planned_frames(other, rig))
-    return other, edit
-
-
-def _edit_words(wish: Wish, session: Session, rig: Rig, text: str) -> str:
-    """Return what an edited plan changes, in words; raises AppError where it cannot hold."""
-    _, edit = _edit(wish, session, rig, text)
-    return "nothing changes" if edit is None else edit.words(len(session.stored))
+        with interruptible(front.control, watcher.tell), disk_faults_named(session):
+            if edit is not None:
+                session = session.amend(_frozen(request, edit.frames), edit.changes)
+            with way_on_named(request, session):
+                if request.until_db not in (None, session.target_db):
+                    session.note("until", target_db=request.until_db, wall=wall_time())
+                choose = None if recording is None else there(session, recording)
+                if session.target_db is not None:
+                    choose = Until(session, watcher)
+                sequencer = Sequencer(
+                    session,
+                    plan,
+                    rig,
+                    watcher,
+                    front.control,
+                    choose,
+                    exposures=Exposures(plan, earlier),
+                    suspended=suspended,
+                )
+                return session, sequencer.run()
 
 
 def asked_for(
     plan: Path, folder: Path, rig: Mapping[str, Any] | None, until_db: float | None
-) -> Wish:
+) -> CaptureRequest:
     """Return what a plan file asks for, or what a session was begun for; raises AppError.
 
     folder: of the session. rig: see `rig_description`; a session has its own, and an edited plan
     for a session that is there keeps it.
     """
     if is_session(plan):
-        return wish_from_session(plan, rig, until_db, folder)
+        return request_from_session(plan, rig, until_db, folder)
     if rig is None and is_session(folder):
         rig = Session(folder).rig
     if rig is None:
         raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
-    return wish_from_plan(plan, folder, rig, until_db)
+    return request_from_plan(plan, folder, rig, until_db)
 
 
 def capture_session(
@@ -385,25 +359,21 @@ def capture_session(
     rig: Mapping[str, Any] | None,
     out: Path | None,
     until_db: float | None,
-    watcher: CaptureWatcher,
-    ask: Ask,
-    agreed: Callable[[Estimate], bool] = lambda expected: True,
-    control: Control | None = None,
-    suspend: Suspend | None = None,
+    front: FrontEnd,
 ) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
-    See `asked_for` and `run_capture`. None where `agreed` says no. Raises StoppedError when
-    somebody stopped it: what was captured is kept, and the same call goes on.
+    See `asked_for` and `run_capture`. Raises StoppedError when somebody stopped it: what was
+    captured is kept, and the same call goes on.
     """
     if not plan.exists():
         raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
     folder = asked_folder(plan, out)
     go_on = f"go on with: emmc-rig capture {folder}"
     with held(folder):
-        wish = asked_for(plan, folder, rig, until_db)
+        request = asked_for(plan, folder, rig, until_db)
         try:
-            captured = run_capture(wish, watcher, ask, agreed, control, suspend)
+            captured = run_capture(request, front)
         except KeyboardInterrupt as stop:
             begun = is_session(folder)
             kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
@@ -414,19 +384,14 @@ def capture_session(
         try:
             write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
-            watcher.tell(f"no report: {fault}")
-    watcher.ended(session, outcome)
+            front.watcher.tell(f"no report: {fault}")
+    front.watcher.ended(session, outcome)
     if not outcome.complete:
         raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
             f"{go_on}"
         )
     return captured
-
-
-def ask_at_prompt(what: str) -> None:
-    """Ask a person to do something at the bench, and wait until Enter is pressed."""
-    input(f"please {what}, then press Enter ")
 
 
 def capture(
@@ -469,7 +434,8 @@ def capture(
     watching = watcher or CaptureWatcher()
     if on_event is not None:
         watching = EventWatcher(on_event, watching)
-    captured = capture_session(plan, description, folder, until_db, watching, ask, suspend=suspend)
+    front = FrontEnd(watching, ask, suspend=suspend)
+    captured = capture_session(plan, description, folder, until_db, front)
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]
 

@@ -21,22 +21,13 @@ class Control:
     signal interrupts.
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
-    preview: set by the capture; takes the text of an edited plan, and says what it changes.
-    edited: the text of an edited plan that is to hold from the next frame on.
     """
 
     def __init__(self, stays: bool = False) -> None:
         self.paused = False
         self.stopping = False
         self.stays = stays
-        self.preview: Callable[[str], str] | None = None
-        self.edited: str | None = None
         self._again: list[str] = []
-
-    @property
-    def ending(self) -> bool:
-        """Whether the present run is to end: for good, or to go on by an edited plan."""
-        return self.stopping or self.edited is not None
 
     def take_again(self, ids: Iterable[str]) -> None:
         """Take these frames once more."""

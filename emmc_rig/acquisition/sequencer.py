@@ -253,21 +253,21 @@ class Sequencer:
         control = self._control
 
         def reason() -> str:
-            wished = control.ending or control.again
+            wished = control.stopping or control.again
             return self._why_wait() or ("" if wished else otherwise)
 
         why = reason()
-        if why and not control.ending:
+        if why and not control.stopping:
             began_s = self._now_s()
             self._note("paused", reason=why, wall=self._wall())
             self._watcher.paused(why)
-            while why and not control.ending:
+            while why and not control.stopping:
                 control.wait()
                 why = reason()
             seconds = self._now_s() - began_s
             self._note("resumed", seconds=seconds, wall=self._wall())
             self._watcher.resumed(seconds)
-        return not control.ending
+        return not control.stopping
 
     def _why_wait(self) -> str:
         return "somebody asked for it" if self._control.paused else self._suspended()

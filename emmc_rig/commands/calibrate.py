@@ -1,4 +1,4 @@
-"""The command `emmc-rig calibrate`: whiteboards to Psi, their plan, and checks of both."""
+"""The command `emmc-rig calibrate`: whiteboards to Psi, and their plan."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import SIZE_VARIABLE
-from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
+from emmc_rig.commands.output import give_result, shown_progress, tell
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
@@ -31,16 +31,6 @@ def calibrate(
     plan: Annotated[
         bool, typer.Option("--plan", help="write how many whiteboards, of which kind, it takes")
     ] = False,
-    check: Annotated[
-        str | None,
-        typer.Option(
-            "--check",
-            help="measure what calibration reaches on the simulated bench: psi, few, session, "
-            "bound, plan, sensor, stage, drift, alarms, cost, frames, large, streamed, effects "
-            "(tilt, glass, lamp, ...); commas between, or all; exit code 1 where a target is "
-            "missed",
-        ),
-    ] = None,
     drift: Annotated[
         Path | None,
         typer.Option(
@@ -76,10 +66,6 @@ def calibrate(
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
-    psnr: Annotated[
-        bool,
-        typer.Option("--psnr", help="with --check effects: what each costs a reconstruction, dB"),
-    ] = False,
     stage: Annotated[
         bool,
         typer.Option(
@@ -98,7 +84,7 @@ def calibrate(
         typer.Option(
             "--out",
             help="folder to write (default: of a session, in the session; emmc-calibration with "
-            "--plan, else emmc-bench, emmc-checks or emmc-drift)",
+            "--plan, else emmc-bench or emmc-drift)",
         ),
     ] = None,
 ) -> None:
@@ -106,7 +92,6 @@ def calibrate(
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
-    from emmc_rig.processing.bench import BenchTruth
     from emmc_rig.processing.board_plan import write_plan
     from emmc_rig.processing.calibration_settings import CalibrateSettings
     from emmc_rig.processing.simulated import run_calibrate
@@ -130,28 +115,12 @@ def calibrate(
         route,
         target,
         seed,
-        BenchTruth(rays_per_view=rays),
+        rays=rays,
         map_stage=stage,
         most_frames=frames,
         few=few,
-        psnr=psnr,
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
     )
-    if check is not None:
-        from emmc_rig.study.checks.check_sweep import run_checks
-
-        out = out or Path("emmc-checks")
-        with shown_progress() as bars:
-            metrics = run_checks(settings, check, out, bars)
-        names = ("what", "measured", "asked", "verdict")
-        rows = [tuple(row[name] for name in names) for row in metrics["rows"]]
-        show_table(("target", "measured", "asked", ""), rows)
-        tell(f"read {out / 'metrics.json'}")
-        give_result(out)
-        missed = [row["what"] for row in metrics["rows"] if row["verdict"] == "missed"]
-        if missed:
-            raise AppError(f"{len(missed)} of {len(metrics['rows'])} missed: {'; '.join(missed)}")
-        return
     if plan:
         out = out or Path("emmc-calibration")
         with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):

@@ -68,10 +68,7 @@ def capture(
     ] = False,
     steer: Annotated[
         bool,
-        typer.Option(
-            "--steer",
-            help="and let the page pause, edit the plan, take frames again; it ends there",
-        ),
+        typer.Option("--steer", help="and let the page pause and take frames again; it ends there"),
     ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
@@ -125,7 +122,7 @@ def _run(
     out: Path | None,
     page: Literal["shows", "steers"] | None,
 ) -> None:
-    from emmc_rig.acquisition.command import asked_folder, capture_session
+    from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
     from emmc_rig.acquisition.control import Control
     from emmc_rig.acquisition.estimate import Estimate
     from emmc_rig.acquisition.events import EventWatcher
@@ -171,7 +168,8 @@ def _run(
         open_things.enter_context(display.shown())
         if json_wanted.get():
             emit("stage", stage="open the rig", steps=None)
-        captured = capture_session(plan, rig, out, until_db, watcher, ask, agreed, control)
+        front = FrontEnd(watcher, ask, agreed, control)
+        captured = capture_session(plan, rig, out, until_db, front)
     if captured is None:
         return
     session, outcome = captured

@@ -124,7 +124,7 @@ def show(session: Folder) -> None:
         for number in range(opened.amendments + 1):
             name = amended_name(PLAN, number)
             tell(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
-    leftovers, foreign = opened.strangers()
+    leftovers, foreign = opened.unexpected_files()
     if leftovers:
         tell(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
     for name in foreign:

@@ -112,8 +112,8 @@ class Page(Protocol):
         """Return the state, plain data with its `version`."""
         ...
 
-    def looked(self) -> None:
-        """Take note that somebody looks."""
+    def touch(self) -> None:
+        """Note that the page is being viewed."""
         ...
 
     def listen(self, listener: Callable[[], None]) -> None:
@@ -165,7 +165,7 @@ class _News:
 
     def state(self, **more: Any) -> tuple[int, bytes]:
         """Return version and state as JSON, encoded once for all who ask."""
-        self._page.looked()
+        self._page.touch()
         if self._encoded[0] != self._page.version:
             state = self._page.state()
             data = json.dumps({**state, **more}, allow_nan=False, separators=(",", ":"))

@@ -118,18 +118,4 @@ $("retake").addEventListener("click", async () => {
   for (const id of ids) rows.get(id)?.setAttribute("aria-pressed", "false");
   await act("retake", { ids });
 });
-$("plan-details").addEventListener("toggle", async () => {
-  if ($("plan-details").open && !$("plan").value) $("plan").value = (await act("plan"))?.text || "";
-});
-$("plan").addEventListener("input", () => { $("amend").disabled = true; write("changes", ""); });
-$("preview").addEventListener("click", async () => {
-  const answer = await act("preview", { text: $("plan").value });
-  write("changes", answer ? answer.changes : complaint); // also here: the head may be out of sight
-  $("changes").classList.toggle("bad", !answer);
-  $("amend").disabled = !answer || answer.changes === "nothing changes";
-});
-$("amend").addEventListener("click", async () => {
-  $("amend").disabled = true;
-  await act("amend", { text: $("plan").value });
-});
 follow(draw);

@@ -100,9 +100,6 @@ class SessionPage(EventWatcher):
             "resume": lambda: self._wish("", control.resume),
             "stop": lambda: self._wish("stopping after this frame", control.stop),
             "retake": self._retake,
-            "plan": lambda: {"text": Session(folder).plan_yaml},
-            "preview": lambda text: {"changes": self._preview(text)},
-            "amend": self._amend,
         }
 
     def start(self) -> None:
@@ -127,7 +124,7 @@ class SessionPage(EventWatcher):
         with self._changed:
             return dict(self._state)
 
-    def looked(self) -> None:
+    def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
 
     def listen(self, listener: Callable[[], None]) -> None:
@@ -247,17 +244,6 @@ class SessionPage(EventWatcher):
             self._retaken += len(ids)
             self._control.take_again(ids)
             self._publish_frames()
-
-    def _preview(self, text: object) -> str:
-        if self._control.preview is None:
-            raise AppError("the capture has not begun yet")
-        return self._control.preview(str(text))
-
-    def _amend(self, text: str) -> dict[str, Any]:
-        changes = self._preview(text)
-        self._wish("the edited plan holds after this frame", lambda: None)
-        self._control.edited = text
-        return {"changes": changes}
 
     def _newest_picture(self, query: Query) -> Picture | None:
         newest = self._newest

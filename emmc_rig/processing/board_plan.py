@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +16,11 @@ from calibration.planning import (
     FEW_MODEL_ERROR,
     MODEL_ERROR,
     MOST_FRAMES,
+    REFERENCE_FRAMES,
     Kind,
     Light,
     PlannedFrames,
-    free_noise,
-    plan_free,
+    plan_combined,
     plan_parametric,
 )
 from calibration.shadow import ShadowMask, shadow_mask
@@ -37,7 +36,6 @@ from emmc_rig.acquisition.plan import (
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
-from emmc_rig.processing.bench import SERIES_SHARES, Setting, WhiteboardBench
 from emmc_rig.processing.calibration_settings import WATCHES, CalibrateSettings
 
 PLAN = "plan.yaml"
@@ -49,21 +47,21 @@ METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
 LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
+"""Where the mask stage has not been before: the whiteboards to judge by."""
+SERIES_SHARES = (0.25, 0.5, 0.75)
+"""Of a reference's exposure: they show whether the response is linear."""
+BOARD_LEVEL = 0.7
+"""Of the sensor's range, that a whiteboard without masks fills."""
 
 
-def plan_light(bench: WhiteboardBench, mask: ShadowMask) -> Light:
+def plan_light(camera: Camera, mask: ShadowMask) -> Light:
     """Return what the plan counts on: the exposure of a whiteboard, and how many pixels see it."""
     rows, columns = mask.pixel_shape()
-    views = bench.camera.views
-    single = bench.camera.sensor.cfa_name != "mono"
-    light = (1 if single else 3) * bench.camera.sensor.binning**2
-    return Light(
-        bench.camera.sensor.noise,
-        bench.board_exposure_s(),
-        views,
-        light,
-        rows * columns,
-    )
+    noise = camera.sensor.noise
+    light = (1 if camera.sensor.cfa_name != "mono" else 3) * camera.sensor.binning**2
+    range_electrons = (noise.white_level_dn - noise.black_level_dn) / noise.gain_dn_per_electron
+    board_s = BOARD_LEVEL * range_electrons / (noise.electrons_per_s * light)
+    return Light(noise, board_s, camera.views, light, rows * columns)
 
 
 def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
@@ -79,29 +77,6 @@ def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: floa
     return plan_parametric(mask, soft_design(camera, mask), kinds, light, target)
 
 
-def few_settings(planned: PlannedFrames, lamp: str = "white") -> list[Setting]:
-    """Return a plan as settings of the bench, in shot 0."""
-    return [
-        Setting(0, kind.pinhole, lamp, kind.stage_um, count, window=kind.window)
-        for kind, count in planned.counts.items()
-    ]
-
-
-def free_settings(camera: Camera, lamps: Sequence[str], repeats: int) -> list[Setting]:
-    """Return the settings of the free route: every shot, view and lamp."""
-    return [
-        Setting(shot, (v, u), lamp, repeats=repeats)
-        for shot in range(len(camera.shots))
-        for v, u in np.ndindex(camera.views)
-        for lamp in lamps
-    ]
-
-
-def held_out_settings(camera: Camera) -> list[Setting]:
-    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
-    return [Setting(0), *([Setting(0, stage_um=VERIFY_UM)] if camera.moving_masks else [])]
-
-
 def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
     through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
@@ -112,10 +87,8 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
         for kind, count in planned.counts.items()
         if kind.pinhole is None
     ]
-    judging = [
-        OpenBoard(mask_um=one.stage_um, repeats=one.repeats, held_out=True)
-        for one in held_out_settings(settings.camera)
-    ]
+    judged_um = ((0.0, 0.0), VERIFY_UM) if settings.camera.moving_masks else ((0.0, 0.0),)
+    judging = [OpenBoard(mask_um=place_um, held_out=True) for place_um in judged_um]
     coloured = camera_colours(settings.camera) and "colours" not in settings.leave_out
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
@@ -125,7 +98,7 @@ def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
             views="all" if every else tuple(sorted(through)),
             shots=(0,),
             repeats=repeats,
-            references=max(2, planned.reference_frames),
+            references=REFERENCE_FRAMES,
             open=(*fitted, *judging),
             lamp_checks=0 if "lamp" in settings.leave_out else LAMP_CHECKS,
             response=() if "response" in settings.leave_out else SERIES_SHARES,
@@ -171,7 +144,7 @@ def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -
             f"and takes {others} frames beside: name at least {len(views) + others}, or --leave-out"
         )
     soft = soft_design(camera, mask)
-    planned = plan_free(mask, soft, light, target, 1, most, modelled=True)
+    planned = plan_combined(mask, soft, light, target, most)
     if planned.expected_error > target:
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached"
@@ -217,8 +190,7 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     """
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
-    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
-    light = plan_light(bench, mask)
+    light = plan_light(camera, mask)
     planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
     counts, few, more = frames_by_kind(settings, planned), settings.few, 0
     if few:
@@ -260,11 +232,3 @@ def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
     (folder / PLAN).write_text(PLAN_HEAD + text, encoding="utf-8")
     write_metrics(folder, metrics)
     return metrics
-
-
-def free_route_error(settings: CalibrateSettings, repeats: int) -> float:
-    """Return the error of Psi that the free route's formula expects of so many frames a view."""
-    mask = shadow_mask(settings.camera, settings.size)
-    bench = WhiteboardBench(settings.camera, settings.size, settings.truth, settings.seed)
-    light = plan_light(bench, mask)
-    return free_noise(mask, soft_design(settings.camera, mask), light).error(repeats)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from calibration.fit import FitSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.processing.bench import BenchTruth
+from simulators.effects import ORDINARY, Flaws, flawed
 
 ROUTES = {
     "auto": ("parametric", "mixed", "free", "combined"),
@@ -16,6 +15,8 @@ ROUTES = {
     "free": ("free",),
 }
 TARGET = 0.005
+ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
+RAYS_PER_VIEW = 512
 WATCHES = {
     "lamp": "open whiteboards between the others, and the reference again at the end",
     "response": "references at several exposures",
@@ -31,7 +32,8 @@ class CalibrateSettings:
 
     target: relative error of Psi. most_frames: of the plan, None: as many as it takes. leave_out:
     names of WATCHES that the rig cannot take. few: plan for the fitted mask alone, without the
-    pinhole before every view. psnr: measure effects by what they cost a reconstruction, too.
+    pinhole before every view. flaws, rays: what is wrong with a simulated bench, and how many rays
+    it traces per view and pixel.
     """
 
     camera_name: str
@@ -40,13 +42,12 @@ class CalibrateSettings:
     route: str = "auto"
     target: float = TARGET
     seed: int = 0
-    truth: BenchTruth = field(default_factory=BenchTruth)
-    fit: FitSettings = field(default_factory=FitSettings)
+    flaws: Flaws = ORDINARY_BENCH
+    rays: int = RAYS_PER_VIEW
     map_stage: bool = False
     most_frames: int | None = None
     leave_out: frozenset[str] = frozenset()
     few: bool = False
-    psnr: bool = False
 
     def __post_init__(self) -> None:
         for name in sorted(self.leave_out):

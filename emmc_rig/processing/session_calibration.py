@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,15 +123,16 @@ class SessionCalibration:
         with result_folder(Path(out), "calibrate", belongs_to=place) as folder:
             self.write(folder)
 
-    def write(self, folder: Path) -> None:
-        """Write the same files into an existing folder."""
+    def write(self, folder: Path, truth: Mapping[str, float] | None = None) -> None:
+        """Write the same files into an existing folder; truth: parameters of a simulated bench."""
         save_outcome(folder, self.outcome, self.calibration)
         stage = self.stage
         write_calibration_report(
             folder / REPORT,
             self.outcome,
             self.metrics,
-            sensor=self.sensor,
+            truth,
+            self.sensor,
             stage=None if stage is None else stage.map,
             places=() if stage is None else stage.rows(),
         )
@@ -262,8 +263,7 @@ def _stage_of(session: Session, outcome: Outcome) -> SessionStage:
     seen = each_reading(boards, layout, outcome.good)
     places = [locate(board, shadow.mask, shadow.placement) for board in seen]
     sent = [one.stage_um for one in boards.frames]
-    # The rig's stages end every move upwards.
-    found = stage_map(sent, [(1, 1)] * len(sent), places)
+    found = stage_map(sent, places)
     read = [_read_um(session, one) for one in planned]
     return SessionStage(found, tuple(one.id for one in planned), sent, read, places)
 

@@ -1,200 +1,271 @@
-"""Calibration of the simulated bench, whose truth is known."""
+"""Sessions of the simulated rig, whose truth is known: captured, calibrated, compared with it."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+import yaml
+from numpy.typing import NDArray
 
-from calibration.boards import BoardSet, as_readings
-from calibration.parametric import Parametric
-from calibration.planning import (
-    PlannedFrames,
-)
-from calibration.routes import Outcome, calibrate
-from calibration.sensor import SensorSheet, characterise
 from calibration.shadow import shadow_mask
-from calibration.stage_map import StageMap, locate, stage_map
-from calibration.whiteboard import lamps_needed
+from calibration.whiteboard import Calibration
+from drivers.raw import RawFrame
+from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
+from emmc_rig.acquisition.expand import mask_offsets_um
+from emmc_rig.acquisition.plan import OpenBoard, Plan
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hardware import Rig, simulated_rig
+from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import command_line, versions, write_metrics
-from emmc_rig.model.blas import one_blas_thread
-from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.files.results import write_metrics
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.calibration_page import write_calibration_report
-from emmc_rig.processing.bench import Setting, WhiteboardBench
-from emmc_rig.processing.board_plan import (
-    few_plan,
-    few_settings,
-    free_settings,
-    held_out_settings,
-    parametric_plan,
-    plan_light,
-)
+from emmc_rig.processing.board_plan import capture_plan, combined_plan, few_plan, plan_light
 from emmc_rig.processing.calibration_settings import ROUTES, CalibrateSettings
-from emmc_rig.processing.comparison import coverage, stated_error, true_error, true_parameters
-from emmc_rig.processing.stored import REPORT, outcome_figures, save_outcome
+from emmc_rig.processing.session_calibration import SessionCalibration, calibrate
 from emmc_rig.progress import Silent, Watcher
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
+from simulators.bench import Bench
+from simulators.effects import Flaws
 
-FREE_REPEATS = 2
-BOARD_TURN_DEG = 90.0
+Array = NDArray[np.floating]
 STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
+PINHOLE_REPEATS = 2
+GREY = 0.5
+"""Of the scene that a calibration's shots show."""
+
+
+class FrameSteps(CaptureWatcher):
+    """A capture shown as steps of a stage, one a frame."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher = watcher
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """Count a frame."""
+        self._watcher.step(planned.id)
+
+
+@contextmanager
+def simulated_session(plan: Plan, camera: Camera, rig: Rig, watcher: Watcher) -> Iterator[Session]:
+    """Yield the session that the sequencer captures on a rig; its folder is gone afterwards.
+
+    camera: as planned. Raises AppError or a `DriverError`.
+    """
+    text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+    with TemporaryDirectory(prefix="emmc-rig-") as name:
+        folder = Path(name) / "session"
+        request = CaptureRequest(folder, plan, text, camera, folder, {"kind": SIMULATED})
+        session = new_session(request, planned_frames(request, rig))
+        Sequencer(session, plan, rig, FrameSteps(watcher)).run()
+        yield session
+
+
+def place_masks(rig: Rig, camera: Camera, shot: int) -> None:
+    """Bring the masks on the stage to where a shot has them."""
+    offsets_um = mask_offsets_um(camera, shot)
+    if offsets_um:
+        rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in offsets_um.items()})
+
+
+def true_psi(camera: Camera, rig: Rig, bench: Bench) -> NDArray[np.float32]:
+    """Return `Bench.true_psi` of every shot, (shot, v, u, y, colour, x)."""
+    found = []
+    for shot in range(len(camera.shots)):
+        place_masks(rig, camera, shot)
+        found.append(bench.true_psi(shot))
+    return np.stack(found)
+
+
+def in_three_colours(values: Array, psi: ImagingMatrix) -> NDArray[np.float32]:
+    """Return values shaped as Psi's weights for all three colours: 0 where it stores none."""
+    if psi.colour is None:
+        return np.asarray(values, dtype=np.float32)
+    own = np.arange(3)[:, None] == psi.colour[:, None, None, :, None, :]
+    return np.where(own, values, 0).astype(np.float32)
+
+
+def _of_good(psi: ImagingMatrix, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)[:, None, :]
+
+
+def true_error(psi: ImagingMatrix, true: Array, good: NDArray[np.bool_]) -> float:
+    """Return |Psi - true| / |true| in three colours over the good pixels, Frobenius.
+
+    true: (shot, v, u, y, colour, x). A colour that Psi does not store counts as 0.
+    """
+    chosen = _of_good(psi, good)
+    off = np.where(chosen, in_three_colours(psi.weights, psi) - true, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, true, 0)))
+
+
+def stated_error(known: Calibration, good: NDArray[np.bool_]) -> float:
+    """Return the relative error of Psi that a calibration states, as `true_error`."""
+    chosen = _of_good(known.psi, good)
+    off = np.where(chosen, known.deviation, 0)
+    return float(np.linalg.norm(off) / np.linalg.norm(np.where(chosen, known.psi.weights, 0)))
+
+
+def coverage(known: Calibration, true: Array, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the share of true coefficients within one and two stated deviations.
+
+    Coefficients that are 0 in truth and in Psi do not count.
+    """
+    psi = known.psi
+    chosen = np.broadcast_to(_of_good(psi, good), true.shape)
+    off = np.abs(in_three_colours(psi.weights, psi) - true)
+    stated = in_three_colours(known.deviation, psi)
+    counted = chosen & ((true != 0) | (stated != 0))
+    within = [float((off <= k * stated)[counted].mean()) for k in (1, 2)]
+    return within[0], within[1]
+
+
+def true_parameters(flaws: Flaws) -> dict[str, float]:
+    """Return the scalars of the placement that a simulated bench really has, where comparable.
+
+    Its vignetting and falloff follow another law.
+    """
+    mounting, optics = flaws.mounting, flaws.optics
+    return {
+        "offset_x_um": mounting.offset_um[0],
+        "offset_y_um": mounting.offset_um[1],
+        "rotation_rad": float(np.deg2rad(mounting.rotation_deg)),
+        "scale": mounting.stretch,
+        "skew": mounting.skew,
+        "distance_share": mounting.distance_share,
+        "distortion_um": mounting.distortion_um,
+        "blur_um": mounting.edge_blur_um,
+        "clear": optics.clear,
+        "leak": optics.leak,
+    }
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """A calibration of the simulated bench, with everything that the report shows."""
+class SimulatedCalibration:
+    """A calibration of the simulated rig and the coefficients that its rays integrate to.
 
-    settings: CalibrateSettings
-    bench: WhiteboardBench
-    outcome: Outcome
-    few: BoardSet | None
-    held_out: BoardSet
-    planned: PlannedFrames | None
-    metrics: dict
-    sensor: SensorSheet
-    stage: StageMap | None
+    true: (shot, v, u, y, colour, x).
+    """
+
+    found: SessionCalibration
+    true: NDArray[np.float32]
 
 
-@one_blas_thread()
-def run_calibration(settings: CalibrateSettings, watcher: Watcher | None = None) -> Run:
-    """Capture the whiteboards that the route needs from the simulated bench, and calibrate."""
-    watcher = watcher or Silent()
-    if settings.route not in ROUTES:
-        raise AppError(f"--route {settings.route}: use one of {', '.join(ROUTES)}")
-    # Few whiteboards do not open every view.
-    few_alone = settings.few and settings.route == "auto"
-    routes = ROUTES["mixed" if few_alone else settings.route]
-    camera = settings.camera
-    watcher.begin("design", None)
-    design = build_imaging_matrix(camera, settings.size)
-    bench = WhiteboardBench(camera, settings.size, settings.truth, settings.seed)
-    lamps = lamps_needed(design)
-    few = pinholes = planned = None
-    started = time.perf_counter()
-    fitted: list[Setting] = []
-    if "parametric" in routes:
-        mask = shadow_mask(camera, settings.size)
-        light = plan_light(bench, mask)
-        if settings.few:
-            planned = few_plan(settings, mask, light)
-        else:
-            planned = parametric_plan(camera, mask, light, settings.target)
-        fitted = few_settings(planned)
-    through: list[Setting] = []
-    if "free" in routes:
-        through = free_settings(camera, lamps, FREE_REPEATS)
-        fitted = [one for one in fitted if one.pinhole is None]
-    judges = held_out_settings(camera)[: 2 if "parametric" in routes else 1]
-    watcher.begin("whiteboards", len(fitted) + len(through) + len(judges))
-    every = [*fitted, *through, *judges]
-    boards = bench.capture(every, watcher.step, settings.leave_out)
-    first, last = len(fitted), len(fitted) + len(through)
-    held_out = boards.with_frames(boards.frames[last:])
-    if "free" in routes:
-        pinholes = boards.with_frames(boards.frames[first:last])
-    if "parametric" in routes:
-        few = boards.with_frames([one for one in boards.frames[:last] if one.shot == 0])
-    turned = {}
-    if "combined" in routes and "turned" not in settings.leave_out:
-        watcher.begin("whiteboards, the board turned", 1)
-        turned[BOARD_TURN_DEG] = bench.capture(
-            [Setting(lamp=lamps[0], repeats=4, board_turn_deg=BOARD_TURN_DEG)], watcher.step
-        )
-    captured_s = time.perf_counter() - started
-    started = time.perf_counter()
-    outcome = calibrate(
-        camera,
-        design,
-        routes,
-        held_out,
-        few,
-        pinholes,
-        settings.fit,
-        on_stage=lambda name: watcher.begin(name, None),
-        turned=turned,
+def place_rig(rig: Rig, frame: PlannedFrame) -> None:
+    """Bring a simulated bench to how it stands for a frame."""
+    bench = frame.bench
+    rig.attendant.place(bench.target, bench.board_turn_deg)
+    rig.attendant.fit_masks(bench.fitting, bench.masks_in)
+    rig.attendant.set_lamp(bench.lamp)
+    rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in bench.offsets_um.items()})
+
+
+def rig_to_calibrate(settings: CalibrateSettings, scene: Array | None = None) -> tuple[Rig, Bench]:
+    """Return the simulated rig, homed; scene: see `simulated_rig` (default: grey)."""
+    rows, columns = settings.size
+    if scene is None:
+        scene = np.full((*settings.camera.views, rows, columns, 3), GREY, np.float32)
+    rig, bench = simulated_rig(
+        settings.camera,
+        np.asarray(scene, np.float32),
+        settings.size,
+        settings.seed,
+        rays_per_view=settings.rays,
+        flaws=settings.flaws,
     )
-    calibrated_s = time.perf_counter() - started
-    watcher.begin("sensor", None)
-    sensor = characterise(*bench.sensor_pairs(), camera.sensor.noise.white_level_dn)
-    stage = None
-    best = outcome.mixed or outcome.parametric
+    rig.stage.home()
+    return rig, bench
+
+
+def simulated_plan(settings: CalibrateSettings) -> Plan:
+    """Return the plan of `write_plan`, with the pinhole before the views of every shot.
+
+    With more places of the mask stage where its map is wanted.
+
+    Raises AppError where the target cannot be reached.
+    """
+    mask = shadow_mask(settings.camera, settings.size)
+    light = plan_light(settings.camera, mask)
+    planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
+    plan = capture_plan(settings, planned)
+    assert plan.whiteboards is not None
+    changes: dict[str, Any] = {}
+    if not settings.few:
+        repeats = max(plan.whiteboards.repeats, PINHOLE_REPEATS)
+        changes |= {"shots": "all", "repeats": repeats}
     if settings.map_stage:
-        if best is None:
-            raise AppError("--stage needs a parametric route: leave --route at auto")
-        stage = measured_stage(bench, design, best, watcher)
+        if not settings.camera.moving_masks:
+            raise AppError("--stage: no mask of this camera moves")
+        reach = STAGE_REACH_UM
+        places_um = np.random.default_rng(settings.seed).uniform(-reach, reach, (STAGE_PLACES, 2))
+        further = [OpenBoard(mask_um=(float(x), float(y)), repeats=1) for x, y in places_um]
+        changes["open"] = (*plan.whiteboards.open, *further)
+    boards = plan.whiteboards.model_copy(update=changes)
+    return plan.model_copy(update={"whiteboards": boards})
+
+
+def calibrate_simulated(
+    settings: CalibrateSettings, watcher: Watcher | None = None
+) -> SimulatedCalibration:
+    """Plan, capture and calibrate a session of the simulated rig, and compare it with the truth.
+
+    Raises AppError or CalibrationError.
+    """
+    watcher = watcher or Silent()
+    camera, route = settings.camera, settings.route
+    if route not in ROUTES:
+        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
+    watcher.begin("plan", None)
+    plan = simulated_plan(settings)
+    rig, bench = rig_to_calibrate(settings)
+    frames = planned_frames(CaptureRequest(Path(), plan, "", camera, Path(), {}), rig)
+    watcher.begin("whiteboards", sum(not frame.is_optional for frame in frames))
+    started = time.perf_counter()
+    # What a sensor is takes its response.
+    sensor = "response" not in settings.leave_out
+    with simulated_session(plan, camera, rig, watcher) as session:
+        captured_s = time.perf_counter() - started
+        found = calibrate(session, route, sensor=sensor, stage=settings.map_stage, watcher=watcher)
+        held_out = sum(frame.kind == "held-out" for frame in session.frames)
     watcher.begin("the true Psi, for comparison", None)
-    true = bench.true_psi()
-    errors = {
-        name: true_error(one.psi, true, outcome.good) for name, one in outcome.calibrations.items()
-    }
+    true = true_psi(camera, rig, bench)
+    outcome = found.outcome
+    known, good = outcome.calibrations, outcome.good
+    design = build_imaging_matrix(camera, settings.size)
     metrics = {
+        **{name: value for name, value in found.metrics.items() if name != "session"},
         "camera": settings.camera_name,
-        "size": list(settings.size),
-        "route": settings.route,
-        **outcome_figures(outcome),
-        "psi_relative_error": errors,
-        "psi_stated_error": {
-            name: stated_error(one, outcome.good) for name, one in outcome.calibrations.items()
+        "psi_relative_error": {
+            name: true_error(one.psi, true, good) for name, one in known.items()
         },
-        "psi_coverage": {
-            name: coverage(one, true, outcome.good) for name, one in outcome.calibrations.items()
-        },
-        "design_relative_error": true_error(design, true, outcome.good),
-        "held_out_frames": held_out.exposures,
-        "sensor": {name: value for name, value, _, _ in sensor.rows()},
-        "stage": None if stage is None else {name: value for name, value, _, _ in stage.rows()},
+        "psi_stated_error": {name: stated_error(one, good) for name, one in known.items()},
+        "psi_coverage": {name: coverage(one, true, good) for name, one in known.items()},
+        "design_relative_error": true_error(design, true, good),
+        "held_out_frames": held_out,
         "capture_seconds": captured_s,
-        "calibration_seconds": calibrated_s,
         "seed": settings.seed,
-        "command": command_line(),
-        "versions": versions(),
     }
-    return Run(settings, bench, outcome, few, held_out, planned, metrics, sensor, stage)
-
-
-def measured_stage(
-    bench: WhiteboardBench, design: ImagingMatrix, known: Parametric, watcher: Watcher
-) -> StageMap:
-    """Move the mask stage about, from both sides, with a whiteboard each; return its map."""
-    if not bench.camera.moving_masks:
-        raise AppError("--stage: no mask of this camera moves")
-    rng = np.random.default_rng(bench.seed)
-    reach = STAGE_REACH_UM
-    places_um = rng.uniform(-reach, reach, (STAGE_PLACES, 2))
-    # Every pair of sides equally often.
-    wanted = [
-        Setting(
-            stage_um=(float(x), float(y)),
-            repeats=1,
-            came_from=(1 - 2 * (k % 2), 1 - 2 * (k // 2 % 2)),
-        )
-        for k, (x, y) in enumerate(places_um)
-    ]
-    watcher.begin("whiteboards for the stage map", len(wanted))
-    boards = as_readings(bench.capture(wanted, watcher.step), design.layout)
-    places = [locate(board, known.shadow.mask, known.fit.placement) for board in boards]
-    return stage_map([one.stage_um for one in wanted], [one.came_from for one in wanted], places)
+    return SimulatedCalibration(replace(found, metrics=metrics), true)
 
 
 def run_calibrate(
     settings: CalibrateSettings, folder: Path, watcher: Watcher | None = None
 ) -> dict:
-    """Calibrate the simulated bench into an existing folder and return the metrics.
+    """Calibrate the simulated rig into an existing folder and return the metrics.
 
-    Writes psi.h5, calibration.h5, metrics.json and report.html.
+    Writes what `SessionCalibration.write` does; the report shows the true parameters too.
     """
-    run = run_calibration(settings, watcher)
-    save_outcome(folder, run.outcome, run.outcome.calibration)
-    write_calibration_report(
-        folder / REPORT,
-        run.outcome,
-        run.metrics,
-        true_parameters(settings.truth),
-        run.sensor,
-        run.stage,
-    )
-    write_metrics(folder, run.metrics)
-    return run.metrics
+    found = calibrate_simulated(settings, watcher).found
+    found.write(folder, true_parameters(settings.flaws))
+    write_metrics(folder, found.metrics)
+    return found.metrics

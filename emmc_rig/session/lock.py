@@ -45,7 +45,7 @@ def held(folder: Path) -> Iterator[None]:
             locks.enter_context(_made_above(folder))
             locks.enter_context(_locked(beside, folder))
             if not is_session(folder):
-                _clear_unborn(folder)
+                _remove_stale_temporaries(folder)
                 break
             # It was made between the two looks at it.
             locks.close()
@@ -53,9 +53,9 @@ def held(folder: Path) -> Iterator[None]:
             locks.enter_context(_locked(folder / LOCK, folder))
             # Nobody is needed to make it any more: what lies beside is of a killed program, or of
             # the one that holds both.
-            if beside.exists() or _unborn(folder):
+            if beside.exists() or _stale_temporaries(folder):
                 with suppress(AppError), _locked(beside, folder):
-                    _clear_unborn(folder)
+                    _remove_stale_temporaries(folder)
         yield
 
 
@@ -95,8 +95,8 @@ def _made_above(folder: Path) -> Iterator[None]:
                 above.rmdir()
 
 
-def _unborn(folder: Path) -> list[Path]:
-    """Return the folders in which a session of this name was begun, and never took its name."""
+def _stale_temporaries(folder: Path) -> list[Path]:
+    """Return folders of sessions that a killed program left before they got their name."""
     name = re.compile(rf"\.{re.escape(folder.name)}\.(\d+-[0-9a-f]+\.)?{PART[1:]}")
     try:
         return [one for one in folder.parent.iterdir() if name.fullmatch(one.name) and one.is_dir()]
@@ -104,9 +104,9 @@ def _unborn(folder: Path) -> list[Path]:
         return []
 
 
-def _clear_unborn(folder: Path) -> None:
-    """Remove them; one that holds anything else stays."""
-    for one in _unborn(folder):
+def _remove_stale_temporaries(folder: Path) -> None:
+    """Remove these folders; one that holds anything else stays."""
+    for one in _stale_temporaries(folder):
         with suppress(OSError):
             for file in list(one.rglob("*")):
                 if file.is_file() and (file.name in KNOWN or OURS.match(file.name)):

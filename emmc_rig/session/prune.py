@@ -15,7 +15,7 @@ def prune(session: Session, dry_run: bool = False) -> tuple[list[str], int]:
     Raises AppError.
     Hold the session (`lock.held`), which clears what was left beside it, and open it then.
     """
-    leftovers, _ = session.strangers()
+    leftovers, _ = session.unexpected_files()
     size = 0
     for name in leftovers:
         path = session.folder / name

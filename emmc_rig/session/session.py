@@ -163,7 +163,8 @@ class Session:
 
     def forget(self) -> None:
         """Remove a session in which no frame was ever stored, unless it holds other files."""
-        if any(entry["kind"] == "frame" for entry in self.journal.entries) or self.strangers()[1]:
+        taken = any(entry["kind"] == "frame" for entry in self.journal.entries)
+        if taken or self.unexpected_files()[1]:
             return
         with suppress(OSError):
             # Whole or not at all: what a crash leaves of it is cleared like one never made.
@@ -378,8 +379,8 @@ class Session:
             found += [f"{FRAMES}/{name}" for name in sizes if is_part(name) and sizes[name] >= 0]
         return found
 
-    def strangers(self) -> tuple[list[str], list[str]]:
-        """Return (leftovers of a crash, files of other programs), relative to the folder."""
+    def unexpected_files(self) -> tuple[list[str], list[str]]:
+        """Return leftovers of a crash and files of other programs, relative to the folder."""
         ours = {entry["file"] for entry in self.stored.values()}
         known = {*KNOWN, *self.digests}
         unfinished = {amended_name(name, self.amendments + 1) for name in AMENDED}

@@ -140,7 +140,7 @@ def verify(
     planned = {frame.id for frame in session.needed}
     stored = {name: entry for name, entry in session.stored.items() if name in planned}
     damaged = verify_frames(session, stored.values(), on_frame, threads)
-    leftovers, foreign = session.strangers()
+    leftovers, foreign = session.unexpected_files()
     return Verdict(
         planned=len(planned),
         good=len(stored) - len(damaged),

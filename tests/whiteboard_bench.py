@@ -1,8 +1,4 @@
-"""Whiteboards of a simulated bench that is with every flaw, none of them known to the calibration.
-
-The only part of the calibration that knows a simulator: whoever reads whiteboards from a rig or a
-session makes the same `BoardSet`.
-"""
+"""Whiteboards of a simulated bench in memory, without a session: what the calibration is given."""
 
 from __future__ import annotations
 
@@ -17,7 +13,6 @@ from calibration.boards import BoardFrame, BoardSet, channels_of
 from calibration.frames import MeanFrame, average, before_and_after
 from calibration.levels import Check, check_of
 from calibration.openings import CENTRED, Window, views_open, window_place_um
-from calibration.sensor import Pair
 from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
@@ -38,11 +33,9 @@ FRAME_S = 0.5
 """Between two frames, for stage and readout."""
 COLOUR_REPEATS = 2
 BOARD_LEVEL = 0.7
-DARK_EXPOSURES_S = (0.01, 1.0, 4.0)
-FLAT_SHARES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.3)
-"""Of the exposure that fills the well."""
 RAYS_PER_VIEW = 512
 ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
+VERIFY_UM = (-207.0, 118.0)
 
 
 @dataclass(frozen=True)
@@ -296,18 +289,6 @@ class WhiteboardBench:
         x, y = moving[0] if moving else (0.0, 0.0)
         return (x + setting.stage_um[0], y + setting.stage_um[1])
 
-    def sensor_pairs(self) -> tuple[list[Pair], list[Pair]]:
-        """Return pairs of dark frames, and of whiteboards without masks from dim to saturated."""
-        full_s = self.board_exposure_s() / BOARD_LEVEL
-
-        def pairs(setting: Setting, times: Sequence[float]) -> list[Pair]:
-            return [
-                Pair(float(t), *(self._exposed(setting, t, False) for _ in range(2))) for t in times
-            ]
-
-        flats = pairs(Setting(), [share * full_s for share in FLAT_SHARES])
-        return pairs(Setting(lamp="off"), DARK_EXPOSURES_S), flats
-
     def _dark(self, exposure_s: float) -> MeanFrame:
         return self._frames(Setting(lamp="off"), exposure_s, False, DARK_REPEATS, "dark frame")
 
@@ -339,3 +320,14 @@ class WhiteboardBench:
         finally:
             self.bench.target = "whiteboard"
         return np.stack(frames), exposures_s
+
+
+def held_out_settings() -> list[Setting]:
+    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
+    return [Setting(0), Setting(0, stage_um=VERIFY_UM)]
+
+
+def moved_truth(truth: BenchTruth, x_um: float, y_um: float) -> BenchTruth:
+    """Return the bench with its mask moved."""
+    x, y = truth.mounting.offset_um
+    return replace(truth, mounting=replace(truth.mounting, offset_um=(x + x_um, y + y_um)))

@@ -1,1 +1,0 @@
-"""Measurements of the calibration on the simulated bench, against its targets."""
