@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.pages.display import DisplayCurve
-from emmc_rig.pages.pictures import Pictures, detailed_pieces, epipolar_lines, pictures_of
-from emmc_rig.pages.tiles import (
+from emmc_rig.pages.paper_figure import (
     FRAMES,
     CloseUp,
     PaperFigure,
@@ -22,6 +21,7 @@ from emmc_rig.pages.tiles import (
     caption_of,
     draw_tiles,
 )
+from emmc_rig.pages.pictures import Pictures, detailed_pieces, epipolar_lines, pictures_of
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cell_sweep import TablesSweep
 from emmc_rig.study.tables.cells import (

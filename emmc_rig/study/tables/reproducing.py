@@ -24,7 +24,7 @@ from emmc_rig.pages.page import (
     framed,
     provenance_section,
 )
-from emmc_rig.pages.tiles import PaperFigure
+from emmc_rig.pages.paper_figure import PaperFigure
 from emmc_rig.progress import Watcher
 from emmc_rig.study.sweep import csv_text, provenance, sweep_folder
 from emmc_rig.study.tables.cell_sweep import TablesSettings, TablesSweep
