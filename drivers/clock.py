@@ -9,11 +9,9 @@ class Clock(Protocol):
 
     def now_s(self) -> float:
         """Return the time in seconds."""
-        ...
 
     def sleep(self, duration_s: float) -> None:
         """Return `duration_s` seconds later."""
-        ...
 
 
 class SystemClock:

@@ -55,7 +55,6 @@ class PortError(DriverError):
 
     def __init__(self, port: str, what: str, advice: str) -> None:
         super().__init__(f"serial port {port} {what}", advice)
-        self.port = port
 
 
 class PortNotFoundError(PortError):
@@ -105,8 +104,6 @@ class TransportTimeoutError(DriverError):
         super().__init__(
             f"{port} answered {got} within {timeout_s:g} s", "check power, baud rate and address"
         )
-        self.port = port
-        self.timeout_s = timeout_s
         self.partial = partial
 
 
@@ -141,7 +138,6 @@ class UnknownAxisError(DriverError):
         super().__init__(
             f"no axis {axis!r} on this stage", f"use one of {', '.join(known)}", axis=axis
         )
-        self.known = known
 
 
 class LimitExceededError(DriverError):
@@ -154,7 +150,6 @@ class LimitExceededError(DriverError):
             f"choose {low_um:g} to {high_um:g} um",
             axis=axis,
         )
-        self.target_um = target_um
         self.limits_um = limits_um
 
 
@@ -167,8 +162,6 @@ class SpeedLimitError(DriverError):
             f"choose a speed above 0, up to {top_speed_um_s:g} um/s",
             axis=axis,
         )
-        self.speed_um_s = speed_um_s
-        self.top_speed_um_s = top_speed_um_s
 
 
 class SpeedFixedError(DriverError):
@@ -206,7 +199,6 @@ class AxisFaultError(DriverError):
         self, axis: str, fault: str, advice: str = "resolve it, then home the axis"
     ) -> None:
         super().__init__(f"{axis} reports a fault, {fault}", advice, axis=axis)
-        self.fault = fault
 
 
 class StalledError(AxisFaultError):
@@ -263,7 +255,6 @@ class PositionMismatchError(DriverError):
         )
         self.commanded_um = commanded_um
         self.read_um = read_um
-        self.tolerance_um = tolerance_um
 
 
 class RawFrameError(DriverError):
@@ -293,8 +284,6 @@ class UsbNotFoundError(DriverError):
         super().__init__(
             f"no {wanted} on USB ({seen} found): check cable, power and the device's USB mode"
         )
-        self.wanted = wanted
-        self.present = present
 
 
 class UsbPermissionError(DriverError):
@@ -305,7 +294,6 @@ class UsbPermissionError(DriverError):
             f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
             "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
         )
-        self.device = device
 
 
 class UsbClaimedError(DriverError):
@@ -314,7 +302,6 @@ class UsbClaimedError(DriverError):
     def __init__(self, device: str, holders: tuple[str, ...], advice: str) -> None:
         by = ", ".join(holders) if holders else "another program"
         super().__init__(f"{device} is claimed by {by}: {advice}")
-        self.device = device
         self.holders = holders
 
 
@@ -323,7 +310,6 @@ class UsbGoneError(DriverError):
 
     def __init__(self, device: str) -> None:
         super().__init__(f"{device} went away: plug it in, switch it on and open it again")
-        self.device = device
 
 
 class UsbStalledError(DriverError):
@@ -334,8 +320,6 @@ class UsbStalledError(DriverError):
             f"{device} stalled endpoint {endpoint:#04x}: clear the halt and try again, "
             "or switch the device off and on"
         )
-        self.device = device
-        self.endpoint = endpoint
 
 
 class UsbTimeoutError(DriverError):
@@ -346,8 +330,6 @@ class UsbTimeoutError(DriverError):
         super().__init__(
             f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
         )
-        self.device = device
-        self.timeout_s = timeout_s
         self.done = done
 
 
@@ -356,7 +338,6 @@ class UsbTransferError(DriverError):
 
     def __init__(self, device: str, reason: str, advice: str) -> None:
         super().__init__(f"{device}: transfer failed ({reason}): {advice}")
-        self.device = device
         self.reason = reason
 
 
@@ -365,7 +346,6 @@ class CameraSettingError(DriverError):
 
     def __init__(self, setting: str, reason: str) -> None:
         super().__init__(f"the camera's {setting} {reason}")
-        self.setting = setting
         self.reason = reason
 
 
@@ -387,9 +367,7 @@ class PtpRefusedError(DriverError):
 
     def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
         super().__init__(f"the camera refused {operation} with {answer}: {advice}")
-        self.operation = operation
         self.code = code
-        self.answer = answer
 
 
 class CameraBusyError(DriverError):
@@ -400,8 +378,6 @@ class CameraBusyError(DriverError):
             f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
             "has stored its pictures, check its battery and close its menus"
         )
-        self.operation = operation
-        self.waited_s = waited_s
 
 
 class CardFullError(DriverError):
@@ -409,7 +385,6 @@ class CardFullError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"the card of {camera} is full or missing: empty or insert it")
-        self.camera = camera
 
 
 class CaptureError(DriverError):
@@ -425,7 +400,6 @@ class ExposureStoppedError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"{camera}: the exposure was broken off; take the frame again")
-        self.camera = camera
 
 
 class DownloadError(DriverError):
@@ -436,9 +410,6 @@ class DownloadError(DriverError):
             f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
             "the picture is still on the card"
         )
-        self.name = name
-        self.got = got
-        self.size = size
         self.reason = reason
 
 
@@ -447,7 +418,6 @@ class FolderCameraError(DriverError):
 
     def __init__(self, folder: str, reason: str) -> None:
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
-        self.folder = folder
         self.reason = reason
 
 
@@ -456,7 +426,6 @@ class CameraClosedError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"{camera} was closed: open it again")
-        self.camera = camera
 
 
 class U3vFormatError(DriverError):
@@ -478,7 +447,6 @@ class U3vRefusedError(DriverError):
     def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
         super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
         self.command = command
-        self.status = status
 
 
 class U3vBusyError(DriverError):
@@ -490,7 +458,6 @@ class U3vBusyError(DriverError):
             "switch it off and on, then open it again"
         )
         self.command = command
-        self.waited_s = waited_s
 
 
 class CameraDescriptionError(DriverError):

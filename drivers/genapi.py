@@ -42,11 +42,9 @@ class Port(Protocol):
 
     def read(self, address: int, length: int) -> bytes:
         """Return `length` bytes from `address` on."""
-        ...
 
     def write(self, address: int, data: bytes) -> None:
         """Store `data` from `address` on."""
-        ...
 
 
 @dataclass(frozen=True)

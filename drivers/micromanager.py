@@ -10,17 +10,16 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.dng import frame_of_array
+from drivers.dng import BAYER_PATTERNS, frame_of_array
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
@@ -31,13 +30,7 @@ from drivers.errors import (
 )
 from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.raw import RawFrame
-from drivers.stage import (
-    DEFAULT_SETTINGS,
-    HostStage,
-    Reading,
-    StageSettings,
-    check_within_limits,
-)
+from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
 
 if TYPE_CHECKING:
     from pymmcore_plus import CMMCorePlus
@@ -45,12 +38,6 @@ if TYPE_CHECKING:
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
 FRAME_GRACE_S = 2.0
 POLL_S = 0.001
-BAYER_ROWS = {
-    "rggb": ("rg", "gb"),
-    "grbg": ("gr", "bg"),
-    "gbrg": ("gb", "rg"),
-    "bggr": ("bg", "gr"),
-}
 SPEED_UM_S = 100.0
 """Of a stage that does not state its own: slow, so that no time limit is too short."""
 
@@ -288,29 +275,6 @@ class MicroManagerCamera:
             finally:
                 core.stopSequenceAcquisition()
 
-    def triggered(
-        self, stage: MicroManagerStage, axis: str, places_um: Sequence[float]
-    ) -> Generator[RawFrame, None, None]:
-        """Yield a frame at each of the ascending places: the camera's trigger steps the stage.
-
-        Only for devices of one configuration that say that they can, and are wired so. Raises
-        `CameraSettingError` when the stage cannot hold so many places, `ValueError` unless they
-        ascend, and what a move and `stream` raise.
-        """
-        most = stage.sequence_length(axis)
-        if len(places_um) > most:
-            raise CameraSettingError("hardware sequence", f"takes {most} places along {axis}")
-        if any(b <= a for a, b in pairwise(places_um)):
-            raise ValueError("the places of a hardware sequence must ascend")
-        with stage.stepping(axis, places_um), calling("run a hardware sequence"):
-            with self._alone() as core:
-                core.startSequenceAcquisition(len(places_um), 0, True)
-            try:
-                for _ in places_um:
-                    yield self._next(core)
-            finally:
-                core.stopSequenceAcquisition()
-
     def close(self) -> None:
         """Let go of the core; closing twice is allowed."""
         if not self._closed:
@@ -409,9 +373,9 @@ class MicroManagerCamera:
 
 def _shifted(cfa: str, top: int, left: int) -> str:
     """Return the Bayer phase of a frame that begins at that row and column of the sensor."""
-    if cfa not in BAYER_ROWS:
+    if cfa not in BAYER_PATTERNS:
         return cfa
-    rows = BAYER_ROWS[cfa]
+    rows = cfa[:2], cfa[2:]
     return "".join(rows[(top + i) % 2][(left + j) % 2] for i in (0, 1) for j in (0, 1))
 
 
@@ -478,46 +442,6 @@ class MicroManagerStage(HostStage):
         if not self._closed:
             self._closed = True
             super().close()
-
-    def sequence_length(self, axis: str) -> int:
-        """Return how many places the axis can step through by itself; 0 where it cannot."""
-        self._require_axis(axis)
-        label, coordinate = self._place(axis)
-        core = self._loaded.core
-        with calling("describe hardware sequences"):
-            if coordinate is None and core.isStageSequenceable(label):
-                return core.getStageSequenceMaxLength(label)
-            if coordinate is not None and core.isXYStageSequenceable(label):
-                return core.getXYStageSequenceMaxLength(label)
-        return 0
-
-    @contextmanager
-    def stepping(self, axis: str, places_um: Sequence[float]) -> Iterator[None]:
-        """Let the axis step from place to place at each trigger while the block lasts.
-
-        It begins at the first place, and stays where the last trigger brought it. Raises
-        `LimitExceededError` before anything moves, and what `move_to_um` raises.
-        """
-        for place_um in places_um:
-            check_within_limits(axis, place_um, self.limits_um(axis))
-        self.move_to_um({axis: places_um[0]})
-        label, coordinate = self._place(axis)
-        core = self._loaded.core
-        with calling("load a hardware sequence"):
-            if coordinate is None:
-                core.loadStageSequence(label, list(places_um))
-                start, stop = core.startStageSequence, core.stopStageSequence
-            else:
-                still = [core.getXYPosition(label)[1 - coordinate]] * len(places_um)
-                pair = (list(places_um), still) if coordinate == 0 else (still, list(places_um))
-                core.loadXYStageSequence(label, *pair)
-                start, stop = core.startXYStageSequence, core.stopXYStageSequence
-            start(label)
-        try:
-            yield
-        finally:
-            with calling("end a hardware sequence"):
-                stop(label)
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move: the device's where a property holds it."""

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
-from typing import Protocol
 
 from drivers import ptp_codec as codec
 from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
@@ -37,6 +36,7 @@ from drivers.ptp_canon import EosBody, is_eos
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
 from drivers.ptp_dials import EXPOSURE_UNIT_S, Body, StandardBody
 from drivers.ptp_sony import SonyBody, is_sony
+from drivers.ptp_usb import PtpUsb
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
 
 _log = logging.getLogger(__name__)
@@ -86,39 +86,6 @@ class PtpSettings:
     attempts: int = 3
 
 
-class PtpTransport(Protocol):
-    """What carries PTP: see `drivers.ptp_usb.PtpUsb`."""
-
-    name: str
-
-    def exchange(
-        self,
-        command: Message,
-        data: bytes | None,
-        sink: Callable[[memoryview], object],
-        most: int,
-        timeout_s: float = 0.0,
-    ) -> Message:
-        """Send a command and return the response; what comes with it goes to `sink`."""
-        ...
-
-    def event(self, timeout_s: float) -> Message | None:
-        """Return the next event, None when none came in time."""
-        ...
-
-    def recover(self, transaction: int) -> None:
-        """Make a clean start after an exchange that did not end."""
-        ...
-
-    def reset(self) -> None:
-        """Close whatever session the camera believes to be open."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the camera."""
-        ...
-
-
 class PtpSession:
     """An open session with a camera; `info` is what it said of itself.
 
@@ -129,7 +96,7 @@ class PtpSession:
 
     def __init__(
         self,
-        transport: PtpTransport,
+        transport: PtpUsb,
         clock: Clock = SYSTEM_CLOCK,
         settings: PtpSettings | None = None,
     ) -> None:

@@ -52,59 +52,45 @@ class Stage(Protocol):
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the axes."""
-        ...
 
     def home(self, axes: Iterable[str] | None = None) -> None:
         """Find the reference of the given axes (all by default), and wait until they stand."""
-        ...
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""
-        ...
 
     def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
         """Move the axes together, wait until they stand, and return where they read to be."""
-        ...
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
         """As `move_to_um`, relative to where the axes read to be."""
-        ...
 
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
-        ...
 
     def limits_um(self, axis: str) -> tuple[float, float]:
         """Return the lowest and highest target that `move_to_um` accepts."""
-        ...
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
-        ...
 
     def top_speed_um_s(self, axis: str) -> float:
         """Return the fastest speed that `set_speed_um_s` accepts."""
-        ...
 
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Choose the speed of the moves that follow, also after a reconnect."""
-        ...
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """Stop the given axes (all by default) at once, and return when they stand."""
-        ...
 
     def wait_until_settled(self, axes: Iterable[str] | None = None) -> None:
         """Return when the given axes (all by default) stand and their vibration has died down."""
-        ...
 
     def reconnect(self, wait_s: float = 10.0) -> None:
         """Open the ports again after an unplug; every axis must be homed before its next move."""
-        ...
 
     def close(self) -> None:
         """Let go of the ports; nothing is moved or stopped."""
-        ...
 
     def __enter__(self) -> Self: ...
 
@@ -117,7 +103,6 @@ class SignallingStage(Stage, Protocol):
 
     def check_output(self, axis: str, output: int | str) -> None:
         """Lower an output; raises a `DriverError` where the axis's controller has none such."""
-        ...
 
     def move_and_signal_um(self, axis: str, target_um: float, output: int | str) -> float:
         """As `move_to_um`, but without waiting for vibration; the output rises on arrival.
@@ -125,7 +110,6 @@ class SignallingStage(Stage, Protocol):
         It falls at the next such move. A move that fails raises no output. A camera that it
         triggers must wait out the vibration by a delay of its own.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -199,11 +183,9 @@ class Link(Protocol):
 
     def reopen(self) -> None:
         """Open it again, wherever it is now; raises a `PortError`."""
-        ...
 
     def close(self) -> None:
         """Let go of it; closing twice is allowed."""
-        ...
 
 
 class HostStage(ABC):

@@ -6,6 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simulated_eos import EosCameraSimulator
+from simulated_sony import SonyCameraSimulator
 
 from drivers.errors import (
     CameraSettingError,
@@ -21,8 +23,6 @@ from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.usb import open_device
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.ptp_canon import EosCameraSimulator
-from simulators.ptp_sony import SonyCameraSimulator
 from simulators.usb import SimulatedUsb
 
 MOSAIC = np.random.default_rng(5).integers(0, 4095, (40, 48), dtype=np.uint16)

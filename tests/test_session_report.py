@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
+from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.checks import figures
 from emmc_rig.acquisition.control import Control
@@ -21,7 +22,6 @@ from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SYSTEM_DISK
 from emmc_rig.study.benchmarks import session as session_benchmark
-from simulators.disk import SimulatedDisk
 from simulators.still import StillStage
 
 ROOT = Path("/disk")

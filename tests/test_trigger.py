@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun, plan_and_camera
+from simulated_disk import SimulatedDisk
 
 from drivers.errors import (
     CameraSettingError,
@@ -31,7 +32,6 @@ from emmc_rig.study.benchmarks.devices import (
     trigger_timing,
 )
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 
 BACKLASH_UM = 3.0
 

@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,6 @@ from emmc_rig.bench.trigger import LINE_LATENCY_S, SimulatedTrigger
 from emmc_rig.session.session import Frozen, Session
 from emmc_rig.study.benchmarks.timing import Figures, median_s
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 from simulators.firmware import SimulatedController
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
 from simulators.u3v import U3vCameraSimulator
@@ -329,7 +329,8 @@ def _frame_s(trigger: SimulatedTrigger) -> float:
     rig, _ = simulated_rig(camera, scene, SHAPE, 0, clock, rays_per_view=16, trigger=trigger)
     frames = ordered(expand(STEPPED, camera, rig.window_um), STEPPED.order)
     frozen = Frozen("", camera.model_dump(mode="json"), {}, frames)
-    session = Session.create(Path("/bench/session"), frozen, {"title": "steps"}, SimulatedDisk())
-    Sequencer(session, STEPPED, rig, timer=clock.now_s).run()
+    with TemporaryDirectory() as folder:
+        session = Session.create(Path(folder, "session"), frozen, {"title": "steps"})
+        Sequencer(session, STEPPED, rig, timer=clock.now_s).run()
     ends_s = [entry["spans_s"]["check"][1] for entry in session.stored.values()]
     return (ends_s[-1] - ends_s[0]) / (len(ends_s) - 1)

@@ -38,7 +38,6 @@ from emmc_rig.session.session import JOURNAL, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, Disk
 from emmc_rig.session.verify import PIECE_BYTES, THREADS, verify
 from emmc_rig.study.benchmarks.timing import Figures
-from simulators.disk import SimulatedDisk
 from simulators.still import PreparedCamera, StillStage
 
 LARGE_SHAPE = (4000, 6000)
@@ -113,9 +112,9 @@ class _Timed:
 
 
 def overheads(folder: Path, shots: int) -> Iterator[Overhead]:
-    """Yield what sequencing costs: of small frames in memory, of 24 MP frames on the disk."""
-    yield _overhead(SMALL_SHAPE, shots, SimulatedDisk(), Path("/bench"), 0.0)
+    """Yield what sequencing costs: of small frames, and of 24 MP frames."""
     with _scratch(folder) as scratch:
+        yield _overhead(SMALL_SHAPE, shots, SYSTEM_DISK, scratch / "small", 0.0)
         yield _overhead(LARGE_SHAPE, min(shots, 24), SYSTEM_DISK, scratch / "session", MOVE_S)
 
 
