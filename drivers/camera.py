@@ -39,30 +39,37 @@ class Camera(Protocol):
     @property
     def identity(self) -> CameraIdentity:
         """Who made it."""
+        ...
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of a frame."""
+        ...
 
     @property
     def cfa(self) -> str:
         """Colour phase or tile name of a frame, as in `RawFrame`."""
+        ...
 
     @property
     def exposure_s(self) -> float:
         """Exposure of the next frame."""
+        ...
 
     @property
     def exposure_limits_s(self) -> Limits:
         """Shortest and longest exposure; equal where it cannot be chosen."""
+        ...
 
     @property
     def gain(self) -> float:
         """Gain of the next frame, linear: ISO over base ISO, or 10^(dB/20)."""
+        ...
 
     @property
     def gain_limits(self) -> Limits:
         """Lowest and highest gain; equal where it cannot be chosen."""
+        ...
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Choose the exposure of the frames that follow: the nearest that the camera has.
@@ -75,6 +82,7 @@ class Camera(Protocol):
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises a `DriverError`."""
+        ...
 
     def close(self) -> None:
         """Let go of the camera; closing twice is allowed."""
@@ -85,6 +93,7 @@ class StreamingCamera(Camera, Protocol):
 
     def stream(self) -> Iterator[RawFrame]:
         """Yield frames as they come; closing the generator stops the acquisition."""
+        ...
 
 
 class StoppableCamera(Camera, Protocol):
@@ -95,6 +104,7 @@ class StoppableCamera(Camera, Protocol):
 
         Whoever waits for the frame gets an `ExposureStoppedError`, half a second later at most.
         """
+        ...
 
 
 class TriggeredCamera(Camera, Protocol):
@@ -109,6 +119,7 @@ class TriggeredCamera(Camera, Protocol):
         between edge and exposure. Raises `CameraSettingError` for a camera without such a line
         or delay.
         """
+        ...
 
 
 def check_setting(setting: str, value: float, limits: Limits) -> None:
@@ -178,6 +189,7 @@ class CaptureTransport(Protocol):
 
     def capture(self, exposure_s: float) -> bytes:
         """Expose for `exposure_s` and return the file's bytes."""
+        ...
 
 
 class RawFileCamera:

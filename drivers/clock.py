@@ -9,6 +9,7 @@ class Clock(Protocol):
 
     def now_s(self) -> float:
         """Return the time in seconds."""
+        ...
 
     def sleep(self, duration_s: float) -> None:
         """Return `duration_s` seconds later."""

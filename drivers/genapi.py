@@ -42,6 +42,7 @@ class Port(Protocol):
 
     def read(self, address: int, length: int) -> bytes:
         """Return `length` bytes from `address` on."""
+        ...
 
     def write(self, address: int, data: bytes) -> None:
         """Store `data` from `address` on."""

@@ -12,10 +12,11 @@ import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field
 
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -157,12 +158,22 @@ class CameraSetup:
     """
 
     label: str = ""
-    cfa: str = "mono"
-    black_level_dn: int = 0
-    bit_depth: int | None = None
-    binning: int | None = None
+    cfa: Annotated[str, Field(pattern="^(mono|rggb|grbg|gbrg|bggr)$")] = "mono"
+    black_level_dn: Annotated[int, Field(ge=0)] = 0
+    bit_depth: Annotated[int, Field(gt=0, le=16)] | None = None
+    binning: Annotated[int, Field(gt=0)] | None = None
     roi: tuple[int, int, int, int] | None = None
-    properties: Mapping[str, PropertyValue] | None = None
+    properties: Mapping[str, PropertyValue] = field(default_factory=dict)
+
+
+OPTIONS = CameraSetup
+
+
+def open_camera(
+    address: str, clock: Clock, backend: object, setup: CameraSetup
+) -> MicroManagerCamera:
+    """Open the camera of a configuration file; see `drivers.cameras`."""
+    return MicroManagerCamera(load_core(address), setup, clock)
 
 
 class MicroManagerCamera:
@@ -285,7 +296,7 @@ class MicroManagerCamera:
     def _apply(self) -> None:
         """Set the camera as the configuration says, and read what frames it gives now."""
         core, setup = self._loaded.core, self._setup
-        wanted: dict[str, PropertyValue] = dict(setup.properties or {})
+        wanted: dict[str, PropertyValue] = dict(setup.properties)
         if setup.bit_depth is not None:
             wanted["BitDepth"] = setup.bit_depth
         if setup.binning is not None:

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
+from typing import Any
 
 from drivers import ptp_codec as codec
 from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
@@ -36,8 +37,9 @@ from drivers.ptp_canon import EosBody, is_eos
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
 from drivers.ptp_dials import EXPOSURE_UNIT_S, Body, StandardBody
 from drivers.ptp_sony import SonyBody, is_sony
-from drivers.ptp_usb import PtpUsb
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.usb import open_device
 
 _log = logging.getLogger(__name__)
 
@@ -602,6 +604,19 @@ class PtpCamera(ShapeFromFrames):
     def _base_iso(self) -> float:
         limits = self._iso.limits
         return limits[0] if limits else self._iso.value or 1.0
+
+
+def open_camera(
+    address: str,
+    clock: Clock,
+    backend: Any = None,
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    """Open the camera with a serial number, "" for the first; the rest as in `PtpCamera`."""
+    device = open_device(PTP_INTERFACE, serial=address, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
 
 
 def _body(session: PtpSession) -> Body:

@@ -52,30 +52,38 @@ class Stage(Protocol):
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the axes."""
+        ...
 
     def home(self, axes: Iterable[str] | None = None) -> None:
         """Find the reference of the given axes (all by default), and wait until they stand."""
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""
+        ...
 
     def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
         """Move the axes together, wait until they stand, and return where they read to be."""
+        ...
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
         """As `move_to_um`, relative to where the axes read to be."""
+        ...
 
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
+        ...
 
     def limits_um(self, axis: str) -> tuple[float, float]:
         """Return the lowest and highest target that `move_to_um` accepts."""
+        ...
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
+        ...
 
     def top_speed_um_s(self, axis: str) -> float:
         """Return the fastest speed that `set_speed_um_s` accepts."""
+        ...
 
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Choose the speed of the moves that follow, also after a reconnect."""
@@ -110,6 +118,7 @@ class SignallingStage(Stage, Protocol):
         It falls at the next such move. A move that fails raises no output. A camera that it
         triggers must wait out the vibration by a delay of its own.
         """
+        ...
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Transport(ABC):
         self.port = port
         self.timeout_s = timeout_s
         self.lock = threading.RLock()
-        self._unread = bytearray()
+        self._unread: bytearray = bytearray()
 
     @abstractmethod
     def write(self, data: bytes) -> None:

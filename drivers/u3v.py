@@ -1,7 +1,7 @@
 """USB3 Vision cameras: one that names exposure, gain and pixels as GenICam does, and its frames.
 
 A recorded frame (`RawFrame.original`) is the camera's leader, payload and trailer in a row, as they
-came; `decode_u3v` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
+came; `decode_frame` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
 Convention 2.7 (feature names, exposure in microseconds, gain in decibels).
 """
 
@@ -39,7 +39,7 @@ from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_
 from drivers.raw import RawFrame, hashed
 from drivers.u3v_control import U3vControl
 from drivers.u3v_stream import U3vStream
-from drivers.usb import BULK, UsbDevice, UsbListing, list_devices, open_device
+from drivers.usb import BULK, UsbDevice, open_device
 
 _log = logging.getLogger(__name__)
 
@@ -76,9 +76,9 @@ IN_FLIGHT = 3
 """Frames that a camera may have begun before a new setting counts."""
 
 
-def list_u3v(backend: Any = None) -> list[UsbListing]:
-    """Return the USB3 Vision cameras that are plugged in; raises `UsbUnavailableError`."""
-    return list_devices(codec.CONTROL, backend)
+def open_camera(address: str, clock: Clock, backend: Any = None) -> U3vCamera:
+    """Open the camera with a serial number, "" for the first; see `drivers.cameras`."""
+    return open_u3v(address, backend=backend, clock=clock)
 
 
 def open_u3v(
@@ -306,7 +306,7 @@ class U3vCamera:
     def _decode(self, original: bytes) -> RawFrame:
         host_time_s = self._clock.now_s()
         try:
-            frame = decode_u3v(original, self.black_level_dn, self.white_level_dn)
+            frame = decode_frame(original, self.black_level_dn, self.white_level_dn)
         except (U3vFormatError, RawFrameError) as error:
             raise FrameLostError(error.reason) from error
         if (frame.mosaic.shape, frame.cfa) != (self.shape, self.cfa):
@@ -398,7 +398,7 @@ class U3vCamera:
         return min(max(shown, 0.0), float(self.white_level_dn))
 
 
-def decode_u3v(
+def decode_frame(
     original: bytes, black_level_dn: float = 0.0, white_level_dn: int | None = None
 ) -> RawFrame:
     """Return the frame in a leader, payload and trailer, as `RawFrame.original` holds them.

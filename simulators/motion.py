@@ -31,16 +31,20 @@ class Course(Protocol):
     @property
     def start_s(self) -> float:
         """When it begins."""
+        ...
 
     @property
     def duration_s(self) -> float:
         """Time until it stands."""
+        ...
 
     def position_um(self, now_s: float) -> float:
         """Return where the motor is."""
+        ...
 
     def velocity_um_s(self, now_s: float) -> float:
         """Return how fast it goes, negative downwards."""
+        ...
 
 
 @dataclass(frozen=True)

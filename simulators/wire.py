@@ -30,16 +30,20 @@ class Firmware(Protocol):
     @property
     def unplugged(self) -> bool:
         """Whether the wire has been pulled."""
+        ...
 
     @property
     def plugs(self) -> int:
         """How often the wire has been plugged in."""
+        ...
 
     def feed(self, data: bytes) -> bytes:
         """Take bytes from the host; return those that fell due for the host by now."""
+        ...
 
     def due(self) -> bytes:
         """Return the bytes that fell due for the host by now."""
+        ...
 
     def next_due_s(self) -> float | None:
         """Return when something may next fall due, if anything will."""

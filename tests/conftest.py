@@ -3,7 +3,6 @@
 import os
 import signal
 import tempfile
-from functools import partial
 from pathlib import Path
 
 # As many processes as cores: threads of BLAS in each would wait on each other.
@@ -119,15 +118,6 @@ def run(monkeypatch, capsys, tmp_path):
         return code, shown.out, shown.err
 
     return call
-
-
-@pytest.fixture
-def small_pictures(monkeypatch):
-    """`devices bench` times pictures of a quarter of a megapixel, twice, not of 24, nine times."""
-    from emmc_rig.study.benchmarks import devices
-
-    for name in ("picture_timing", "unpacking_timings", "stream_timing"):
-        monkeypatch.setattr(devices, name, partial(getattr(devices, name), (400, 600), 2))
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """`emmc-rig devices`: alike on simulated and real stages, stopped by every interruption."""
 
-import json
 import os
 import re
 import signal
@@ -185,16 +184,6 @@ def test_ports_are_listed_with_their_holder(run, monkeypatch):
 def test_the_udev_rule_is_printed(run):
     code, out, _ = run("udev-rule")
     assert (code, out.splitlines()[-1]) == (0, 'LABEL="emmc_rig_end"')
-
-
-@pytest.mark.usefixtures("small_pictures")
-def test_what_a_command_costs_is_measured(run, tmp_path):
-    code, out, _ = run("bench", "--repeats", 3, "--out", "bench")
-    assert code == 0
-    assert "position" in out
-    rows = json.loads((tmp_path / "bench/metrics.json").read_text())["stage_commands"]
-    assert {row["protocol"] for row in rows} == {"zaber", "grbl", "apt"}
-    assert all(row["milliseconds"] > 0 and row["exchanges"] >= 1 for row in rows)
 
 
 @pytest.mark.parametrize(

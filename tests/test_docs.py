@@ -101,7 +101,7 @@ def _fitted_once():
         yield
 
 
-@pytest.mark.usefixtures("small", "small_pictures", "_fitted_once")
+@pytest.mark.usefixtures("small", "_fitted_once")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
     for name, text in written_files(document):

@@ -54,7 +54,6 @@ WRITERS = {
     "demo": (*SIZE,),
     "design": (),
     "design --check": (),
-    "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
     "devices serve": ("zaber",),

@@ -33,10 +33,11 @@ from drivers.errors import (
     UsbTimeoutError,
     UsbTransferError,
 )
-from drivers.u3v import UNZIPPED_LIMIT, decode_u3v, list_u3v, open_u3v
+from drivers.u3v import UNZIPPED_LIMIT, decode_frame, open_u3v
+from drivers.u3v_codec import CONTROL
 from drivers.u3v_control import BUSY_LIMIT_S, READ_ATTEMPTS
 from drivers.u3v_stream import plan_sizes
-from drivers.usb import TRANSFER_BYTES
+from drivers.usb import TRANSFER_BYTES, list_devices
 from emmc_rig.bench.hardware import open_camera
 from simulators import u3v as simulation
 from simulators.clock import ManualClock
@@ -122,7 +123,7 @@ def test_opening_makes_an_automatic_triggered_camera_manual(bench):
 
 
 def test_a_camera_is_listed_and_says_who_made_it(bench):
-    (listing,) = list_u3v(bench.bus)
+    (listing,) = list_devices(CONTROL, bench.bus)
     assert (listing.maker, listing.model, listing.serial) == ("EMMC", "U3V simulator", "U1")
     identity = bench.open(serial="U1").identity
     assert (identity.maker, identity.serial, identity.firmware) == ("EMMC", "U1", "1.0")
@@ -262,7 +263,7 @@ def test_a_region_of_the_sensor_is_what_was_set_before():
 
 def test_the_recorded_bytes_decode_to_the_same_frame(bench):
     frame = bench.open().snap()
-    again = decode_u3v(frame.original, black_level_dn=64)
+    again = decode_frame(frame.original, black_level_dn=64)
     np.testing.assert_array_equal(again.mosaic, frame.mosaic)
     assert (again.sha256, again.cfa, again.metadata) == (frame.sha256, frame.cfa, frame.metadata)
     assert again.camera_time_s == frame.camera_time_s
@@ -272,14 +273,14 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     original = bytearray(bench.open().snap().original)
     struct.pack_into("<I", original, 28, 0x02180014)
     with pytest.raises(RawFrameError, match="0x02180014 is not raw"):
-        decode_u3v(bytes(original))
+        decode_frame(bytes(original))
     struct.pack_into("<I", original, 28, 0x010C0059)
     struct.pack_into("<Q", original, len(original) - 12, 100)
     with pytest.raises(RawFrameError, match="100 bytes are not the 2880 of 40x48"):
-        decode_u3v(bytes(original))
+        decode_frame(bytes(original))
     struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
     with pytest.raises(RawFrameError, match="bytes are not the"):
-        decode_u3v(bytes(original))
+        decode_frame(bytes(original))
 
 
 def test_a_black_level_may_be_given(bench):
@@ -761,7 +762,7 @@ def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(reques
             raw[random.randrange(len(raw))] = random.randrange(256)
         raw = raw[: random.choice((len(raw), random.randrange(len(raw))))]
         with suppress(DriverError):
-            decode_u3v(bytes(raw))
+            decode_frame(bytes(raw))
 
     check()
 

@@ -14,6 +14,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from drivers.cameras import CAMERA_HELP
 from emmc_rig.acquisition.keyboard import pressed_keys
 from emmc_rig.commands.output import (
     Quiet,
@@ -35,9 +36,7 @@ SAVE_KEY, END_KEYS = "s", "q\x1b"
 
 CameraSpec = Annotated[
     str,
-    typer.Option(
-        "--camera", help="ptp:, u3v:, gphoto2:, mm:CONFIG.cfg, folder:DIR, simulated or a YAML file"
-    ),
+    typer.Option("--camera", help=f"{CAMERA_HELP}, simulated or a YAML file"),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")

@@ -10,13 +10,14 @@ import logging
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drivers.cameras import CAMERAS
 from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
@@ -78,19 +79,20 @@ def list_devices(rig: RigOption = None) -> None:
 
 
 def _list_cameras(backend: Any = None) -> None:
-    """Print the PTP and USB3 Vision cameras that are plugged in; `backend`: of pyusb."""
+    """Print the cameras that are plugged in; `backend`: of pyusb."""
     from drivers.errors import DriverError
-    from drivers.ptp_usb import PTP_INTERFACE
-    from drivers.u3v_codec import CONTROL
     from drivers.usb import list_devices as list_usb
 
-    found = []
-    for kind, interface in (("ptp", PTP_INTERFACE), ("u3v", CONTROL)):
-        try:
-            found += [(kind, one) for one in list_usb(interface, backend)]
-        except DriverError as fault:
-            tell(f"USB cameras cannot be listed: {fault}")
-            return
+    try:
+        found = [
+            (kind, one)
+            for kind, protocol in CAMERAS.items()
+            if protocol.interface
+            for one in list_usb(protocol.interface, backend)
+        ]
+    except DriverError as fault:
+        tell(f"USB cameras cannot be listed: {fault}")
+        return
     if not found:
         tell("no USB camera: plug one in and switch it on, or try --camera simulated")
         return
@@ -229,72 +231,6 @@ def udev_rule() -> None:
     from drivers.ports import udev_rule_path
 
     tell(udev_rule_path().read_text(encoding="utf-8").removesuffix("\n"))
-
-
-@app.command()
-def bench(
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed calls of each")] = 300,
-    out: Annotated[Path | None, typer.Option("--out", help="folder for metrics.json")] = None,
-) -> None:
-    """Time what drivers cost: stage commands on a wire without delay, pictures in memory."""
-    from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import write_metrics
-    from emmc_rig.study.benchmarks.devices import (
-        capture_timing,
-        picture_timing,
-        stage_timings,
-        trigger_timing,
-        u3v_timings,
-    )
-
-    with (
-        nullcontext() if out is None else result_folder(out, "devices bench") as folder,
-        shown_progress("stage commands") as progress,
-    ):
-        timings = stage_timings(repeats)
-        show_table(
-            ("stage", "command", "exchanges", "ms", "ms for each exchange"),
-            [
-                (one.protocol, one.command, f"{one.exchanges:g}", f"{one.milliseconds:.3f}",
-                 f"{one.milliseconds / one.exchanges:.3f}")
-                for one in timings
-            ],
-        )  # fmt: skip
-        progress.begin("pictures")
-        picture = picture_timing()
-        tell(
-            f"PTP, {picture.megabytes:.0f} MB: {picture.download_s:.3f} s from the bus, "
-            f"{picture.decode_s:.3f} s to a checked mosaic; together {picture.ratio:.2f} times "
-            "rawpy alone"
-        )
-        progress.begin("USB3 Vision")
-        streams = list(u3v_timings())
-        for one in streams:
-            tell(
-                f"USB3 Vision, {one.name}: {one.seconds * 1e3:.3f} ms, "
-                f"{one.gigabytes_per_s:.2f} GB/s"
-            )
-        progress.begin("triggers")
-        trigger, session = trigger_timing(), capture_timing()
-        for what, one in (
-            ("a frame at each step", trigger),
-            ("shots of `emmc-rig capture`", session),
-        ):
-            tell(
-                f"{what}, {one.vibration_ms:g} ms of vibration, {one.exposure_ms:g} ms of exposure "
-                f"(simulated): {one.asked_ms:.1f} ms a frame asked for, {one.triggered_ms:.1f} ms "
-                "triggered by the stage's arrival"
-            )
-        metrics = {
-            "stage_commands": [one.as_dict() for one in timings],
-            "picture": picture.as_dict(),
-            "trigger": trigger.as_dict(),
-            "triggered_session": session.as_dict(),
-            "usb3_vision": [one.as_dict() for one in streams],
-        }
-        if folder is not None:
-            write_metrics(folder, metrics)
-    give_result(metrics=metrics)
 
 
 @contextmanager

@@ -44,7 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[NamedStage]:
     """The stage of that name."""
-    with closing(NamedStage(request.config.getoption("--device"))) as named:
+    with closing(NamedStage(str(request.config.getoption("--device")))) as named:
         yield named
 
 
@@ -53,5 +53,5 @@ def camera(request: pytest.FixtureRequest) -> Iterator[Camera]:
     """The camera of that name."""
     from emmc_rig.bench.hardware import open_camera
 
-    with closing(open_camera(request.config.getoption("--device"))) as opened:
+    with closing(open_camera(str(request.config.getoption("--device")))) as opened:
         yield opened

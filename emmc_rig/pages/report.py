@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +72,12 @@ def write_report(path: str | Path, content: ReportContent) -> None:
 def render(content: ReportContent) -> str:
     """Return the page as text."""
     rows, columns, height, width, _ = content.estimate.shape
-    maps = {name: content.maps.get(name) for name in ("disparity", "sigma", "model", "misfit")}
-    export = Export(content.title, "", content.estimate, content.truth, **maps)
+    disparity, sigma, model, misfit = (
+        content.maps.get(name) for name in ("disparity", "sigma", "model", "misfit")
+    )
+    export = Export(
+        content.title, "", content.estimate, content.truth, disparity, sigma, model, misfit
+    )
     psi, psi_std = content.psi, content.psi_std
     return fragment(
         "report.html",
@@ -108,7 +112,7 @@ def render(content: ReportContent) -> str:
     )
 
 
-def _frames(frames: Array) -> dict[str, object]:
+def _frames(frames: Array) -> dict[str, Any]:
     """Return frames (shot, y, x) as pictures on one scale, so that shots compare, and its ends."""
     frames = finite(frames)
     curve = DisplayCurve.fitted_to(frames)
