@@ -349,8 +349,8 @@ class CameraSettingError(DriverError):
         self.reason = reason
 
 
-class PtpFormatError(DriverError):
-    """Bytes from a camera that are no PTP message, or not the one that must come now."""
+class CameraFormatError(DriverError):
+    """Bytes from a camera that are no message of its protocol, or not the one that must come."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
@@ -358,25 +358,23 @@ class PtpFormatError(DriverError):
             f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
             "check the cable, then open the camera again"
         )
-        self.raw = raw
         self.reason = reason
 
 
-class PtpRefusedError(DriverError):
-    """The camera understood the request and said no; `code` is its answer."""
+class CameraRefusedError(DriverError):
+    """The camera understood the request and said no."""
 
-    def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
+    def __init__(self, operation: str, answer: str, advice: str) -> None:
         super().__init__(f"the camera refused {operation} with {answer}: {advice}")
-        self.code = code
 
 
 class CameraBusyError(DriverError):
-    """The camera answered "busy" for too long."""
+    """The camera answered "busy", or asked for more time, for too long."""
 
     def __init__(self, operation: str, waited_s: float) -> None:
         super().__init__(
-            f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
-            "has stored its pictures, check its battery and close its menus"
+            f"the camera was busy for {waited_s:.3g} s when asked {operation}: wait until it has "
+            "stored its pictures, check its battery, close its menus, or switch it off and on"
         )
 
 
@@ -388,10 +386,10 @@ class CardFullError(DriverError):
 
 
 class CaptureError(DriverError):
-    """The camera was released but gave no usable picture."""
+    """The camera was released but gave no usable frame; the next may be taken."""
 
-    def __init__(self, reason: str, advice: str) -> None:
-        super().__init__(f"no picture, {reason}: {advice}")
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"no frame, {reason}: {advice}")
         self.reason = reason
 
 
@@ -428,38 +426,6 @@ class CameraClosedError(DriverError):
         super().__init__(f"{camera} was closed: open it again")
 
 
-class U3vFormatError(DriverError):
-    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
-
-    def __init__(self, raw: bytes, reason: str) -> None:
-        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
-        super().__init__(
-            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
-            "check the cable, then open the camera again"
-        )
-        self.raw = raw[:64]
-        self.reason = reason
-
-
-class U3vRefusedError(DriverError):
-    """The camera understood a command and said no; `status` is its answer."""
-
-    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
-        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
-        self.command = command
-
-
-class U3vBusyError(DriverError):
-    """The camera kept asking for more time for one command."""
-
-    def __init__(self, command: str, waited_s: float) -> None:
-        super().__init__(
-            f"the camera was still busy with {command} after {waited_s:.3g} s: "
-            "switch it off and on, then open it again"
-        )
-        self.command = command
-
-
 class CameraDescriptionError(DriverError):
     """The camera's own description of its features (GenICam) cannot be used."""
 
@@ -469,15 +435,6 @@ class CameraDescriptionError(DriverError):
             "or use another camera"
         )
         self.reason = reason
-
-
-class FrameLostError(DriverError):
-    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
-
-    def __init__(self, reason: str, advice: str = "capture it again") -> None:
-        super().__init__(f"frame lost, {reason}: {advice}")
-        self.reason = reason
-        self.advice = advice
 
 
 class MicroManagerError(DriverError):

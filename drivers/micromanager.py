@@ -24,7 +24,7 @@ from drivers.dng import BAYER_PATTERNS, frame_of_array
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
-    FrameLostError,
+    CaptureError,
     MicroManagerError,
     PortGoneError,
     SpeedFixedError,
@@ -275,7 +275,7 @@ class MicroManagerCamera:
     def stream(self) -> Generator[RawFrame, None, None]:
         """Yield frames as they come; closing the generator stops the acquisition.
 
-        Raises `FrameLostError` when the core's buffer ran over or no frame comes.
+        Raises `CaptureError` when the core's buffer ran over or no frame comes.
         """
         with calling("stream frames"):
             with self._alone() as core:
@@ -358,9 +358,9 @@ class MicroManagerCamera:
         deadline_s = self._clock.now_s() + self.exposure_s + FRAME_GRACE_S
         while not core.getRemainingImageCount():
             if core.isBufferOverflowed():
-                raise FrameLostError("the core's buffer ran over", "take frames more slowly")
+                raise CaptureError("the core's buffer ran over", "take frames more slowly")
             if self._clock.now_s() > deadline_s:
-                raise FrameLostError("no frame came from the camera")
+                raise CaptureError("no frame came from the camera")
             self._clock.sleep(POLL_S)
         image, tags = core.popNextImageAndMD()
         metadata = {str(name): str(value) for name, value in dict(tags).items()}
@@ -369,7 +369,7 @@ class MicroManagerCamera:
     def _frame(self, image: np.ndarray, metadata: Mapping[str, str]) -> RawFrame:
         mosaic = np.asarray(image, dtype=np.uint16)
         if mosaic.shape != self.shape:
-            raise FrameLostError(f"it has {mosaic.shape} pixels instead of {self.shape}")
+            raise CaptureError(f"it has {mosaic.shape} pixels instead of {self.shape}")
         return frame_of_array(
             mosaic,
             self.cfa,

@@ -22,14 +22,14 @@ from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
     CameraClosedError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
     CaptureError,
     CardFullError,
     DownloadError,
     DriverError,
     ExposureStoppedError,
-    PtpFormatError,
-    PtpRefusedError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -148,7 +148,7 @@ class PtpSession:
     ) -> Parameters:
         """Make one exchange and return the response's parameters; "busy" is asked again.
 
-        Raises `CameraBusyError`, `CardFullError`, `PtpRefusedError`, or an error of the
+        Raises `CameraBusyError`, `CardFullError`, `CameraRefusedError`, or an error of the
         transport. Not `patient`: busy at once.
         """
         started_s = self.clock.now_s()
@@ -162,7 +162,7 @@ class PtpSession:
                 raise _refused(operation, response.code)
             waited_s = self.clock.now_s() - started_s
             if not patient or waited_s >= self.settings.busy_limit_s:
-                raise CameraBusyError(_shown(operation), waited_s)
+                raise CameraBusyError(f"for {_shown(operation)}", waited_s)
             self.clock.sleep(self.settings.busy_poll_s)
 
     def fetch(self, operation: int, *parameters: int, patient: bool = True) -> bytes:
@@ -260,7 +260,7 @@ class PtpSession:
                 response = self._exchange(
                     Operation.OPEN_SESSION, (SESSION,), None, lambda piece: None, 0, transaction=0
                 )
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 if last:
                     raise
                 _log.info("%s: opening it again after: %s", self.name, error)
@@ -278,7 +278,7 @@ class PtpSession:
     def _end_foreign_session(self) -> None:
         try:
             self.request(Operation.CLOSE_SESSION)
-        except PtpRefusedError:
+        except CameraRefusedError:
             self._transport.reset()
 
     def _exchange(
@@ -404,7 +404,7 @@ class PtpSession:
                 if answered and answered[0] != came:
                     reason = f"{came} bytes came of the {answered[0]} that it says it sent"
                     received.seek(done)
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 # Nobody knows whether what came before the fault is in its place.
                 reason = str(error)
                 received.seek(done)
@@ -433,7 +433,7 @@ class PtpSession:
 
             try:
                 self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 reason = str(error)
                 _log.info("%s: fetching %s again: %s", self.name, info.name, error)
             else:
@@ -644,10 +644,10 @@ def _shown(operation: int) -> str:
         return f"operation {operation:#06x}"
 
 
-def _refused(operation: int, code: int) -> PtpRefusedError:
+def _refused(operation: int, code: int) -> CameraRefusedError:
     try:
         known = Code(code)
     except ValueError:
-        return PtpRefusedError(_shown(operation), code, f"{code:#06x}", SEE_MANUAL)
+        return CameraRefusedError(_shown(operation), f"{code:#06x}", SEE_MANUAL)
     answer = known.name.lower().replace("_", " ")
-    return PtpRefusedError(_shown(operation), code, answer, REFUSALS.get(known, SEE_MANUAL))
+    return CameraRefusedError(_shown(operation), answer, REFUSALS.get(known, SEE_MANUAL))

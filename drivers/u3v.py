@@ -27,12 +27,12 @@ from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraDescriptionError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
+    CaptureError,
     DriverError,
-    FrameLostError,
     RawFrameError,
-    U3vFormatError,
-    U3vRefusedError,
 )
 from drivers.genapi import Features
 from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
@@ -181,7 +181,7 @@ class U3vCamera:
         """Expose and return one frame; raises a `DriverError`.
 
         The exposure begins after the call. A frame that does not come whole raises
-        `FrameLostError`; the camera is ready for another.
+        `CaptureError`; the camera is ready for another.
         """
         with self._acquisition("SingleFrame"):
             return self._decode(self._receive())
@@ -220,7 +220,7 @@ class U3vCamera:
         """Yield frames as they come; closing the generator stops the acquisition.
 
         `metadata["frames_lost"]` counts the frames missing right before this one, by the camera's
-        numbers. Frames that come torn are passed over; three in a row raise `FrameLostError`.
+        numbers. Frames that come torn are passed over; three in a row raise `CaptureError`.
         Exposure and gain are None for frames that may have begun before a change of them.
         """
         self._in_flight = 0
@@ -284,7 +284,7 @@ class U3vCamera:
         try:
             if "AcquisitionStop" in self.features:
                 self.features.execute("AcquisitionStop")
-        except (U3vRefusedError, CameraSettingError) as error:
+        except (CameraRefusedError, CameraSettingError) as error:
             _log.debug("%s: no acquisition to stop (%s)", self._device.name, error)
         finally:
             self._stream.stop()
@@ -297,7 +297,7 @@ class U3vCamera:
         for attempt in range(1, LOST_IN_A_ROW + 1):
             try:
                 return self._receive()
-            except FrameLostError as error:
+            except CaptureError as error:
                 if attempt == LOST_IN_A_ROW:
                     raise
                 _log.warning("%s: %s", self._device.name, error)
@@ -307,8 +307,8 @@ class U3vCamera:
         host_time_s = self._clock.now_s()
         try:
             frame = decode_frame(original, self.black_level_dn, self.white_level_dn)
-        except (U3vFormatError, RawFrameError) as error:
-            raise FrameLostError(error.reason) from error
+        except (CameraFormatError, RawFrameError) as error:
+            raise CaptureError(error.reason) from error
         if (frame.mosaic.shape, frame.cfa) != (self.shape, self.cfa):
             rows, columns = frame.mosaic.shape
             raise RawFrameError(
@@ -348,7 +348,7 @@ class U3vCamera:
             if isinstance(value, str) and value not in features.choices(name):
                 return False
             features.set(name, value)
-        except (CameraDescriptionError, CameraSettingError, U3vRefusedError) as error:
+        except (CameraDescriptionError, CameraSettingError, CameraRefusedError) as error:
             _log.debug("%s: %s stays as it is (%s)", self._device.name, name, error)
             return False
         return True
@@ -403,7 +403,7 @@ def decode_frame(
 ) -> RawFrame:
     """Return the frame in a leader, payload and trailer, as `RawFrame.original` holds them.
 
-    What the bytes do not say is None, or as given here. Raises `U3vFormatError` for bytes that
+    What the bytes do not say is None, or as given here. Raises `CameraFormatError` for bytes that
     are no frame, `RawFrameError` for one that cannot be unpacked.
     """
     leader, payload, trailer = codec.split_frame(original)

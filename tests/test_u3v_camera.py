@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 
 from drivers import u3v_codec as codec
 from drivers.errors import (
+    CameraBusyError,
     CameraDescriptionError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
+    CaptureError,
     DriverError,
     ExposureStoppedError,
-    FrameLostError,
     RawFrameError,
-    U3vBusyError,
-    U3vFormatError,
-    U3vRefusedError,
     UsbClaimedError,
     UsbGoneError,
     UsbNotFoundError,
@@ -200,7 +200,7 @@ def test_a_stream_is_broken_off_in_the_middle_of_a_long_exposure(bench, monkeypa
 def test_a_stream_that_fails_stops_the_camera(bench, faults):
     camera = bench.open()
     faults.inject("torn_payload", times=math.inf)
-    with pytest.raises(FrameLostError):
+    with pytest.raises(CaptureError):
         next(camera.stream())
     assert not bench.simulator.streaming
 
@@ -347,7 +347,7 @@ def test_a_read_that_goes_wrong_is_repeated(bench, faults, fault, after):
     ("fault", "error"),
     [
         ("lost_reply", UsbTimeoutError),
-        ("garbled_reply", U3vFormatError),
+        ("garbled_reply", CameraFormatError),
         ("stall_control", UsbStalledError),
     ],
 )
@@ -386,16 +386,18 @@ def test_a_camera_that_is_busy_for_ever_is_given_up(bench, faults):
     camera = bench.open()
     faults.inject("busy")
     before_s = bench.clock.now_s()
-    with pytest.raises(U3vBusyError, match="busy with to read 4 bytes"):
+    with pytest.raises(CameraBusyError, match=r"busy for .* when asked to read 4 bytes"):
         camera.features.number("Width")
     assert BUSY_LIMIT_S <= bench.clock.now_s() - before_s < BUSY_LIMIT_S + 2
 
 
 def test_a_refusal_says_what_was_asked_and_what_to_do(bench):
     camera = bench.open()
-    with pytest.raises(U3vRefusedError, match=r"read 4 bytes at 0xdead0000 \(0x8003, invalid addr"):
+    with pytest.raises(
+        CameraRefusedError, match=r"to read 4 bytes at 0xdead0000 with invalid addr"
+    ):
         camera._control.read(0xDEAD0000, 4)
-    with pytest.raises(U3vRefusedError, match="write protected"):
+    with pytest.raises(CameraRefusedError, match="write protected"):
         camera._control.write(0x100010, bytes(4))
 
 
@@ -421,7 +423,7 @@ def test_a_frame_that_does_not_come_whole_is_reported_and_the_next_one_comes(
     camera = bench.open()
     bench.simulator.faults.inject(fault)
     with pytest.raises(
-        (FrameLostError, RawFrameError),
+        (CaptureError, RawFrameError),
         match=complaint.replace("40x48", ".*").replace("38x48", ".*"),
     ):
         camera.snap()
@@ -473,7 +475,7 @@ def test_the_end_of_another_frame_does_not_make_this_one_whole(bench):
         bench.simulator._messages.append(bytes(trailer))
 
     bench.simulator._send = send_wrong_end
-    with pytest.raises(FrameLostError, match="begins as frame 0 and ends as 3"):
+    with pytest.raises(CaptureError, match="begins as frame 0 and ends as 3"):
         camera.snap()
 
 
