@@ -1,7 +1,7 @@
 """The tests kill what breaks the program: random mutants of each room, and which survive.
 
-A mutant is one operator, comparison, min or max of one function changed. It is killed when the tests
-of its room fail. Run it in a clone of its own, since it writes into the program's files:
+A mutant is one operator, comparison, min or max of one function changed. It is killed when the
+tests of its room fail. Run it in a clone of its own, since it writes into the program's files:
 
     git clone . /tmp/mutants && cd /tmp/mutants && python benchmarks/mutants.py --each 10
 """

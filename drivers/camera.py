@@ -76,11 +76,9 @@ class Camera(Protocol):
 
         Raises `ValueError` unless positive, `CameraSettingError` outside the limits.
         """
-        ...
 
     def set_gain(self, gain: float) -> None:
         """Choose the gain of the frames that follow; raises as `set_exposure_s`."""
-        ...
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises a `DriverError`."""
@@ -88,7 +86,6 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let go of the camera; closing twice is allowed."""
-        ...
 
 
 class StreamingCamera(Camera, Protocol):

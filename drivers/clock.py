@@ -13,7 +13,6 @@ class Clock(Protocol):
 
     def sleep(self, duration_s: float) -> None:
         """Return `duration_s` seconds later."""
-        ...
 
 
 class SystemClock:

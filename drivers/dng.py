@@ -13,17 +13,12 @@ import tifffile
 
 from drivers.camera import CameraIdentity
 from drivers.errors import RawFrameError
-from drivers.plain_dng import PRIVATE_DATA_OWNER, PRIVATE_DATA_TAG, SMALLEST_SIDE_PX
+from drivers.plain_dng import PHASES, PRIVATE_DATA_OWNER, PRIVATE_DATA_TAG, SMALLEST_SIDE_PX
 from drivers.raw import CFA_TILE_PREFIX, RawFrame, decode_raw
 
 Array = np.ndarray
 
-BAYER_PATTERNS = {
-    "rggb": (0, 1, 1, 2),
-    "grbg": (1, 0, 2, 1),
-    "gbrg": (1, 2, 0, 1),
-    "bggr": (2, 1, 1, 0),
-}
+BAYER_PATTERNS = {phase: pattern for pattern, phase in PHASES.items()}
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""

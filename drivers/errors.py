@@ -55,7 +55,6 @@ class PortError(DriverError):
 
     def __init__(self, port: str, what: str, advice: str) -> None:
         super().__init__(f"serial port {port} {what}", advice)
-        self.port = port
 
 
 class PortNotFoundError(PortError):
@@ -105,8 +104,6 @@ class TransportTimeoutError(DriverError):
         super().__init__(
             f"{port} answered {got} within {timeout_s:g} s", "check power, baud rate and address"
         )
-        self.port = port
-        self.timeout_s = timeout_s
         self.partial = partial
 
 
@@ -141,7 +138,6 @@ class UnknownAxisError(DriverError):
         super().__init__(
             f"no axis {axis!r} on this stage", f"use one of {', '.join(known)}", axis=axis
         )
-        self.known = known
 
 
 class LimitExceededError(DriverError):
@@ -154,7 +150,6 @@ class LimitExceededError(DriverError):
             f"choose {low_um:g} to {high_um:g} um",
             axis=axis,
         )
-        self.target_um = target_um
         self.limits_um = limits_um
 
 
@@ -167,8 +162,6 @@ class SpeedLimitError(DriverError):
             f"choose a speed above 0, up to {top_speed_um_s:g} um/s",
             axis=axis,
         )
-        self.speed_um_s = speed_um_s
-        self.top_speed_um_s = top_speed_um_s
 
 
 class SpeedFixedError(DriverError):
@@ -206,7 +199,6 @@ class AxisFaultError(DriverError):
         self, axis: str, fault: str, advice: str = "resolve it, then home the axis"
     ) -> None:
         super().__init__(f"{axis} reports a fault, {fault}", advice, axis=axis)
-        self.fault = fault
 
 
 class StalledError(AxisFaultError):
@@ -263,7 +255,6 @@ class PositionMismatchError(DriverError):
         )
         self.commanded_um = commanded_um
         self.read_um = read_um
-        self.tolerance_um = tolerance_um
 
 
 class RawFrameError(DriverError):
@@ -293,8 +284,6 @@ class UsbNotFoundError(DriverError):
         super().__init__(
             f"no {wanted} on USB ({seen} found): check cable, power and the device's USB mode"
         )
-        self.wanted = wanted
-        self.present = present
 
 
 class UsbPermissionError(DriverError):
@@ -305,7 +294,6 @@ class UsbPermissionError(DriverError):
             f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
             "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
         )
-        self.device = device
 
 
 class UsbClaimedError(DriverError):
@@ -314,7 +302,6 @@ class UsbClaimedError(DriverError):
     def __init__(self, device: str, holders: tuple[str, ...], advice: str) -> None:
         by = ", ".join(holders) if holders else "another program"
         super().__init__(f"{device} is claimed by {by}: {advice}")
-        self.device = device
         self.holders = holders
 
 
@@ -323,7 +310,6 @@ class UsbGoneError(DriverError):
 
     def __init__(self, device: str) -> None:
         super().__init__(f"{device} went away: plug it in, switch it on and open it again")
-        self.device = device
 
 
 class UsbStalledError(DriverError):
@@ -334,8 +320,6 @@ class UsbStalledError(DriverError):
             f"{device} stalled endpoint {endpoint:#04x}: clear the halt and try again, "
             "or switch the device off and on"
         )
-        self.device = device
-        self.endpoint = endpoint
 
 
 class UsbTimeoutError(DriverError):
@@ -346,8 +330,6 @@ class UsbTimeoutError(DriverError):
         super().__init__(
             f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
         )
-        self.device = device
-        self.timeout_s = timeout_s
         self.done = done
 
 
@@ -356,7 +338,6 @@ class UsbTransferError(DriverError):
 
     def __init__(self, device: str, reason: str, advice: str) -> None:
         super().__init__(f"{device}: transfer failed ({reason}): {advice}")
-        self.device = device
         self.reason = reason
 
 
@@ -365,12 +346,11 @@ class CameraSettingError(DriverError):
 
     def __init__(self, setting: str, reason: str) -> None:
         super().__init__(f"the camera's {setting} {reason}")
-        self.setting = setting
         self.reason = reason
 
 
-class PtpFormatError(DriverError):
-    """Bytes from a camera that are no PTP message, or not the one that must come now."""
+class CameraFormatError(DriverError):
+    """Bytes from a camera that are no message of its protocol, or not the one that must come."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
@@ -378,30 +358,24 @@ class PtpFormatError(DriverError):
             f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
             "check the cable, then open the camera again"
         )
-        self.raw = raw
         self.reason = reason
 
 
-class PtpRefusedError(DriverError):
-    """The camera understood the request and said no; `code` is its answer."""
+class CameraRefusedError(DriverError):
+    """The camera understood the request and said no."""
 
-    def __init__(self, operation: str, code: int, answer: str, advice: str) -> None:
+    def __init__(self, operation: str, answer: str, advice: str) -> None:
         super().__init__(f"the camera refused {operation} with {answer}: {advice}")
-        self.operation = operation
-        self.code = code
-        self.answer = answer
 
 
 class CameraBusyError(DriverError):
-    """The camera answered "busy" for too long."""
+    """The camera answered "busy", or asked for more time, for too long."""
 
     def __init__(self, operation: str, waited_s: float) -> None:
         super().__init__(
-            f"the camera was busy for {waited_s:.3g} s when asked for {operation}: wait until it "
-            "has stored its pictures, check its battery and close its menus"
+            f"the camera was busy for {waited_s:.3g} s when asked {operation}: wait until it has "
+            "stored its pictures, check its battery, close its menus, or switch it off and on"
         )
-        self.operation = operation
-        self.waited_s = waited_s
 
 
 class CardFullError(DriverError):
@@ -409,14 +383,13 @@ class CardFullError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"the card of {camera} is full or missing: empty or insert it")
-        self.camera = camera
 
 
 class CaptureError(DriverError):
-    """The camera was released but gave no usable picture."""
+    """The camera was released but gave no usable frame; the next may be taken."""
 
-    def __init__(self, reason: str, advice: str) -> None:
-        super().__init__(f"no picture, {reason}: {advice}")
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"no frame, {reason}: {advice}")
         self.reason = reason
 
 
@@ -425,7 +398,6 @@ class ExposureStoppedError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"{camera}: the exposure was broken off; take the frame again")
-        self.camera = camera
 
 
 class DownloadError(DriverError):
@@ -436,9 +408,6 @@ class DownloadError(DriverError):
             f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
             "the picture is still on the card"
         )
-        self.name = name
-        self.got = got
-        self.size = size
         self.reason = reason
 
 
@@ -447,7 +416,6 @@ class FolderCameraError(DriverError):
 
     def __init__(self, folder: str, reason: str) -> None:
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
-        self.folder = folder
         self.reason = reason
 
 
@@ -456,41 +424,6 @@ class CameraClosedError(DriverError):
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"{camera} was closed: open it again")
-        self.camera = camera
-
-
-class U3vFormatError(DriverError):
-    """Bytes from a USB3 Vision camera that are not the packet that must come now."""
-
-    def __init__(self, raw: bytes, reason: str) -> None:
-        shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
-        super().__init__(
-            f"garbled packet from the camera, {reason} ({shown or 'nothing'}): "
-            "check the cable, then open the camera again"
-        )
-        self.raw = raw[:64]
-        self.reason = reason
-
-
-class U3vRefusedError(DriverError):
-    """The camera understood a command and said no; `status` is its answer."""
-
-    def __init__(self, command: str, status: int, meaning: str, advice: str) -> None:
-        super().__init__(f"the camera refused {command} ({status:#06x}, {meaning}): {advice}")
-        self.command = command
-        self.status = status
-
-
-class U3vBusyError(DriverError):
-    """The camera kept asking for more time for one command."""
-
-    def __init__(self, command: str, waited_s: float) -> None:
-        super().__init__(
-            f"the camera was still busy with {command} after {waited_s:.3g} s: "
-            "switch it off and on, then open it again"
-        )
-        self.command = command
-        self.waited_s = waited_s
 
 
 class CameraDescriptionError(DriverError):
@@ -502,15 +435,6 @@ class CameraDescriptionError(DriverError):
             "or use another camera"
         )
         self.reason = reason
-
-
-class FrameLostError(DriverError):
-    """A frame did not arrive, or not whole; the stream was cleaned up behind it."""
-
-    def __init__(self, reason: str, advice: str = "capture it again") -> None:
-        super().__init__(f"frame lost, {reason}: {advice}")
-        self.reason = reason
-        self.advice = advice
 
 
 class MicroManagerError(DriverError):

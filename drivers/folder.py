@@ -23,6 +23,11 @@ class Recorded:
     captured: str
 
 
+def open_camera(address: str, clock: Clock, backend: object = None) -> FolderCamera:
+    """Return the RAW files of a folder as a camera; see `drivers.cameras`."""
+    return FolderCamera(address or ".", clock)
+
+
 class FolderCamera:
     """The RAW files of a folder, in the order of their names (2 comes before 10).
 

@@ -46,7 +46,6 @@ class Port(Protocol):
 
     def write(self, address: int, data: bytes) -> None:
         """Store `data` from `address` on."""
-        ...
 
 
 @dataclass(frozen=True)

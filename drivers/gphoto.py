@@ -12,7 +12,7 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -42,6 +42,28 @@ ADVICE = {
 }
 
 
+@dataclass(frozen=True)
+class GphotoSetup:
+    """How a camera is found and set.
+
+    model: libgphoto2's name of it; "" where libgphoto2 finds that out. settings: by libgphoto2's
+    names, set at the start; frames go to the memory card unless `capturetarget` says otherwise.
+    delete: each RAW file from the card once it has arrived; a JPEG beside it stays.
+    """
+
+    model: str = ""
+    settings: Mapping[str, str | int | float] = field(default_factory=dict)
+    delete: bool = False
+
+
+OPTIONS = GphotoSetup
+
+
+def open_camera(address: str, clock: Clock, backend: object, setup: GphotoSetup) -> GphotoCamera:
+    """Open the camera at a port of libgphoto2's, "" for the first; see `drivers.cameras`."""
+    return GphotoCamera(address, setup.model, setup.settings, setup.delete, clock)
+
+
 def seconds_of(choice: str) -> float | None:
     """Return the exposure that a choice's words mean, None for bulb, auto and the like."""
     match = SECONDS.fullmatch(choice.strip())
@@ -56,11 +78,8 @@ class GphotoCamera(ShapeFromFrames):
     """A still camera set to RAW and manual exposure, found by libgphoto2.
 
     address: a port such as `usb:001,007` or `ptpip:192.168.1.5`; "" takes the first camera found.
-    model: libgphoto2's name of it; "" where libgphoto2 finds that out. settings: by libgphoto2's
-    names, set at the start; frames go to the memory card unless `capturetarget` says otherwise.
-    delete: each RAW file from the card once it has arrived; a JPEG beside it stays. The size of a
-    frame is known from the first one, which asking for it takes. Raises `GphotoError`,
-    `CameraSettingError`.
+    The rest as in `GphotoSetup`. The size of a frame is known from the first one, which asking for
+    it takes. Raises `GphotoError`, `CameraSettingError`.
     """
 
     def __init__(

@@ -10,34 +10,28 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field
 
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.dng import frame_of_array
+from drivers.dng import BAYER_PATTERNS, frame_of_array
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
-    FrameLostError,
+    CaptureError,
     MicroManagerError,
     PortGoneError,
     SpeedFixedError,
 )
 from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.raw import RawFrame
-from drivers.stage import (
-    DEFAULT_SETTINGS,
-    HostStage,
-    Reading,
-    StageSettings,
-    check_within_limits,
-)
+from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
 
 if TYPE_CHECKING:
     from pymmcore_plus import CMMCorePlus
@@ -45,12 +39,6 @@ if TYPE_CHECKING:
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
 FRAME_GRACE_S = 2.0
 POLL_S = 0.001
-BAYER_ROWS = {
-    "rggb": ("rg", "gb"),
-    "grbg": ("gr", "bg"),
-    "gbrg": ("gb", "rg"),
-    "bggr": ("bg", "gr"),
-}
 SPEED_UM_S = 100.0
 """Of a stage that does not state its own: slow, so that no time limit is too short."""
 
@@ -170,12 +158,22 @@ class CameraSetup:
     """
 
     label: str = ""
-    cfa: str = "mono"
-    black_level_dn: int = 0
-    bit_depth: int | None = None
-    binning: int | None = None
+    cfa: Annotated[str, Field(pattern="^(mono|rggb|grbg|gbrg|bggr)$")] = "mono"
+    black_level_dn: Annotated[int, Field(ge=0)] = 0
+    bit_depth: Annotated[int, Field(gt=0, le=16)] | None = None
+    binning: Annotated[int, Field(gt=0)] | None = None
     roi: tuple[int, int, int, int] | None = None
-    properties: Mapping[str, PropertyValue] | None = None
+    properties: Mapping[str, PropertyValue] = field(default_factory=dict)
+
+
+OPTIONS = CameraSetup
+
+
+def open_camera(
+    address: str, clock: Clock, backend: object, setup: CameraSetup
+) -> MicroManagerCamera:
+    """Open the camera of a configuration file; see `drivers.cameras`."""
+    return MicroManagerCamera(load_core(address), setup, clock)
 
 
 class MicroManagerCamera:
@@ -277,36 +275,13 @@ class MicroManagerCamera:
     def stream(self) -> Generator[RawFrame, None, None]:
         """Yield frames as they come; closing the generator stops the acquisition.
 
-        Raises `FrameLostError` when the core's buffer ran over or no frame comes.
+        Raises `CaptureError` when the core's buffer ran over or no frame comes.
         """
         with calling("stream frames"):
             with self._alone() as core:
                 core.startContinuousSequenceAcquisition(0)
             try:
                 while True:
-                    yield self._next(core)
-            finally:
-                core.stopSequenceAcquisition()
-
-    def triggered(
-        self, stage: MicroManagerStage, axis: str, places_um: Sequence[float]
-    ) -> Generator[RawFrame, None, None]:
-        """Yield a frame at each of the ascending places: the camera's trigger steps the stage.
-
-        Only for devices of one configuration that say that they can, and are wired so. Raises
-        `CameraSettingError` when the stage cannot hold so many places, `ValueError` unless they
-        ascend, and what a move and `stream` raise.
-        """
-        most = stage.sequence_length(axis)
-        if len(places_um) > most:
-            raise CameraSettingError("hardware sequence", f"takes {most} places along {axis}")
-        if any(b <= a for a, b in pairwise(places_um)):
-            raise ValueError("the places of a hardware sequence must ascend")
-        with stage.stepping(axis, places_um), calling("run a hardware sequence"):
-            with self._alone() as core:
-                core.startSequenceAcquisition(len(places_um), 0, True)
-            try:
-                for _ in places_um:
                     yield self._next(core)
             finally:
                 core.stopSequenceAcquisition()
@@ -321,7 +296,7 @@ class MicroManagerCamera:
     def _apply(self) -> None:
         """Set the camera as the configuration says, and read what frames it gives now."""
         core, setup = self._loaded.core, self._setup
-        wanted: dict[str, PropertyValue] = dict(setup.properties or {})
+        wanted: dict[str, PropertyValue] = dict(setup.properties)
         if setup.bit_depth is not None:
             wanted["BitDepth"] = setup.bit_depth
         if setup.binning is not None:
@@ -383,9 +358,9 @@ class MicroManagerCamera:
         deadline_s = self._clock.now_s() + self.exposure_s + FRAME_GRACE_S
         while not core.getRemainingImageCount():
             if core.isBufferOverflowed():
-                raise FrameLostError("the core's buffer ran over", "take frames more slowly")
+                raise CaptureError("the core's buffer ran over", "take frames more slowly")
             if self._clock.now_s() > deadline_s:
-                raise FrameLostError("no frame came from the camera")
+                raise CaptureError("no frame came from the camera")
             self._clock.sleep(POLL_S)
         image, tags = core.popNextImageAndMD()
         metadata = {str(name): str(value) for name, value in dict(tags).items()}
@@ -394,7 +369,7 @@ class MicroManagerCamera:
     def _frame(self, image: np.ndarray, metadata: Mapping[str, str]) -> RawFrame:
         mosaic = np.asarray(image, dtype=np.uint16)
         if mosaic.shape != self.shape:
-            raise FrameLostError(f"it has {mosaic.shape} pixels instead of {self.shape}")
+            raise CaptureError(f"it has {mosaic.shape} pixels instead of {self.shape}")
         return frame_of_array(
             mosaic,
             self.cfa,
@@ -409,9 +384,9 @@ class MicroManagerCamera:
 
 def _shifted(cfa: str, top: int, left: int) -> str:
     """Return the Bayer phase of a frame that begins at that row and column of the sensor."""
-    if cfa not in BAYER_ROWS:
+    if cfa not in BAYER_PATTERNS:
         return cfa
-    rows = BAYER_ROWS[cfa]
+    rows = cfa[:2], cfa[2:]
     return "".join(rows[(top + i) % 2][(left + j) % 2] for i in (0, 1) for j in (0, 1))
 
 
@@ -478,46 +453,6 @@ class MicroManagerStage(HostStage):
         if not self._closed:
             self._closed = True
             super().close()
-
-    def sequence_length(self, axis: str) -> int:
-        """Return how many places the axis can step through by itself; 0 where it cannot."""
-        self._require_axis(axis)
-        label, coordinate = self._place(axis)
-        core = self._loaded.core
-        with calling("describe hardware sequences"):
-            if coordinate is None and core.isStageSequenceable(label):
-                return core.getStageSequenceMaxLength(label)
-            if coordinate is not None and core.isXYStageSequenceable(label):
-                return core.getXYStageSequenceMaxLength(label)
-        return 0
-
-    @contextmanager
-    def stepping(self, axis: str, places_um: Sequence[float]) -> Iterator[None]:
-        """Let the axis step from place to place at each trigger while the block lasts.
-
-        It begins at the first place, and stays where the last trigger brought it. Raises
-        `LimitExceededError` before anything moves, and what `move_to_um` raises.
-        """
-        for place_um in places_um:
-            check_within_limits(axis, place_um, self.limits_um(axis))
-        self.move_to_um({axis: places_um[0]})
-        label, coordinate = self._place(axis)
-        core = self._loaded.core
-        with calling("load a hardware sequence"):
-            if coordinate is None:
-                core.loadStageSequence(label, list(places_um))
-                start, stop = core.startStageSequence, core.stopStageSequence
-            else:
-                still = [core.getXYPosition(label)[1 - coordinate]] * len(places_um)
-                pair = (list(places_um), still) if coordinate == 0 else (still, list(places_um))
-                core.loadXYStageSequence(label, *pair)
-                start, stop = core.startXYStageSequence, core.stopXYStageSequence
-            start(label)
-        try:
-            yield
-        finally:
-            with calling("end a hardware sequence"):
-                stop(label)
 
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move: the device's where a property holds it."""

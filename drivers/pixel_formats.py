@@ -18,59 +18,21 @@ Array = np.ndarray
 
 CFA = {"Mono": "mono", "BayerRG": "rggb", "BayerGR": "grbg", "BayerGB": "gbrg", "BayerBG": "bggr"}
 
+DEPTHS = ("16", "12p", "12Packed", "12", "10p", "10Packed", "10", "8")
+"""Depth and packing: deepest first, and the smaller of two equally deep."""
 CODES = {
-    "Mono": {
-        "16": 0x01100007,
-        "12p": 0x010C0047,
-        "12Packed": 0x010C0006,
-        "12": 0x01100005,
-        "10p": 0x010A0046,
-        "10Packed": 0x010C0004,
-        "10": 0x01100003,
-        "8": 0x01080001,
-    },
-    "BayerGR": {
-        "16": 0x0110002E,
-        "12p": 0x010C0057,
-        "12Packed": 0x010C002A,
-        "12": 0x01100010,
-        "10p": 0x010A0056,
-        "10Packed": 0x010C0026,
-        "10": 0x0110000C,
-        "8": 0x01080008,
-    },
-    "BayerRG": {
-        "16": 0x0110002F,
-        "12p": 0x010C0059,
-        "12Packed": 0x010C002B,
-        "12": 0x01100011,
-        "10p": 0x010A0058,
-        "10Packed": 0x010C0027,
-        "10": 0x0110000D,
-        "8": 0x01080009,
-    },
-    "BayerGB": {
-        "16": 0x01100030,
-        "12p": 0x010C0055,
-        "12Packed": 0x010C002C,
-        "12": 0x01100012,
-        "10p": 0x010A0054,
-        "10Packed": 0x010C0028,
-        "10": 0x0110000E,
-        "8": 0x0108000A,
-    },
-    "BayerBG": {
-        "16": 0x01100031,
-        "12p": 0x010C0053,
-        "12Packed": 0x010C002D,
-        "12": 0x01100013,
-        "10p": 0x010A0052,
-        "10Packed": 0x010C0029,
-        "10": 0x0110000F,
-        "8": 0x0108000B,
-    },
-}
-"""By colours, then by depth and packing: deepest first, and the smaller of two equally deep."""
+    "Mono": (0x01100007, 0x010C0047, 0x010C0006, 0x01100005, 0x010A0046, 0x010C0004, 0x01100003,
+             0x01080001),
+    "BayerGR": (0x0110002E, 0x010C0057, 0x010C002A, 0x01100010, 0x010A0056, 0x010C0026, 0x0110000C,
+                0x01080008),
+    "BayerRG": (0x0110002F, 0x010C0059, 0x010C002B, 0x01100011, 0x010A0058, 0x010C0027, 0x0110000D,
+                0x01080009),
+    "BayerGB": (0x01100030, 0x010C0055, 0x010C002C, 0x01100012, 0x010A0054, 0x010C0028, 0x0110000E,
+                0x0108000A),
+    "BayerBG": (0x01100031, 0x010C0053, 0x010C002D, 0x01100013, 0x010A0052, 0x010C0029, 0x0110000F,
+                0x0108000B),
+}  # fmt: skip
+"""By colours, in the order of DEPTHS."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +62,11 @@ class PixelFormat:
 
 def _formats() -> tuple[PixelFormat, ...]:
     found = []
-    for depth in next(iter(CODES.values())):
+    for place, depth in enumerate(DEPTHS):
         bits = int("".join(letter for letter in depth if letter.isdigit()))
         packing = depth.removeprefix(str(bits))
         for colours, codes in CODES.items():
-            found.append(PixelFormat(colours + depth, codes[depth], CFA[colours], bits, packing))
+            found.append(PixelFormat(colours + depth, codes[place], CFA[colours], bits, packing))
     return tuple(found)
 
 

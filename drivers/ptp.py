@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
-from typing import Protocol
+from typing import Any
 
 from drivers import ptp_codec as codec
 from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
@@ -22,14 +22,14 @@ from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
     CameraClosedError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
     CaptureError,
     CardFullError,
     DownloadError,
     DriverError,
     ExposureStoppedError,
-    PtpFormatError,
-    PtpRefusedError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -37,7 +37,9 @@ from drivers.ptp_canon import EosBody, is_eos
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
 from drivers.ptp_dials import EXPOSURE_UNIT_S, Body, StandardBody
 from drivers.ptp_sony import SonyBody, is_sony
+from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.usb import open_device
 
 _log = logging.getLogger(__name__)
 
@@ -86,39 +88,6 @@ class PtpSettings:
     attempts: int = 3
 
 
-class PtpTransport(Protocol):
-    """What carries PTP: see `drivers.ptp_usb.PtpUsb`."""
-
-    name: str
-
-    def exchange(
-        self,
-        command: Message,
-        data: bytes | None,
-        sink: Callable[[memoryview], object],
-        most: int,
-        timeout_s: float = 0.0,
-    ) -> Message:
-        """Send a command and return the response; what comes with it goes to `sink`."""
-        ...
-
-    def event(self, timeout_s: float) -> Message | None:
-        """Return the next event, None when none came in time."""
-        ...
-
-    def recover(self, transaction: int) -> None:
-        """Make a clean start after an exchange that did not end."""
-        ...
-
-    def reset(self) -> None:
-        """Close whatever session the camera believes to be open."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the camera."""
-        ...
-
-
 class PtpSession:
     """An open session with a camera; `info` is what it said of itself.
 
@@ -129,7 +98,7 @@ class PtpSession:
 
     def __init__(
         self,
-        transport: PtpTransport,
+        transport: PtpUsb,
         clock: Clock = SYSTEM_CLOCK,
         settings: PtpSettings | None = None,
     ) -> None:
@@ -179,7 +148,7 @@ class PtpSession:
     ) -> Parameters:
         """Make one exchange and return the response's parameters; "busy" is asked again.
 
-        Raises `CameraBusyError`, `CardFullError`, `PtpRefusedError`, or an error of the
+        Raises `CameraBusyError`, `CardFullError`, `CameraRefusedError`, or an error of the
         transport. Not `patient`: busy at once.
         """
         started_s = self.clock.now_s()
@@ -193,7 +162,7 @@ class PtpSession:
                 raise _refused(operation, response.code)
             waited_s = self.clock.now_s() - started_s
             if not patient or waited_s >= self.settings.busy_limit_s:
-                raise CameraBusyError(_shown(operation), waited_s)
+                raise CameraBusyError(f"for {_shown(operation)}", waited_s)
             self.clock.sleep(self.settings.busy_poll_s)
 
     def fetch(self, operation: int, *parameters: int, patient: bool = True) -> bytes:
@@ -291,7 +260,7 @@ class PtpSession:
                 response = self._exchange(
                     Operation.OPEN_SESSION, (SESSION,), None, lambda piece: None, 0, transaction=0
                 )
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 if last:
                     raise
                 _log.info("%s: opening it again after: %s", self.name, error)
@@ -309,7 +278,7 @@ class PtpSession:
     def _end_foreign_session(self) -> None:
         try:
             self.request(Operation.CLOSE_SESSION)
-        except PtpRefusedError:
+        except CameraRefusedError:
             self._transport.reset()
 
     def _exchange(
@@ -435,7 +404,7 @@ class PtpSession:
                 if answered and answered[0] != came:
                     reason = f"{came} bytes came of the {answered[0]} that it says it sent"
                     received.seek(done)
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 # Nobody knows whether what came before the fault is in its place.
                 reason = str(error)
                 received.seek(done)
@@ -464,7 +433,7 @@ class PtpSession:
 
             try:
                 self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
-            except (PtpFormatError, UsbTimeoutError, UsbStalledError) as error:
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
                 reason = str(error)
                 _log.info("%s: fetching %s again: %s", self.name, info.name, error)
             else:
@@ -637,6 +606,19 @@ class PtpCamera(ShapeFromFrames):
         return limits[0] if limits else self._iso.value or 1.0
 
 
+def open_camera(
+    address: str,
+    clock: Clock,
+    backend: Any = None,
+    shape: tuple[int, int] | None = None,
+    cfa: str | None = None,
+    from_card: bool = False,
+) -> PtpCamera:
+    """Open the camera with a serial number, "" for the first; the rest as in `PtpCamera`."""
+    device = open_device(PTP_INTERFACE, serial=address, backend=backend, wanted="PTP camera")
+    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+
+
 def _body(session: PtpSession) -> Body:
     """Return how this camera is released, by its maker and what it says that it can do."""
     if is_eos(session.info):
@@ -662,10 +644,10 @@ def _shown(operation: int) -> str:
         return f"operation {operation:#06x}"
 
 
-def _refused(operation: int, code: int) -> PtpRefusedError:
+def _refused(operation: int, code: int) -> CameraRefusedError:
     try:
         known = Code(code)
     except ValueError:
-        return PtpRefusedError(_shown(operation), code, f"{code:#06x}", SEE_MANUAL)
+        return CameraRefusedError(_shown(operation), f"{code:#06x}", SEE_MANUAL)
     answer = known.name.lower().replace("_", " ")
-    return PtpRefusedError(_shown(operation), code, answer, REFUSALS.get(known, SEE_MANUAL))
+    return CameraRefusedError(_shown(operation), answer, REFUSALS.get(known, SEE_MANUAL))

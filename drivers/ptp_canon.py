@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
-from drivers.errors import CaptureError, PtpFormatError
+from drivers.errors import CameraFormatError, CaptureError
 from drivers.ptp_codec import DeviceInfo, EventCode, Kind, Message
 from drivers.ptp_dials import CodedDial, Dial
 
@@ -79,14 +79,14 @@ def iso(code: int) -> float | None:
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield type and payload of what GetEvent gave, up to its end; raises `PtpFormatError`."""
+    """Yield type and payload of what GetEvent gave, up to its end; raises `CameraFormatError`."""
     at = 0
     while at + RECORD.size <= len(data):
         size, kind = RECORD.unpack_from(data, at)
         if size == RECORD.size and kind == 0:
             return
         if size < RECORD.size or at + size > len(data):
-            raise PtpFormatError(data[at : at + RECORD.size], "a record of events runs over")
+            raise CameraFormatError(data[at : at + RECORD.size], "a record of events runs over")
         yield kind, data[at + RECORD.size : at + size]
         at += size
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
-from drivers.errors import PtpFormatError
+from drivers.errors import CameraFormatError
 
 HEADER = struct.Struct("<IHHI")
 HEADER_SIZE = HEADER.size
@@ -150,21 +150,21 @@ def encode_data(code: int, transaction: int, payload: bytes) -> bytes:
 
 
 def decode_header(data: bytes | memoryview) -> Header:
-    """Return a container's header; raises `PtpFormatError`."""
+    """Return a container's header; raises `CameraFormatError`."""
     if len(data) < HEADER_SIZE:
-        raise PtpFormatError(bytes(data), "shorter than a container's header")
+        raise CameraFormatError(bytes(data), "shorter than a container's header")
     header = Header(*HEADER.unpack_from(data))
     if header.length < HEADER_SIZE or header.kind not in KINDS:
-        raise PtpFormatError(bytes(data[:HEADER_SIZE]), "no header of a container")
+        raise CameraFormatError(bytes(data[:HEADER_SIZE]), "no header of a container")
     return header
 
 
 def decode_message(data: bytes) -> Message:
-    """Return the command, response or event in a whole container; raises `PtpFormatError`."""
+    """Return the command, response or event in a whole container; raises `CameraFormatError`."""
     header = decode_header(data)
     count, rest = divmod(header.payload_length, 4)
     if header.length != len(data) or rest or count > MOST_PARAMETERS or header.kind == Kind.DATA:
-        raise PtpFormatError(data, "its length does not fit its parameters")
+        raise CameraFormatError(data, "its length does not fit its parameters")
     parameters = struct.unpack_from(f"<{count}I", data, HEADER_SIZE)
     return Message(header.kind, header.code, header.transaction, parameters)
 
@@ -187,7 +187,7 @@ class _Reader:
     def take(self, layout: str) -> tuple[int, ...]:
         size = struct.calcsize("<" + layout)
         if self._at + size > len(self._data):
-            raise PtpFormatError(self._data, "a dataset ends too early")
+            raise CameraFormatError(self._data, "a dataset ends too early")
         self._at += size
         return struct.unpack_from("<" + layout, self._data, self._at - size)
 
@@ -197,7 +197,7 @@ class _Reader:
     def array(self, layout: str) -> tuple[int, ...]:
         count = self.number("I")
         if count > len(self._data):
-            raise PtpFormatError(self._data, f"a list of {count} values is longer than the data")
+            raise CameraFormatError(self._data, f"a list of {count} values is longer than the data")
         return self.take(f"{count}{layout}")
 
     def text(self) -> str:
@@ -213,7 +213,7 @@ class _Reader:
             return self.text()
         layout = NUMBERS.get(data_type & ~ARRAY)
         if layout is None:
-            raise PtpFormatError(self._data, f"values of type {data_type:#06x} are not known")
+            raise CameraFormatError(self._data, f"values of type {data_type:#06x} are not known")
         return self.array(layout) if data_type & ARRAY else self.number(layout)
 
 
@@ -247,7 +247,7 @@ def encode_value(data_type: int, value: Value) -> bytes:
 
 
 def decode_value(data_type: int, data: bytes) -> Value:
-    """Return a property's value; raises `PtpFormatError`."""
+    """Return a property's value; raises `CameraFormatError`."""
     return _Reader(data).value(data_type)
 
 
@@ -257,7 +257,7 @@ def encode_handles(handles: tuple[int, ...]) -> bytes:
 
 
 def decode_handles(data: bytes) -> tuple[int, ...]:
-    """Return a list of object handles or storages; raises `PtpFormatError`."""
+    """Return a list of object handles or storages; raises `CameraFormatError`."""
     return _Reader(data).array("I")
 
 
@@ -281,7 +281,7 @@ class _Dataset:
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """Return the dataset in the bytes; raises `PtpFormatError`."""
+        """Return the dataset in the bytes; raises `CameraFormatError`."""
         reader = _Reader(data)
         fields: dict[str, Any] = {}
         for name, layout in cls.LAYOUT:
@@ -439,7 +439,7 @@ def encode_description(described: PropertyDescription) -> bytes:
 
 
 def decode_description(data: bytes) -> PropertyDescription:
-    """Return a property's description; raises `PtpFormatError`."""
+    """Return a property's description; raises `CameraFormatError`."""
     reader = _Reader(data)
     code, data_type, writable = reader.take("HHB")
     default, current = reader.value(data_type), reader.value(data_type)
@@ -449,7 +449,7 @@ def decode_description(data: bytes) -> PropertyDescription:
     if form == SPAN_FORM:
         low, high, step = (reader.value(data_type) for _ in range(3))
         if not (isinstance(low, int) and isinstance(high, int) and isinstance(step, int)):
-            raise PtpFormatError(data, "a range of texts or lists")
+            raise CameraFormatError(data, "a range of texts or lists")
         span = low, high, step
     elif form == CHOICES_FORM:
         choices = tuple(reader.value(data_type) for _ in range(reader.number("H")))

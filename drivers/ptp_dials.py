@@ -27,16 +27,13 @@ class Dial(Protocol):
     @property
     def value(self) -> float | None:
         """What it is; None where the camera does not say, or it is automatic."""
-        ...
 
     @property
     def limits(self) -> Limits | None:
         """Lowest and highest value; None where it cannot be chosen."""
-        ...
 
     def choose(self, target: float) -> None:
         """Set the nearest value that the camera has; raises `CameraSettingError`."""
-        ...
 
 
 class Body(Protocol):
@@ -51,11 +48,9 @@ class Body(Protocol):
 
     def release(self) -> None:
         """Release the shutter; raises a `CaptureError` where the camera refuses to."""
-        ...
 
     def event(self, timeout_s: float) -> Message | None:
         """Return the next event in the standard's form, None when none came in time."""
-        ...
 
 
 class StandardBody:

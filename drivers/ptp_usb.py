@@ -16,7 +16,7 @@ from contextlib import suppress
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraBusyError,
-    PtpFormatError,
+    CameraFormatError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -86,7 +86,7 @@ class PtpUsb:
 
         Data that the camera sends goes to `sink` piece by piece, `most` bytes at most; the piece
         is only valid during the call. `timeout_s` is how long the first answer may take where
-        that is more than a transfer's. Raises `PtpFormatError` or an error of USB, after which
+        that is more than a transfer's. Raises `CameraFormatError` or an error of USB, after which
         `recover` must come first.
         """
         self._out.write(encode_message(command), self._timeout_s, end=True)
@@ -104,10 +104,10 @@ class PtpUsb:
                 if ours:
                     return response
             else:
-                raise PtpFormatError(start, "neither data nor a response")
+                raise CameraFormatError(start, "neither data nor a response")
             if not ours:
                 _log.debug("%s: skipped what transaction %d left", self.name, header.transaction)
-        raise PtpFormatError(start, f"transaction {command.transaction} is never answered")
+        raise CameraFormatError(start, f"transaction {command.transaction} is never answered")
 
     def event(self, timeout_s: float) -> Message | None:
         """Return the next event, None when none came in time; what is no event is skipped."""
@@ -166,7 +166,7 @@ class PtpUsb:
             if len(status) < 4 or status[2:4] != struct.pack("<H", Code.BUSY):
                 return
             self._clock.sleep(STATUS_POLL_S)
-        raise CameraBusyError("its status", STATUS_POLLS * STATUS_POLL_S)
+        raise CameraBusyError("for its status", STATUS_POLLS * STATUS_POLL_S)
 
     def _unhalt(self, pipe: UsbPipe) -> None:
         """Clear the endpoint's halt if it has one: clearing one that has none upsets cameras."""
@@ -189,12 +189,12 @@ class PtpUsb:
             if count:
                 start = self._first[:count].tobytes()
                 return decode_header(start), start
-        raise PtpFormatError(b"", "only empty packets")
+        raise CameraFormatError(b"", "only empty packets")
 
     def _read_message(self, header: Header, start: bytes) -> Message:
         parts = [start]
         if header.length > self._in.packet_size:
-            raise PtpFormatError(start, "a response longer than a packet")
+            raise CameraFormatError(start, "a response longer than a packet")
         missing = header.length - len(start)
         if missing > 0:
             self._read_rest(missing, lambda piece: parts.append(bytes(piece)))
@@ -203,10 +203,10 @@ class PtpUsb:
     def _read_payload(self, header: Header, start: bytes, sink: Sink, most: int) -> None:
         length = header.payload_length
         if length > most:
-            raise PtpFormatError(start, f"{length} bytes of data where {most} are the most")
+            raise CameraFormatError(start, f"{length} bytes of data where {most} are the most")
         had = len(start) - HEADER_SIZE
         if had > length:
-            raise PtpFormatError(start, "more data than announced")
+            raise CameraFormatError(start, "more data than announced")
         if had:
             sink(memoryview(start)[HEADER_SIZE:])
         self._read_rest(length - had, sink)
@@ -224,22 +224,22 @@ class PtpUsb:
             buffer = self._buffer if whole else array.array("B", bytes(wanted))
             count = self._in.read_into(buffer, self._timeout_s)
             if count > length:
-                raise PtpFormatError(bytes(memoryview(buffer)[:24]), "more data than announced")
+                raise CameraFormatError(bytes(memoryview(buffer)[:24]), "more data than announced")
             if count:
                 sink((room if whole else memoryview(buffer))[:count])
             empty = 0 if count else empty + 1
             if empty > EMPTY_READS_TOLERATED:
-                raise PtpFormatError(b"", f"{length} bytes of data are missing")
+                raise CameraFormatError(b"", f"{length} bytes of data are missing")
             length -= count
             if length and count % self._in.packet_size:
-                raise PtpFormatError(b"", f"{length} bytes of data are missing")
+                raise CameraFormatError(b"", f"{length} bytes of data are missing")
 
     def _take_events(self, data: bytes) -> None:
         while data:
             try:
                 length = decode_header(data).length
                 message = decode_message(data[:length])
-            except PtpFormatError as error:
+            except CameraFormatError as error:
                 _log.debug("%s: %s", self.name, error)
                 return
             data = data[length:]

@@ -56,7 +56,6 @@ class Stage(Protocol):
 
     def home(self, axes: Iterable[str] | None = None) -> None:
         """Find the reference of the given axes (all by default), and wait until they stand."""
-        ...
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""
@@ -88,23 +87,18 @@ class Stage(Protocol):
 
     def set_speed_um_s(self, axis: str, speed_um_s: float) -> None:
         """Choose the speed of the moves that follow, also after a reconnect."""
-        ...
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """Stop the given axes (all by default) at once, and return when they stand."""
-        ...
 
     def wait_until_settled(self, axes: Iterable[str] | None = None) -> None:
         """Return when the given axes (all by default) stand and their vibration has died down."""
-        ...
 
     def reconnect(self, wait_s: float = 10.0) -> None:
         """Open the ports again after an unplug; every axis must be homed before its next move."""
-        ...
 
     def close(self) -> None:
         """Let go of the ports; nothing is moved or stopped."""
-        ...
 
     def __enter__(self) -> Self: ...
 
@@ -117,7 +111,6 @@ class SignallingStage(Stage, Protocol):
 
     def check_output(self, axis: str, output: int | str) -> None:
         """Lower an output; raises a `DriverError` where the axis's controller has none such."""
-        ...
 
     def move_and_signal_um(self, axis: str, target_um: float, output: int | str) -> float:
         """As `move_to_um`, but without waiting for vibration; the output rises on arrival.
@@ -199,11 +192,9 @@ class Link(Protocol):
 
     def reopen(self) -> None:
         """Open it again, wherever it is now; raises a `PortError`."""
-        ...
 
     def close(self) -> None:
         """Let go of it; closing twice is allowed."""
-        ...
 
 
 class HostStage(ABC):

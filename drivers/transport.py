@@ -3,8 +3,7 @@
 import errno
 import threading
 import time
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
 
 import serial
 
@@ -37,53 +36,84 @@ QUIET_LIMIT = 20
 RTS_PAUSE_S = 0.05
 
 
-class Transport(Protocol):
-    """What a serial driver needs of a port, real or simulated."""
+class Transport(ABC):
+    """What a serial driver needs of a port, real or simulated; what is read in pieces is kept.
 
-    @property
-    def port(self) -> str:
-        """Name of the port, for messages."""
-        ...
+    `port`: its name, for messages. `lock`: held by a driver from the first byte of a command to
+    the last of its answer.
+    """
 
-    @property
-    def lock(self) -> AbstractContextManager[Any]:
-        """Held by a driver from the first byte of a command to the last of its answer."""
-        ...
+    def __init__(self, port: str, timeout_s: float) -> None:
+        self.port = port
+        self.timeout_s = timeout_s
+        self.lock = threading.RLock()
+        self._unread: bytearray = bytearray()
 
+    @abstractmethod
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError` or `TransportTimeoutError`."""
-        ...
 
-    def read_until(self, terminator: bytes) -> bytes:
-        """Return bytes up to and including `terminator`; raises as `write` does."""
-        ...
-
-    def read_exactly(self, count: int) -> bytes:
-        """Return the next `count` bytes; raises as `write` does."""
-        ...
-
+    @abstractmethod
     def waiting(self) -> int:
         """Return how many bytes can be read at once; raises `PortGoneError`."""
-        ...
 
+    @abstractmethod
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
-        ...
+
+    @abstractmethod
+    def reopen(self) -> None:
+        """Open the port again, wherever it is now; raises as opening it does."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the port; closing twice is allowed."""
+
+    @abstractmethod
+    def _now_s(self) -> float:
+        """Return the time in which a read must end."""
+
+    @abstractmethod
+    def _receive(self, deadline_s: float) -> None:
+        """Keep what has arrived, or wait for a byte; raises when the deadline has passed."""
+
+    def read_until(self, terminator: bytes) -> bytes:
+        """Return bytes up to and including `terminator`; raises as `write` does.
+
+        What arrived of an incomplete answer is kept for the next read.
+        """
+        with self.lock:
+            deadline_s = self._now_s() + self.timeout_s
+            while (end := self._unread.find(terminator)) < 0:
+                self._receive(deadline_s)
+            return self._take(end + len(terminator))
+
+    def read_exactly(self, count: int) -> bytes:
+        """Return the next `count` bytes; raises as `read_until` does."""
+        with self.lock:
+            deadline_s = self._now_s() + self.timeout_s
+            while len(self._unread) < count:
+                self._receive(deadline_s)
+            return self._take(count)
 
     def discard_until_quiet(self) -> None:
         """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
-        ...
+        with self.lock:
+            for _ in range(QUIET_LIMIT):
+                self.discard_input()
+                try:
+                    last = self.read_exactly(1)
+                except TransportTimeoutError:
+                    return
+            raise GarbledReplyError(last, f"{self.port} never falls silent")
 
-    def reopen(self) -> None:
-        """Open the port again, wherever it is now; raises as opening it does."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the port; closing twice is allowed."""
-        ...
+    def _take(self, count: int) -> bytes:
+        message = bytes(self._unread[:count])
+        del self._unread[:count]
+        return message
 
 
-class SerialTransport:
+class SerialTransport(Transport):
     """A serial port by pyserial, 8 data bits, no parity, 1 stop bit.
 
     `port` is named as `drivers.ports` says. `timeout_s` bounds a read, `write_timeout_s` a write
@@ -100,22 +130,14 @@ class SerialTransport:
         write_timeout_s: float = 1.0,
         flow_control: bool = False,
     ) -> None:
-        self.port = port
-        self.timeout_s = timeout_s
+        super().__init__(port, timeout_s)
         self.write_timeout_s = write_timeout_s
         self._baud = baud
         self._flow_control = flow_control
-        self._lock = threading.RLock()
-        self._unread = bytearray()
         self._heard = False
         device = find_port(port)
         self._serial = self._open(device)
         self._serial_number = "" if "://" in device else usb_serial_number(device)
-
-    @property
-    def lock(self) -> AbstractContextManager[Any]:
-        """Held by a driver from the first byte of a command to the last of its answer."""
-        return self._lock
 
     @property
     def usb_serial_number(self) -> str:
@@ -124,7 +146,7 @@ class SerialTransport:
 
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError` or `TransportTimeoutError`."""
-        with self._lock:
+        with self.lock:
             self._require_open()
             try:
                 self._serial.write(data)
@@ -133,31 +155,9 @@ class SerialTransport:
             except _PORT_FAILURES as error:
                 raise self._gone() from error
 
-    def read_until(self, terminator: bytes) -> bytes:
-        """Return bytes up to and including `terminator`; raises as `write` does.
-
-        What arrived of an incomplete answer is kept for the next read.
-        """
-        with self._lock:
-            deadline_s = time.monotonic() + self.timeout_s
-            while (end := self._unread.find(terminator)) < 0:
-                self._receive(deadline_s)
-            return self._take(end + len(terminator))
-
-    def read_exactly(self, count: int) -> bytes:
-        """Return the next `count` bytes; raises as `write` does.
-
-        What arrived of an incomplete answer is kept for the next read.
-        """
-        with self._lock:
-            deadline_s = time.monotonic() + self.timeout_s
-            while len(self._unread) < count:
-                self._receive(deadline_s)
-            return self._take(count)
-
     def waiting(self) -> int:
         """Return how many bytes can be read at once; raises `PortGoneError`."""
-        with self._lock:
+        with self.lock:
             self._require_open()
             try:
                 arrived = self._serial.in_waiting
@@ -169,7 +169,7 @@ class SerialTransport:
 
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
-        with self._lock:
+        with self.lock:
             self._unread.clear()
             self._require_open()
             try:
@@ -177,24 +177,13 @@ class SerialTransport:
             except _PORT_FAILURES as error:
                 raise PortGoneError(self.port) from error
 
-    def discard_until_quiet(self) -> None:
-        """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
-        with self._lock:
-            for _ in range(QUIET_LIMIT):
-                self.discard_input()
-                try:
-                    last = self.read_exactly(1)
-                except TransportTimeoutError:
-                    return
-            raise GarbledReplyError(last, f"{self.port} never falls silent")
-
     def reopen(self) -> None:
         """Open the port again, wherever it is now; raises as the constructor does.
 
         A port opened by its name is looked for by the serial number of its USB adapter, if that
         has one: after an unplug it may have another name.
         """
-        with self._lock:
+        with self.lock:
             self.close()
             self._unread.clear()
             number = self._serial_number
@@ -202,7 +191,7 @@ class SerialTransport:
 
     def close(self) -> None:
         """Let go of the port; closing twice is allowed."""
-        with self._lock:
+        with self.lock:
             # pyserial forgets to close a socket that the other side has closed already.
             opened = getattr(self._serial, "_socket", None)
             self._serial.close()
@@ -227,8 +216,10 @@ class SerialTransport:
             _cycle_rts(opened)
         return opened
 
+    def _now_s(self) -> float:
+        return time.monotonic()
+
     def _receive(self, deadline_s: float) -> None:
-        """Read what there is, or wait for a byte; raises when the deadline has passed."""
         self._require_open()
         if time.monotonic() > deadline_s:
             raise TransportTimeoutError(self.port, self.timeout_s, bytes(self._unread))
@@ -245,11 +236,6 @@ class SerialTransport:
         if "://" in self.port and not self._heard:
             return PortBusyError(self.port, "it hung up at once", NETWORK_HOLDER)
         return PortGoneError(self.port)
-
-    def _take(self, count: int) -> bytes:
-        message = bytes(self._unread[:count])
-        del self._unread[:count]
-        return message
 
     def _require_open(self) -> None:
         """Raise `PortGoneError` for a port that was closed; pyserial would trip over itself."""

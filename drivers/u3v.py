@@ -1,7 +1,7 @@
 """USB3 Vision cameras: one that names exposure, gain and pixels as GenICam does, and its frames.
 
 A recorded frame (`RawFrame.original`) is the camera's leader, payload and trailer in a row, as they
-came; `decode_u3v` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
+came; `decode_frame` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
 Convention 2.7 (feature names, exposure in microseconds, gain in decibels).
 """
 
@@ -27,19 +27,19 @@ from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     CameraDescriptionError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
+    CaptureError,
     DriverError,
-    FrameLostError,
     RawFrameError,
-    U3vFormatError,
-    U3vRefusedError,
 )
 from drivers.genapi import Features
 from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
 from drivers.raw import RawFrame, hashed
 from drivers.u3v_control import U3vControl
 from drivers.u3v_stream import U3vStream
-from drivers.usb import BULK, UsbDevice, UsbListing, list_devices, open_device
+from drivers.usb import BULK, UsbDevice, open_device
 
 _log = logging.getLogger(__name__)
 
@@ -76,9 +76,9 @@ IN_FLIGHT = 3
 """Frames that a camera may have begun before a new setting counts."""
 
 
-def list_u3v(backend: Any = None) -> list[UsbListing]:
-    """Return the USB3 Vision cameras that are plugged in; raises `UsbUnavailableError`."""
-    return list_devices(codec.CONTROL, backend)
+def open_camera(address: str, clock: Clock, backend: Any = None) -> U3vCamera:
+    """Open the camera with a serial number, "" for the first; see `drivers.cameras`."""
+    return open_u3v(address, backend=backend, clock=clock)
 
 
 def open_u3v(
@@ -181,7 +181,7 @@ class U3vCamera:
         """Expose and return one frame; raises a `DriverError`.
 
         The exposure begins after the call. A frame that does not come whole raises
-        `FrameLostError`; the camera is ready for another.
+        `CaptureError`; the camera is ready for another.
         """
         with self._acquisition("SingleFrame"):
             return self._decode(self._receive())
@@ -220,7 +220,7 @@ class U3vCamera:
         """Yield frames as they come; closing the generator stops the acquisition.
 
         `metadata["frames_lost"]` counts the frames missing right before this one, by the camera's
-        numbers. Frames that come torn are passed over; three in a row raise `FrameLostError`.
+        numbers. Frames that come torn are passed over; three in a row raise `CaptureError`.
         Exposure and gain are None for frames that may have begun before a change of them.
         """
         self._in_flight = 0
@@ -284,7 +284,7 @@ class U3vCamera:
         try:
             if "AcquisitionStop" in self.features:
                 self.features.execute("AcquisitionStop")
-        except (U3vRefusedError, CameraSettingError) as error:
+        except (CameraRefusedError, CameraSettingError) as error:
             _log.debug("%s: no acquisition to stop (%s)", self._device.name, error)
         finally:
             self._stream.stop()
@@ -297,7 +297,7 @@ class U3vCamera:
         for attempt in range(1, LOST_IN_A_ROW + 1):
             try:
                 return self._receive()
-            except FrameLostError as error:
+            except CaptureError as error:
                 if attempt == LOST_IN_A_ROW:
                     raise
                 _log.warning("%s: %s", self._device.name, error)
@@ -306,9 +306,9 @@ class U3vCamera:
     def _decode(self, original: bytes) -> RawFrame:
         host_time_s = self._clock.now_s()
         try:
-            frame = decode_u3v(original, self.black_level_dn, self.white_level_dn)
-        except (U3vFormatError, RawFrameError) as error:
-            raise FrameLostError(error.reason) from error
+            frame = decode_frame(original, self.black_level_dn, self.white_level_dn)
+        except (CameraFormatError, RawFrameError) as error:
+            raise CaptureError(error.reason) from error
         if (frame.mosaic.shape, frame.cfa) != (self.shape, self.cfa):
             rows, columns = frame.mosaic.shape
             raise RawFrameError(
@@ -348,7 +348,7 @@ class U3vCamera:
             if isinstance(value, str) and value not in features.choices(name):
                 return False
             features.set(name, value)
-        except (CameraDescriptionError, CameraSettingError, U3vRefusedError) as error:
+        except (CameraDescriptionError, CameraSettingError, CameraRefusedError) as error:
             _log.debug("%s: %s stays as it is (%s)", self._device.name, name, error)
             return False
         return True
@@ -398,12 +398,12 @@ class U3vCamera:
         return min(max(shown, 0.0), float(self.white_level_dn))
 
 
-def decode_u3v(
+def decode_frame(
     original: bytes, black_level_dn: float = 0.0, white_level_dn: int | None = None
 ) -> RawFrame:
     """Return the frame in a leader, payload and trailer, as `RawFrame.original` holds them.
 
-    What the bytes do not say is None, or as given here. Raises `U3vFormatError` for bytes that
+    What the bytes do not say is None, or as given here. Raises `CameraFormatError` for bytes that
     are no frame, `RawFrameError` for one that cannot be unpacked.
     """
     leader, payload, trailer = codec.split_frame(original)

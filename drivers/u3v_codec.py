@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from drivers.errors import U3vFormatError
+from drivers.errors import CameraFormatError
 
 CONTROL = (0xEF, 0x05, 0x00)
 """Class, subclass and protocol of the interface that takes commands."""
@@ -160,41 +160,41 @@ def encode_write(request_id: int, address: int, data: bytes) -> bytes:
 
 
 def decode_acknowledge(raw: bytes) -> Acknowledge:
-    """Return the acknowledge in one message; raises `U3vFormatError`."""
+    """Return the acknowledge in one message; raises `CameraFormatError`."""
     if len(raw) < HEADER_SIZE:
-        raise U3vFormatError(raw, f"{len(raw)} bytes are no acknowledge")
+        raise CameraFormatError(raw, f"{len(raw)} bytes are no acknowledge")
     prefix, status, command, length, request_id = _HEADER.unpack_from(raw)
     if prefix != COMMAND_PREFIX:
-        raise U3vFormatError(raw, "it has not the prefix of an acknowledge")
+        raise CameraFormatError(raw, "it has not the prefix of an acknowledge")
     if command not in ACKNOWLEDGES:
-        raise U3vFormatError(raw, f"{command:#06x} is no acknowledge")
+        raise CameraFormatError(raw, f"{command:#06x} is no acknowledge")
     data = raw[HEADER_SIZE:]
     if length != len(data):
-        raise U3vFormatError(raw, f"it announces {length} bytes of data and has {len(data)}")
+        raise CameraFormatError(raw, f"it announces {length} bytes of data and has {len(data)}")
     if command == PENDING_ACK and length != _PAIR.size:
-        raise U3vFormatError(raw, f"a pending acknowledge with {length} bytes of data")
+        raise CameraFormatError(raw, f"a pending acknowledge with {length} bytes of data")
     return Acknowledge(status, command, request_id, data)
 
 
 def decode_leader(raw: bytes | memoryview) -> Leader:
-    """Return the leader of an image at the beginning of `raw`; raises `U3vFormatError`."""
+    """Return the leader of an image at the beginning of `raw`; raises `CameraFormatError`."""
     if not begins_with(raw, LEADER_PREFIX) or len(raw) < _LEADER.size:
-        raise U3vFormatError(bytes(raw[:64]), "it is no leader of an image")
+        raise CameraFormatError(bytes(raw[:64]), "it is no leader of an image")
     _, _, size, block_id, _, payload_type, timestamp_ns, *image, _ = _LEADER.unpack_from(raw)
     if payload_type not in (IMAGE, IMAGE_WITH_CHUNKS):
-        raise U3vFormatError(bytes(raw[:64]), f"payload type {payload_type:#06x} is no image")
+        raise CameraFormatError(bytes(raw[:64]), f"payload type {payload_type:#06x} is no image")
     if not _LEADER.size <= size <= len(raw):
-        raise U3vFormatError(bytes(raw[:64]), f"a leader of {size} bytes")
+        raise CameraFormatError(bytes(raw[:64]), f"a leader of {size} bytes")
     return Leader(block_id, payload_type, timestamp_ns, *image)
 
 
 def decode_trailer(raw: bytes | memoryview) -> Trailer:
-    """Return the trailer that `raw` is; raises `U3vFormatError`."""
+    """Return the trailer that `raw` is; raises `CameraFormatError`."""
     if not begins_with(raw, TRAILER_PREFIX) or len(raw) < _TRAILER.size:
-        raise U3vFormatError(bytes(raw[:64]), "it is no trailer")
+        raise CameraFormatError(bytes(raw[:64]), "it is no trailer")
     _, _, size, block_id, status, _, valid_bytes = _TRAILER.unpack_from(raw)
     if not _TRAILER.size <= size <= len(raw):
-        raise U3vFormatError(bytes(raw[:64]), f"a trailer of {size} bytes")
+        raise CameraFormatError(bytes(raw[:64]), f"a trailer of {size} bytes")
     has_lines = size >= _TRAILER.size + _U32.size
     lines = _U32.unpack_from(raw, _TRAILER.size)[0] if has_lines else None
     return Trailer(block_id, status, valid_bytes, lines)
@@ -203,7 +203,7 @@ def decode_trailer(raw: bytes | memoryview) -> Trailer:
 def split_frame(original: bytes) -> tuple[Leader, memoryview, Trailer]:
     """Return leader, payload and trailer of a recorded frame, which is these three in a row.
 
-    Raises `U3vFormatError` for bytes that are no such frame, or a torn one.
+    Raises `CameraFormatError` for bytes that are no such frame, or a torn one.
     """
     leader = decode_leader(original)
     begin = packet_size(original)
@@ -214,13 +214,13 @@ def split_frame(original: bytes) -> tuple[Leader, memoryview, Trailer]:
             trailer = decode_trailer(raw)
             if packet_size(raw) == size and trailer.block_id == leader.block_id:
                 return leader, memoryview(original)[begin:end], trailer
-    raise U3vFormatError(original[-64:], "the frame does not end with its trailer")
+    raise CameraFormatError(original[-64:], "the frame does not end with its trailer")
 
 
 def decode_manifest_entry(raw: bytes) -> ManifestEntry:
-    """Return one entry of the manifest table; raises `U3vFormatError`."""
+    """Return one entry of the manifest table; raises `CameraFormatError`."""
     if len(raw) < _MANIFEST_ENTRY.size:
-        raise U3vFormatError(raw, f"{len(raw)} bytes are no entry of a manifest table")
+        raise CameraFormatError(raw, f"{len(raw)} bytes are no entry of a manifest table")
     subminor, minor, major, info, address, size, sha1 = _MANIFEST_ENTRY.unpack_from(raw)
     return ManifestEntry(
         (major, minor, subminor), info & 0x7, info >> 10 & 0x3F, address, size, sha1

@@ -15,9 +15,9 @@ from itertools import cycle
 from drivers import u3v_codec as codec
 from drivers.clock import Clock
 from drivers.errors import (
-    U3vBusyError,
-    U3vFormatError,
-    U3vRefusedError,
+    CameraBusyError,
+    CameraFormatError,
+    CameraRefusedError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -37,7 +37,7 @@ DATA_SIZES = (8, 1 << 15)
 """Bounds on the data of one command, whatever lengths the camera states."""
 
 
-_MENDABLE = (UsbTimeoutError, UsbStalledError, U3vFormatError)
+_MENDABLE = (UsbTimeoutError, UsbStalledError, CameraFormatError)
 
 
 class U3vControl:
@@ -94,7 +94,7 @@ class U3vControl:
                     length,
                 )
                 if len(data) != length:
-                    raise U3vFormatError(data, f"{len(data)} bytes instead of {length}")
+                    raise CameraFormatError(data, f"{len(data)} bytes instead of {length}")
                 return data
             except _MENDABLE as error:
                 _log.warning("%s: attempt %d %s failed: %s", self.name, attempt, what, error)
@@ -114,7 +114,7 @@ class U3vControl:
             )
             # Old cameras leave the count out.
             if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(data)):
-                raise U3vFormatError(answer, f"not all {len(data)} bytes were written")
+                raise CameraFormatError(answer, f"not all {len(data)} bytes were written")
         except _MENDABLE as error:
             self._recover(error)
             raise
@@ -135,9 +135,9 @@ class U3vControl:
             raw, message = self._await(what, request_id, data_size)
         if message.status:
             meaning, advice = codec.STATUS.get(message.status, codec.UNKNOWN_STATUS)
-            raise U3vRefusedError(what, message.status, meaning, advice)
+            raise CameraRefusedError(what, f"{meaning} ({message.status:#06x})", advice)
         if message.command != expected:
-            raise U3vFormatError(raw, f"{message.command:#06x} answers something else")
+            raise CameraFormatError(raw, f"{message.command:#06x} answers something else")
         return message.data
 
     def _await(self, what: str, request_id: int, data_size: int) -> tuple[bytes, codec.Acknowledge]:
@@ -159,11 +159,11 @@ class U3vControl:
             pending += 1
             now_s = self._clock.now_s()
             if now_s - started_s >= BUSY_LIMIT_S:
-                raise U3vBusyError(what, now_s - started_s)
+                raise CameraBusyError(what, now_s - started_s)
             deadline_s = now_s + self._timeout_s + min(message.pending_s, BUSY_LIMIT_S)
         if pending:
-            raise U3vBusyError(what, self._clock.now_s() - started_s)
-        raise U3vFormatError(b"", f"no answer to request {request_id} among {foreign} messages")
+            raise CameraBusyError(what, self._clock.now_s() - started_s)
+        raise CameraFormatError(b"", f"no answer to request {request_id} among {foreign} messages")
 
 
 def _bounded(value: float, low: float, high: float) -> float:

@@ -15,9 +15,9 @@ from drivers import u3v_codec as codec
 from drivers.clock import Clock
 from drivers.errors import (
     CameraDescriptionError,
+    CameraFormatError,
+    CaptureError,
     ExposureStoppedError,
-    FrameLostError,
-    U3vFormatError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -139,7 +139,7 @@ class U3vStream:
     def receive(self, wait_s: float) -> bytes:
         """Return the next frame's leader, payload and trailer in one, waiting `wait_s` at most.
 
-        Raises `FrameLostError` for a frame that does not come whole, after which the next may be
+        Raises `CaptureError` for a frame that does not come whole, after which the next may be
         received; `ExposureStoppedError` soon after `stop_wanted` is set.
         """
         self.stop_wanted.clear()
@@ -170,7 +170,7 @@ class U3vStream:
                 return leader
             passed += max(len(raw), self._pipe.packet_size)
             room = self._sizes.transfer
-        raise FrameLostError(f"no frame begins within {passed} bytes", "open the camera again")
+        raise CaptureError(f"no frame begins within {passed} bytes", "open the camera again")
 
     def _payload(self, begin: int, deadline_s: float) -> int:
         """Fill in the payload from `begin` on; return where it ends."""
@@ -182,15 +182,13 @@ class U3vStream:
             )
             if _is_packet(raw):
                 self._next_leader = _leader_at_end(raw)
-                raise FrameLostError(
-                    f"{done} of {sizes.payload} bytes came", advice=LOST_DATA_ADVICE
-                )
+                raise CaptureError(f"{done} of {sizes.payload} bytes came", advice=LOST_DATA_ADVICE)
             self._frame[begin + done : begin + done + len(raw)] = raw
             done += len(raw)
             if not raw or len(raw) % self._pipe.packet_size:
                 break
         if done > sizes.payload:
-            raise FrameLostError(f"{done} bytes came instead of {sizes.payload}", "open it again")
+            raise CaptureError(f"{done} bytes came instead of {sizes.payload}", "open it again")
         return begin + done
 
     def _trailer(self, deadline_s: float) -> bytes:
@@ -200,31 +198,27 @@ class U3vStream:
                 continue
             if codec.begins_with(raw, codec.LEADER_PREFIX):
                 self._next_leader = _leader_at_end(raw)
-                raise FrameLostError("its end did not come before the next", LOST_DATA_ADVICE)
+                raise CaptureError("its end did not come before the next", LOST_DATA_ADVICE)
             try:
                 codec.decode_trailer(raw)
-            except U3vFormatError as error:
-                raise FrameLostError(f"its end is garbled ({error.reason})") from error
+            except CameraFormatError as error:
+                raise CaptureError(f"its end is garbled ({error.reason})") from error
             return raw.tobytes()
-        raise FrameLostError("empty packets came instead of its end")
+        raise CaptureError("empty packets came instead of its end")
 
     def _check(self, leader: codec.Leader, trailer: codec.Trailer, received: int) -> None:
         if trailer.block_id != leader.block_id:
-            raise FrameLostError(
+            raise CaptureError(
                 f"it begins as frame {leader.block_id} and ends as {trailer.block_id}",
                 LOST_DATA_ADVICE,
             )
         if trailer.status:
             meaning, advice = codec.STATUS.get(trailer.status, codec.UNKNOWN_STATUS)
-            raise FrameLostError(f"the camera says {meaning} ({trailer.status:#06x})", advice)
+            raise CaptureError(f"the camera says {meaning} ({trailer.status:#06x})", advice)
         if trailer.valid_bytes > received:
-            raise FrameLostError(
-                f"{received} of {trailer.valid_bytes} bytes came", LOST_DATA_ADVICE
-            )
+            raise CaptureError(f"{received} of {trailer.valid_bytes} bytes came", LOST_DATA_ADVICE)
         if trailer.lines is not None and trailer.lines < leader.height:
-            raise FrameLostError(
-                f"it has {trailer.lines} of {leader.height} lines", LOST_DATA_ADVICE
-            )
+            raise CaptureError(f"it has {trailer.lines} of {leader.height} lines", LOST_DATA_ADVICE)
 
     def _transfer(self, size: int, deadline_s: float, complaint: str) -> memoryview:
         """Return what one transfer of at most `size` bytes, rounded up, brings."""
@@ -232,7 +226,7 @@ class U3vStream:
         while True:
             left_s = deadline_s - self._clock.now_s()
             if left_s <= 0:
-                raise FrameLostError(f"{complaint} in time", "check the trigger and the cable")
+                raise CaptureError(f"{complaint} in time", "check the trigger and the cable")
             try:
                 count = self._pipe.read_into(buffer, min(left_s, SLICE_S))
             except UsbTimeoutError:
@@ -241,7 +235,7 @@ class U3vStream:
                 continue
             except UsbStalledError as error:
                 self._pipe.clear_halt()
-                raise FrameLostError("the camera halted its stream") from error
+                raise CaptureError("the camera halted its stream") from error
             return memoryview(buffer)[:count]
 
     def _buffer(self, size: int) -> array.array[int]:
@@ -264,7 +258,7 @@ def _leader_at_end(raw: memoryview) -> bytes | None:
     """Return the leader that a transfer is, or that ends it after the rest of a frame."""
     for at in (0, len(raw) - codec.LEADER_SIZE):
         if at >= 0 and codec.begins_with(raw[at:], codec.LEADER_PREFIX):
-            with suppress(U3vFormatError):
+            with suppress(CameraFormatError):
                 codec.decode_leader(raw[at:])
                 return raw[at:].tobytes()
     return None

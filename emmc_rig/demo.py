@@ -29,7 +29,6 @@ from emmc_rig.model.lightfield import (
     save_hdf5,
     ssim,
 )
-from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.processing.simulated import place_rig, simulated_session
@@ -219,7 +218,6 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 readings,
                 calibration,
                 boards.pinholes,
-                focus,
                 maps,
             ),
         )
@@ -265,7 +263,6 @@ def _report(
     readings: Array,
     calibration: Calibration,
     pinholes: Mapping[tuple[int, int, int, str], MeanFrame],
-    focus: tuple[float, float, float],
     maps: Mapping[str, NDArray],
 ) -> ReportContent:
     camera = settings.camera
@@ -292,14 +289,12 @@ def _report(
         truth=truth,
         frames=readings,
         cfa=camera.sensor.cfa_name,
-        cfa_tile=cfa_tile(camera.sensor.cfa),
         whiteboards=[(label, board / peak) for label, board in boards],
         psi=weights,
         psi_std=deviation,
         metrics=metrics,
         stage_s=metrics["seconds"],
         objective=[value for _, value in result.objective],
-        disparity_range_px=(focus[0], focus[2]),
         warnings=metrics["warnings"],
         command=metrics["command"],
         maps=maps,

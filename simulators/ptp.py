@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.clock import Clock
 from drivers.dng import encode_dng
-from drivers.errors import PtpFormatError
+from drivers.errors import CameraFormatError
 from drivers.ptp_codec import (
     EVERYTHING,
     HEADER,
@@ -336,7 +336,7 @@ class PtpCameraSimulator:
             return Answer(Code.ACCESS_DENIED)
         try:
             value = decode_value(described.data_type, data)
-        except PtpFormatError:
+        except CameraFormatError:
             return Answer(Code.INVALID_PROPERTY_FORMAT)
         assert isinstance(value, int)
         span = described.span
@@ -489,7 +489,7 @@ class PtpUsbFunction(UsbFunction):
         while len(self._received) >= HEADER_SIZE:
             try:
                 header = decode_header(bytes(self._received[:HEADER_SIZE]))
-            except PtpFormatError:
+            except CameraFormatError:
                 self._clear()
                 raise StallError from None
             if len(self._received) < header.length:

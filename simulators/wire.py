@@ -6,19 +6,18 @@ import socket
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 from drivers.clock import Clock
 from drivers.errors import (
-    GarbledReplyError,
     PortGoneError,
     PortNotFoundError,
     TransportTimeoutError,
 )
-from drivers.transport import IN_USE, QUIET_LIMIT
+from drivers.transport import IN_USE, Transport
 
 READ_SIZE = 4096
 TICK_S = 0.002
@@ -48,80 +47,41 @@ class Firmware(Protocol):
 
     def next_due_s(self) -> float | None:
         """Return when something may next fall due, if anything will."""
-        ...
 
 
-class MemoryTransport:
-    """A `drivers.transport.Transport` that ends in firmware; waiting costs simulated time."""
-
-    port = "simulator"
+class MemoryTransport(Transport):
+    """A wire that ends in firmware; waiting costs simulated time."""
 
     def __init__(self, firmware: Firmware, clock: Clock, timeout_s: float = 0.5) -> None:
+        super().__init__("simulator", timeout_s)
         self._firmware = firmware
         self._clock = clock
-        self._timeout_s = timeout_s
-        self._lock = threading.RLock()
-        self._unread = bytearray()
         self._plugs = firmware.plugs
         self._closed = False
 
-    @property
-    def lock(self) -> AbstractContextManager[Any]:
-        """Held by a driver from the first byte of a command to the last of its answer."""
-        return self._lock
-
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError`."""
-        with self._lock:
+        with self.lock:
             self._require_open()
             self._unread += self._firmware.feed(data)
 
-    def read_until(self, terminator: bytes) -> bytes:
-        """Return bytes up to and including `terminator`; or raise `TransportTimeoutError`."""
-        with self._lock:
-            deadline_s = self._clock.now_s() + self._timeout_s
-            self._require_open()
-            while (end := self._unread.find(terminator)) < 0:
-                self._wait(deadline_s)
-            return self._take(end + len(terminator))
-
-    def read_exactly(self, count: int) -> bytes:
-        """Return the next `count` bytes; or raise `TransportTimeoutError`."""
-        with self._lock:
-            deadline_s = self._clock.now_s() + self._timeout_s
-            self._require_open()
-            while len(self._unread) < count:
-                self._wait(deadline_s)
-            return self._take(count)
-
     def waiting(self) -> int:
         """Return how many bytes can be read at once; raises `PortGoneError`."""
-        with self._lock:
+        with self.lock:
             self._require_open()
             self._unread += self._firmware.due()
             return len(self._unread)
 
     def discard_input(self) -> None:
         """Forget what has arrived and was not read; raises `PortGoneError`."""
-        with self._lock:
+        with self.lock:
             self._require_open()
             self._firmware.due()
             self._unread.clear()
 
-    def discard_until_quiet(self) -> None:
-        """Forget what arrives until nothing does; raises `PortGoneError`, `GarbledReplyError`."""
-        with self._lock:
-            for _ in range(QUIET_LIMIT):
-                self.discard_input()
-                try:
-                    last = self.read_exactly(1)
-                except TransportTimeoutError:
-                    return
-            raise GarbledReplyError(last, f"{self.port} never falls silent")
-
     def reopen(self) -> None:
         """Open the wire again; raises `PortNotFoundError` while it is pulled."""
-        with self._lock:
+        with self.lock:
             if self._firmware.unplugged:
                 raise PortNotFoundError(self.port)
             self._unread.clear()
@@ -132,8 +92,10 @@ class MemoryTransport:
         """Let go of the wire; closing twice is allowed."""
         self._closed = True
 
-    def _wait(self, deadline_s: float) -> None:
-        """Let time pass until something may have arrived; raises at the deadline."""
+    def _now_s(self) -> float:
+        return self._clock.now_s()
+
+    def _receive(self, deadline_s: float) -> None:
         arrived = self._firmware.due()
         self._unread += arrived
         self._require_open()
@@ -146,14 +108,9 @@ class MemoryTransport:
             arrived = self._firmware.due()
             self._unread += arrived
             if not arrived:
-                raise TransportTimeoutError(self.port, self._timeout_s, bytes(self._unread))
+                raise TransportTimeoutError(self.port, self.timeout_s, bytes(self._unread))
         else:
             self._clock.sleep(next_s - now_s)
-
-    def _take(self, count: int) -> bytes:
-        message = bytes(self._unread[:count])
-        del self._unread[:count]
-        return message
 
     def _require_open(self) -> None:
         if self._closed or self._firmware.unplugged or self._firmware.plugs != self._plugs:

@@ -1,20 +1,113 @@
-"""Stages for tests: each protocol's simulated firmware on each kind of wire, or a real one."""
+"""Stages for tests: each protocol's simulated firmware on each kind of wire."""
 
+import time
+from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
+
+import pytest
+from serial.urlhandler import protocol_socket
 
 from drivers import grbl_codec as codec
 from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.apt_codec import Id
 from drivers.grbl import GrblStage
+from drivers.stage import DEFAULT_SETTINGS, HostStage, StageSettings
+from drivers.transport import SerialTransport, Transport
 from drivers.zaber import ZaberStage
-from emmc_rig.conformance.rigs import StageRig
 from simulators.apt import AptController
+from simulators.clock import JumpingClock, ManualClock
+from simulators.firmware import Occasion, SimulatedController
 from simulators.grbl import GrblController
+from simulators.wire import PtyServer, TcpServer
 from simulators.zaber import AxisSpec, ZaberChain
+
+WIRES = ("memory", "pty", "tcp")
+MEMORY_TIMEOUT_S = 0.5
+WIRE_TIMEOUT_S = 0.05
+"""Replies over a pseudo-terminal or TCP really take time: far less than this."""
+WIRE_PACE = 5.0
+WIRE_POLL_S = 0.1
 
 Z825_MOTOR = ACTUATORS["z825"]
 QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
 """mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
+
+
+class StageRig(ABC):
+    """One stage: simulated firmware, the wire to it, and where its axes really are.
+
+    wire: one of `WIRES`. opened: closes what is opened.
+    `senses_stalls`: the controller reports them; `replies_are_numbered`: a late one is
+    recognised.
+    """
+
+    senses_stalls = True
+    replies_are_numbered = False
+
+    @abstractmethod
+    def make_device(self) -> SimulatedController:
+        """Return the firmware, on `self.clock`."""
+
+    @abstractmethod
+    def make_from(self, settings: StageSettings) -> HostStage:
+        """Return the driver over `self.transport`."""
+
+    @abstractmethod
+    def true_um(self, axis: str) -> float:
+        """Return where the axis really is, in the driver's coordinates."""
+
+    @abstractmethod
+    def is_move(self, occasion: Occasion) -> bool:
+        """Return whether the command under way starts a move."""
+
+    @abstractmethod
+    def is_question(self, occasion: Occasion) -> bool:
+        """Return whether the command under way asks for a position."""
+
+    def __init__(self, wire: str, opened: ExitStack, tmp_path: Path) -> None:
+        self.wire = wire
+        self.clock: Any = ManualClock() if wire == "memory" else JumpingClock(WIRE_PACE)
+        self.timeout_s = MEMORY_TIMEOUT_S if wire == "memory" else WIRE_TIMEOUT_S
+        self.timeout_on_clock_s = self.timeout_s * (1.0 if wire == "memory" else WIRE_PACE)
+        self.device: Any = self.make_device()
+        self.device.late_by_s = 1.5 * self.timeout_on_clock_s
+        self.server: PtyServer | TcpServer | None = None
+        self.link = tmp_path / "stage"
+        if wire == "pty":
+            self.server = opened.enter_context(PtyServer(self.device, self.link))
+        elif wire == "tcp":
+            self.server = opened.enter_context(TcpServer(self.device))
+        self.transport = self.make_transport()
+        opened.callback(self.transport.close)
+
+    def make_transport(self) -> Transport:
+        """Return the wire to the firmware."""
+        if self.server is None:
+            return self.device.transport(self.timeout_s)
+        port = f"{self.link}*" if self.wire == "pty" else self.server.port
+        return SerialTransport(port, timeout_s=self.timeout_s, flow_control=False)
+
+    def let_bytes_arrive(self) -> None:
+        """On a real wire bytes are under way for a while; jumps of the clock must not pass them."""
+        if self.server is not None:
+            time.sleep(0.03)
+
+    def replug(self, power_lost: bool = False) -> None:
+        """Plug the cable in again, and wait until the port is there."""
+        self.device.replug(power_lost)
+        deadline_s = time.monotonic() + 5.0
+        while self.server is not None and not self.server.is_open:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.001)
+
+    def make_stage(self, **settings: Any) -> HostStage:
+        """Open the stage with settings of `StageSettings`."""
+        poll_s = DEFAULT_SETTINGS.poll_s if self.server is None else WIRE_POLL_S
+        return self.make_from(replace(DEFAULT_SETTINGS, poll_s=poll_s, **settings))
 
 
 class ZaberRig(StageRig):
@@ -83,3 +176,19 @@ class AptRig(StageRig):
 
 
 RIGS = {"zaber": ZaberRig, "grbl": GrblRig, "apt": AptRig}
+SIMULATED = [f"{protocol}-{wire}" for protocol in RIGS for wire in WIRES]
+
+
+@pytest.fixture
+def opened():
+    """What the other fixtures open; closed after the test."""
+    with ExitStack() as stack:
+        yield stack
+
+
+def simulated_rig(name, opened, tmp_path, monkeypatch):
+    """Return the rig of one of the names in `SIMULATED`."""
+    protocol, wire = name.split("-")
+    # pyserial pauses 0.3 s in the closing of a socket, for the other side's sake
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda pause_s: None))
+    return RIGS[protocol](wire, opened, tmp_path)

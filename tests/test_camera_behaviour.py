@@ -10,6 +10,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simulated_eos import EosCameraSimulator
+from simulated_raw_camera import SimulatedRawCamera
 
 from drivers.camera import Camera, RawFileCamera
 from drivers.dng import encode_dng
@@ -19,10 +21,8 @@ from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.u3v import open_u3v
 from drivers.usb import open_device
 from emmc_rig.conformance.cameras import *  # noqa: F403
-from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.ptp_canon import EosCameraSimulator
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 

@@ -100,23 +100,6 @@ def test_what_was_saved_can_be_replayed_by_the_same_command(run, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "frames" / name).read_bytes()
 
 
-def test_live_prints_a_line_a_frame_and_saves_those_asked_for(run, tmp_path):
-    done = run(
-        *("live", "--camera", "simulated", "--frames", "5", "--save-every", "2", "--out", "kept")
-    )
-    assert done.exit_code == 0, done.output
-    assert len([line for line in done.output.splitlines() if "focus" in line]) == 5
-    assert [name for name in files(tmp_path) if name.endswith(".dng")] == [
-        "kept/frame-0001.dng",
-        "kept/frame-0002.dng",
-    ]
-
-
-def test_live_writes_nothing_unless_asked(run, tmp_path):
-    assert run("live", "--camera", "simulated", "--frames", "2").exit_code == 0
-    assert files(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [

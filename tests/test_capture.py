@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_rigs import begun, plan_and_camera, request_for, still_rig
+from simulated_disk import SimulatedDisk
 
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
@@ -40,7 +41,6 @@ from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 
 ROOT = Path("/disk")
 SIZE = (24, 32)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 from capture_rigs import begun, still_rig
+from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
 from drivers.errors import DriverError
@@ -17,7 +18,6 @@ from emmc_rig.acquisition.plan import Suspender, load_plan
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.suspend import suspended_by
 from emmc_rig.errors import AppError
-from simulators.disk import SimulatedDisk
 
 PLAN = {
     "camera": "rgbw-bayer-2shots",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_rigs import begun, plan_and_camera, request_for
+from simulated_disk import SimulatedDisk
 
 from drivers.errors import CameraSettingError
 from emmc_rig.acquisition.amend import amendment
@@ -22,7 +23,6 @@ from emmc_rig.session.decisions import metered
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 
 SIZE = (24, 32)
 AUTO = """

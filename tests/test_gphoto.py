@@ -14,6 +14,8 @@ import pytest
 
 pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
 
+from simulated_eos import EosCameraSimulator
+
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
@@ -29,7 +31,6 @@ from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction
-from simulators.ptp_canon import EosCameraSimulator
 from simulators.usb import SimulatedUsb
 
 SERVER = """
@@ -37,8 +38,8 @@ import json, sys
 import numpy as np
 from drivers.clock import SystemClock
 from simulators.ptp import PtpCameraSimulator
-from simulators.ptp_canon import EosCameraSimulator
-from simulators.ptpip import PtpIpServer
+from simulated_eos import EosCameraSimulator
+from ptpip_server import PtpIpServer
 
 mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 given = json.loads(sys.argv[1])
@@ -74,6 +75,7 @@ def served(quality="raw", faults=(), eos="", hidden=None):
     reported = json.dumps({"quality": quality, "faults": faults, "eos": eos, "hidden": hidden})
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, reported],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

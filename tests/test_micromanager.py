@@ -1,4 +1,4 @@
-"""Micro-Manager both ways: its devices in our rig, and our rig's devices in its core.
+"""Micro-Manager's devices in our rig.
 
 Needs the extra `micromanager`, whose mm-test-adapters bring a core's demo devices and its
 SequenceTester, a camera whose pixels spell out where every device was during the exposure.
@@ -7,9 +7,8 @@ SequenceTester, a camera whose pixels spell out where every device was during th
 import re
 import subprocess
 import sys
-from contextlib import ExitStack, closing
+from contextlib import closing
 from itertools import islice
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +16,7 @@ import pytest
 pytest.importorskip("pymmcore_plus", reason="the extra `micromanager` is not installed")
 pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not installed")
 
-import useq
-from pymmcore_plus.experimental.unicore import UniMMCore
 from pymmcore_plus.seq_tester import decode_image
-from stage_rigs import ZaberRig
 
 from drivers.errors import (
     CameraClosedError,
@@ -39,14 +35,9 @@ from drivers.micromanager import (
     load_core,
 )
 from drivers.raw import decode_raw
-from drivers.unicore import load_rig
-from emmc_rig.bench.hardware import open_camera, open_stage, simulated_rig
+from emmc_rig.bench.hardware import open_camera, open_stage
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.errors import AppError
-from emmc_rig.model.camera import Camera
-from simulators.clock import ManualClock
-from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.usb import SimulatedUsb
 
 DEMO = "MMConfig_demo.cfg"
 TRAVEL_UM = (-1000.0, 1000.0)
@@ -61,9 +52,6 @@ Property,Camera,ImageWidth,128
 Property,Camera,ImageHeight,128
 Property,Core,Initialize,1
 Property,Core,Camera,Camera
-Property,Z,TriggerSequenceMaxLength,20
-Property,Z,TriggerSourceDevice,TCamera
-Property,Z,TriggerSourcePort,ExposureStartEdge
 """
 
 
@@ -255,26 +243,6 @@ def test_an_encoder_that_knows_its_place_is_confirmed_after_a_reconnect(sequence
     stage.move_to_um({"z": 41.0})
 
 
-def test_a_hardware_sequence_exposes_a_frame_at_every_place(sequence_tester):
-    camera, stage = sequence_tester
-    places_um = [20.0, 25.0, 30.0, 47.5]
-    seen = [places_in(frame) for frame in camera.triggered(stage, "z", places_um)]
-    assert [one["TZStage", "ZPositionUm"] for one in seen] == places_um
-    camera.snap()
-
-
-def test_a_hardware_sequence_is_refused_where_the_device_says_no(sequence_tester):
-    camera, stage = sequence_tester
-    with pytest.raises(CameraSettingError, match="takes 20 places along z"):
-        next(camera.triggered(stage, "z", list(range(20, 41))))
-    with pytest.raises(ValueError, match="ascend"):
-        next(camera.triggered(stage, "z", [20.0, 19.0]))
-    with pytest.raises(LimitExceededError):
-        next(camera.triggered(stage, "z", [90.0, 101.0]))
-    with closing(demo_stage()) as other:
-        assert other.sequence_length("mask_x") == 0
-
-
 def test_files_and_short_names_open_both_by_name(tmp_path):
     (tmp_path / "camera.yaml").write_text(f"{{kind: mm, address: {DEMO}, binning: 4}}")
     (tmp_path / "stage.yaml").write_text(
@@ -292,114 +260,3 @@ def test_files_and_short_names_open_both_by_name(tmp_path):
         open_camera(str(tmp_path / "wrong.yaml"))
     with pytest.raises(MicroManagerError, match="cannot be loaded"):
         open_camera("mm:no-such.cfg")
-
-
-@pytest.fixture
-def our_rig(tmp_path):
-    """A core whose camera and stages are ours: simulated PTP over USB, and Zaber on its wire."""
-    with ExitStack() as opened:
-        rig = ZaberRig("memory", opened, tmp_path)
-        stage: Any = rig.make_stage()
-        seen_um = []
-
-        def see(exposure_s):
-            seen_um.append((rig.true_um("mask_x"), rig.true_um("mask_y"), exposure_s))
-            return np.full((40, 48), len(seen_um), np.uint16)
-
-        clock = ManualClock()
-        bus = SimulatedUsb(clock, PtpUsbFunction(PtpCameraSimulator(see, clock, "grbg")))
-        camera = open_camera("ptp:", clock, bus)
-        core = UniMMCore()
-        opened.callback(core.unloadAllDevices)
-        opened.callback(camera.close)
-        load_rig(core, camera, stage, {"XY": ("mask_x", "mask_y"), "Z": ("mask_y",)})
-        yield core, seen_um
-
-
-def test_a_core_drives_our_stage_and_camera(our_rig):
-    core, seen_um = our_rig
-    with pytest.raises(NotHomedError):
-        core.setXYPosition(5000.0, 6000.0)
-    core.home("XY")
-    core.setXYPosition(5000.0, 6000.0)
-    assert core.getXYPosition() == pytest.approx((5000.0, 6000.0), abs=0.1)
-    core.setPosition("Z", 6500.0)
-    assert core.getPosition("Z") == pytest.approx(6500.0, abs=0.1)
-    with pytest.raises(LimitExceededError):
-        core.setXYPosition(1e9, 0.0)
-    with pytest.raises(NotImplementedError, match="home it"):
-        core.setOriginX("XY")
-    core.stop("XY")
-    core.setExposure(8.0)
-    core.setProperty("Camera", "Gain", 2)
-    core.snapImage()
-    image = core.getImage()
-    assert (image.shape, image.dtype) == ((40, 48), np.uint16)
-    assert seen_um[-1] == (pytest.approx(5000.0, abs=1.0), pytest.approx(6500.0, abs=1.0), 0.008)
-
-
-def test_a_useq_sequence_runs_against_our_rig(our_rig):
-    core, seen_um = our_rig
-    core.home("XY")
-    places = [(5000.0, 6000.0), (5100.0, 6000.0), (5100.0, 6200.0)]
-    plan = useq.MDASequence.model_validate(
-        {"stage_positions": places, "time_plan": {"interval": 0, "loops": 2}, "axis_order": "tp"}
-    )
-    taken = []
-    core.mda.events.frameReady.connect(
-        lambda image, event, metadata: taken.append((event.x_pos, event.y_pos, image[0, 0]))
-    )
-    core.setExposure(8.0)
-    core.mda.run(plan)
-    assert [(x, y) for x, y, _ in taken] == places * 2
-    exposed = [seen_um[number - 1] for _, _, number in taken]
-    np.testing.assert_allclose([one[:2] for one in exposed], places * 2, atol=1.0)
-
-
-def test_our_camera_through_a_core_and_back_gives_the_same_mosaic(our_rig):
-    core, _ = our_rig
-    core.snapImage()
-    direct = core.getImage()
-    assert (direct == direct[0, 0]).all()
-    core.startSequenceAcquisition(3, 0, True)
-    while core.isSequenceRunning():
-        pass
-    numbers = [int(core.popNextImage()[0, 0]) for _ in range(3)]
-    assert numbers == [int(direct[0, 0]) + n for n in (1, 2, 3)]
-
-
-def test_the_whole_simulated_rig_runs_a_sequence_of_mask_places():
-    design = Camera.model_validate(
-        {
-            "title": "test",
-            "views": (3, 3),
-            "sensor": {"cfa": "rggb"},
-            "masks": {
-                "m": {
-                    "distance_mm": 0.24,
-                    "cell_um": 24.0,
-                    "pattern": {"kind": "random_rgbw", "seed": 0},
-                }
-            },
-            "more_shots_step_um": {"m": (72, 48)},
-        }
-    )
-    scene = np.full((6, 6, 96, 128, 3), 0.5, np.float32)
-    rig, _ = simulated_rig(design, scene, (24, 32), seed=0, rays_per_view=16)
-    with closing(rig.camera), closing(rig.stage):
-        rig.attendant.set_lamp("white")
-        rig.attendant.place("scene")
-        rig.attendant.fit_masks(0)
-        rig.stage.home()
-        rig.stage.move_to_um({"aperture_x": rig.zero_um["aperture_x"] + rig.window_um})
-        core = UniMMCore()
-        load_rig(core, rig.camera, rig.stage, {"XY": ("mask_x", "mask_y")})
-        centre = (rig.zero_um["mask_x"], rig.zero_um["mask_y"])
-        frames = []
-        core.mda.events.frameReady.connect(lambda image, event, metadata: frames.append(image))
-        places = [centre, (centre[0] + 72, centre[1])]
-        core.mda.run(useq.MDASequence.model_validate({"stage_positions": places}))
-        core.unloadAllDevices()
-    assert len(frames) == 2
-    assert frames[0].shape == (24, 32)
-    assert np.abs(frames[0].astype(float) - frames[1]).mean() > 5

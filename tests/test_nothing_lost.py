@@ -51,9 +51,7 @@ WRITERS = {
     "demo": (*SIZE,),
     "design": (),
     "design --check": (),
-    "devices bench": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
-    "devices live": ("--rig", "simulated", "--frames", 1, "--save-every", 1),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
@@ -165,9 +163,9 @@ def place(world, situation, typed):
 
 ALLOWED = {
     # New files of names that are free, beside what is there.
-    "a foreign folder": {*ONE_FILE, "devices snap", "devices live"},
-    "its parent": {"devices snap", "devices live"},
-    "an edited result": {"devices snap", "devices live"},
+    "a foreign folder": {*ONE_FILE, "devices snap"},
+    "its parent": {"devices snap"},
+    "an edited result": {"devices snap"},
 }
 SITUATIONS = (
     "a session", "its parent", "inside it", "its frames", "a link to it", "beyond the link",
@@ -239,7 +237,7 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert not list(tmp_path.rglob(".*"))
 
 
-AT_ONCE = {"capture --new", "devices live", "devices scale", "devices serve"}
+AT_ONCE = {"capture --new", "devices scale", "devices serve"}
 """Done at once, shown by what they print; `devices scale` is given no stage here."""
 
 

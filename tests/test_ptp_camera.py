@@ -8,13 +8,13 @@ import pytest
 
 from drivers.errors import (
     CameraBusyError,
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
     CaptureError,
     CardFullError,
     DownloadError,
     ExposureStoppedError,
-    PtpFormatError,
-    PtpRefusedError,
     RawFrameError,
     UsbClaimedError,
     UsbGoneError,
@@ -251,7 +251,7 @@ def test_the_driver_makes_up_for(fault, times, partial):
         ("busy", math.inf, CameraBusyError, r"busy for 10\.\d s .*battery"),
         ("late", 1, CaptureError, "nothing new on the card"),
         ("silent", 1, UsbTimeoutError, "silent for 5 s"),
-        ("garbled_header", 1, PtpFormatError, "garbled"),
+        ("garbled_header", 1, CameraFormatError, "garbled"),
         ("card_full", 1, CardFullError, "full or missing"),
         ("lost_bytes", math.inf, DownloadError, "still on the card"),
         ("short_part", math.inf, DownloadError, "the camera sent nothing"),
@@ -373,13 +373,13 @@ def test_a_card_that_fills_up_is_an_error_and_emptying_it_helps():
 
 def test_a_picture_deleted_on_the_camera_is_refused_with_advice(bench):
     session = bench.open().session
-    with pytest.raises(PtpRefusedError, match="invalid handle: the picture is gone"):
+    with pytest.raises(CameraRefusedError, match="invalid handle: the picture is gone"):
         session.download(99, ObjectInfo(1, Format.DNG, 100, 0, "X.DNG"))
 
 
 def test_a_camera_that_cannot_be_released_says_so():
     bench = Bench(lacks=(Operation.INITIATE_CAPTURE,))
-    with pytest.raises(PtpRefusedError, match=r"initiate capture.*PC remote"):
+    with pytest.raises(CameraRefusedError, match=r"initiate capture.*PC remote"):
         bench.open()
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import ptp_codec as codec
-from drivers.errors import PtpFormatError
+from drivers.errors import CameraFormatError
 from drivers.ptp_codec import Kind, Message, Operation
 
 HEARD_HANDLES = bytes.fromhex("1c000000 0200 0710 02000000 03000000 03000000 02000000 01000000")
@@ -127,10 +127,10 @@ def test_any_message_comes_back(transaction, parameters):
 def test_a_dataset_that_ends_too_early_is_refused_or_lacks_only_texts(kept):
     numbers = 52
     if kept < numbers:
-        with pytest.raises(PtpFormatError, match="too early"):
+        with pytest.raises(CameraFormatError, match="too early"):
             codec.ObjectInfo.decode(HEARD_OBJECT[:kept])
         return
-    with suppress(PtpFormatError):
+    with suppress(CameraFormatError):
         assert codec.ObjectInfo.decode(HEARD_OBJECT[:kept]).size == 4400
 
 
@@ -146,7 +146,7 @@ def test_a_dataset_that_ends_too_early_is_refused_or_lacks_only_texts(kept):
     ],
 )
 def test_what_is_no_message_is_refused(damaged):
-    with pytest.raises(PtpFormatError):
+    with pytest.raises(CameraFormatError):
         codec.decode_message(damaged)
 
 

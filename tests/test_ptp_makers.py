@@ -6,12 +6,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simulated_eos import EosCameraSimulator
+from simulated_sony import SonyCameraSimulator
 
 from drivers.errors import (
+    CameraFormatError,
+    CameraRefusedError,
     CameraSettingError,
     CaptureError,
-    PtpFormatError,
-    PtpRefusedError,
 )
 from drivers.ptp import PtpCamera, PtpSession
 from drivers.ptp_canon import EosOperation, EosProperty, iso, records, shutter_s
@@ -21,8 +23,6 @@ from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.usb import open_device
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.ptp_canon import EosCameraSimulator
-from simulators.ptp_sony import SonyCameraSimulator
 from simulators.usb import SimulatedUsb
 
 MOSAIC = np.random.default_rng(5).integers(0, 4095, (40, 48), dtype=np.uint16)
@@ -186,7 +186,7 @@ def test_records_are_read_up_to_their_end_and_no_further():
     assert list(records(one + bytes((8, 0, 0, 0, 0, 0, 0, 0)) + b"rest")) == [(0xC189, one[8:])]
     assert list(records(b"")) == []
     for broken in (struct.pack("<II", 4, 1), struct.pack("<II", 99, 1)):
-        with pytest.raises(PtpFormatError):
+        with pytest.raises(CameraFormatError):
             list(records(broken))
 
 
@@ -202,7 +202,7 @@ def test_random_records_raise_nothing_but_the_drivers_own_errors():
             bench.body._records = [bytes(data)]
             try:
                 camera.session.body.event(0.0)
-            except PtpFormatError:
+            except CameraFormatError:
                 bench.body._records = []
 
 
@@ -243,7 +243,7 @@ def test_a_sony_whose_picture_never_comes_is_an_error_in_time(sony):
 
 def test_a_camera_without_any_release_that_is_known_is_refused():
     bench = Bench(partial(PtpCameraSimulator, lacks=(Operation.INITIATE_CAPTURE,)))
-    with pytest.raises(PtpRefusedError, match="tethering"), bench.open():
+    with pytest.raises(CameraRefusedError, match="tethering"), bench.open():
         pass
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ptpip_server import PtpIpServer
 
 from drivers.clock import SystemClock
 from drivers.dng import encode_dng
@@ -24,7 +25,6 @@ from drivers.raw import decode_raw
 from drivers.usb import INTERRUPT, open_device
 from simulators.clock import ManualClock
 from simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpCameraSimulator
-from simulators.ptpip import PtpIpServer
 from simulators.usb import (
     DeviceSpec,
     EndpointSpec,

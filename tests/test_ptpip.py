@@ -6,13 +6,13 @@ from contextlib import ExitStack
 from typing import ClassVar
 
 import numpy as np
+import ptpip_server as ptpip
 import pytest
+from ptpip_server import PtpIpServer
 
 from drivers.clock import SystemClock
 from drivers.ptp_codec import Code, EventCode, Operation
-from simulators import ptpip
 from simulators.ptp import PtpCameraSimulator
-from simulators.ptpip import PtpIpServer
 
 PATIENCE_S = 10.0
 MOSAIC = np.zeros((40, 48), np.uint16)

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from simulated_raw_camera import SimulatedRawCamera
 
 from drivers.camera import Camera, RawFileCamera
 from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
 from drivers.raw import decode_by_libraw, decode_raw
-from simulators.camera import SimulatedRawCamera
 from simulators.clock import ManualClock
 
 BAYER = ("rggb", "grbg", "gbrg", "bggr")

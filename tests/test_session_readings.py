@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun
+from simulated_disk import SimulatedDisk
 
 from drivers.errors import DriverError
 from emmc_rig.acquisition.plan import Plan, planned_camera
@@ -28,7 +29,6 @@ from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame, frame_file
 from emmc_rig.session.readings import session_readings, whiteboards
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 from simulators.effects import Flaws
 from simulators.flaws import SensorFlaws
 from simulators.u3v import U3vCameraSimulator

@@ -1,4 +1,4 @@
-"""What a session shows of itself: timeline, contact sheet, terminal, and what it costs."""
+"""What a session shows of itself: times, contact sheet, terminal, and what it costs."""
 
 import io
 import json
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from capture_rigs import begun, still_rig
 from rich.console import Console
+from simulated_disk import SimulatedDisk
 
 from drivers.dng import encode_dng
 from drivers.raw import decode_raw
@@ -19,10 +20,9 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet
-from emmc_rig.pages.timeline import overlap, run_entries, timeline_svg
+from emmc_rig.pages.timeline import overlap, run_entries
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SYSTEM_DISK
-from simulators.disk import SimulatedDisk
 from simulators.still import StillStage
 
 ROOT = Path("/disk")
@@ -52,13 +52,6 @@ def test_runs_are_kept_apart_and_other_lines_passed_over():
     assert [[e["id"] for e in run] for run in run_entries(entries)] == [["a"], ["b"]]
 
 
-def test_the_timeline_draws_every_span_in_its_lane():
-    svg = timeline_svg([entry("a<b", move=(0, 1), expose=(1, 2), write=(2, 3))])
-    assert svg.count("<title>") == 3
-    assert "a&lt;b: move, 1000.0 ms" in svg
-    assert timeline_svg([]) == ""
-
-
 @pytest.fixture
 def captured(tmp_path):
     rig = still_rig()
@@ -84,10 +77,10 @@ def test_a_contact_sheet_of_few_pictures_says_so(captured):
     assert "of 4 are shown" in page
 
 
-def test_the_timeline_comes_first_and_most_pictures_of_a_kind_are_folded(captured, monkeypatch):
+def test_events_come_first_and_most_pictures_of_a_kind_are_folded(captured, monkeypatch):
     monkeypatch.setattr("emmc_rig.pages.session_sheet.FIRST_PICTURES", 1)
     page = sheet(captured)
-    assert page.index('id="timeline"') < page.index('id="events"') < page.index("<img ")
+    assert page.index('id="events"') < page.index("<img ")
     folded = [int(count) for count in re.findall(r"<summary>(\d+) more</summary>", page)]
     kinds = Counter(frame.kind for frame in captured.needed)
     assert sorted(folded) == sorted(count - 1 for count in kinds.values() if count > 1)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_rigs import PLAN_YAML, SIZE, begun, frame_bytes, plan_and_camera, still_rig
+from simulated_disk import PowerCutError, SimulatedDisk
 
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.amend import amendment
@@ -28,7 +29,6 @@ from emmc_rig.session.readings import decoded
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
-from simulators.disk import PowerCutError, SimulatedDisk
 from simulators.still import PreparedCamera
 
 ROOT = Path("/disk")

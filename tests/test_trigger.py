@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun, plan_and_camera
+from simulated_disk import SimulatedDisk
 
 from drivers.errors import (
     CameraSettingError,
+    CaptureError,
     CommandRefusedError,
-    FrameLostError,
     LimitExceededError,
     StalledError,
 )
@@ -26,7 +27,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.session.frame_file import decode_frame
 from simulators.clock import ManualClock
-from simulators.disk import SimulatedDisk
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
 from simulators.zaber import AxisSpec, ZaberChain
@@ -107,7 +107,7 @@ def test_a_move_that_fails_raises_no_line_and_exposes_nothing(rig):
         with pytest.raises(StalledError), camera.armed():
             rig.stage.move_and_signal_um("x", 9_000.0)
         assert rig.seen_um == []
-        with pytest.raises(FrameLostError), camera.armed() as receive:
+        with pytest.raises(CaptureError), camera.armed() as receive:
             receive(1.0)
         assert camera.snap().mosaic.shape  # untriggered again
 

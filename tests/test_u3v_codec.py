@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import DriverError, U3vFormatError
+from drivers.errors import CameraFormatError, DriverError
 from drivers.u3v_codec import (
     IMAGE,
     READMEM_ACK,
@@ -99,7 +99,7 @@ def test_a_command_that_the_format_cannot_carry_is_refused(request_id, address, 
     ],
 )
 def test_a_garbled_acknowledge_is_reported(wire, complaint):
-    with pytest.raises(U3vFormatError, match=complaint):
+    with pytest.raises(CameraFormatError, match=complaint):
         decode_acknowledge(wire)
 
 
@@ -123,7 +123,7 @@ def test_a_trailer_is_read_with_and_without_lines():
     ],
 )
 def test_what_is_no_leader_is_reported(wire, complaint):
-    with pytest.raises(U3vFormatError, match=complaint):
+    with pytest.raises(CameraFormatError, match=complaint):
         decode_leader(wire)
 
 
@@ -136,13 +136,13 @@ def test_a_recorded_frame_comes_apart_again():
 
 @pytest.mark.parametrize("cut", [1, 31, 33, 200])
 def test_a_torn_recorded_frame_is_reported(cut):
-    with pytest.raises(U3vFormatError):
+    with pytest.raises(CameraFormatError):
         split_frame((LEADER + bytes(500) + TRAILER)[:-cut])
 
 
 def test_the_end_of_another_frame_is_not_taken_for_the_own():
     other = TRAILER[:8] + b"\x0a" + TRAILER[9:]
-    with pytest.raises(U3vFormatError, match="does not end with its trailer"):
+    with pytest.raises(CameraFormatError, match="does not end with its trailer"):
         split_frame(LEADER + bytes(100) + other)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.pixel_formats import CODES
+from drivers.pixel_formats import FORMATS
 
 pytestmark = pytest.mark.peers
 
@@ -98,11 +98,7 @@ def test_our_pixel_format_codes_are_those_of_aravis(peer):
         name.removeprefix("PIXEL_FORMAT_").replace("_", "").lower(): code
         for name, code in peer("fake")["formats"].items()
     }
-    ours = {
-        (colours + depth).lower(): code
-        for colours, codes in CODES.items()
-        for depth, code in codes.items()
-    }
+    ours = {form.name.lower(): form.code for form in FORMATS}
     shared = ours.keys() & theirs.keys()
     assert len(shared) >= 35
     assert {name: ours[name] for name in shared} == {name: theirs[name] for name in shared}

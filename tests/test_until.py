@@ -12,6 +12,7 @@ import pytest
 import yaml
 from capture_rigs import begun, still_rig
 from programs import program
+from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.assessment import assessed, stated_psnr_db
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -25,7 +26,6 @@ from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify
 from reconstruction.result import Reconstruction, Status
-from simulators.disk import SimulatedDisk
 
 SIZE = (32, 40)
 RIG = ("--rig", "simulated", "--scene", "deep-occlusions", "--size", "32x40", "--rays", "64")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, get_type_hints
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import shown_path
@@ -24,24 +24,19 @@ class CameraChoice:
     source: str = ""
 
 
-class MicroManagerCameraConfig(Settings):
-    """A camera of a Micro-Manager configuration; see `drivers.micromanager.CameraSetup`."""
-
-    label: str = ""
-    cfa: Annotated[str, Field(pattern="^(mono|rggb|grbg|gbrg|bggr)$")] = "mono"
-    black_level_dn: Annotated[int, Field(ge=0)] = 0
-    bit_depth: Annotated[int, Field(gt=0, le=16)] | None = None
-    binning: Annotated[int, Field(gt=0)] | None = None
-    roi: tuple[int, int, int, int] | None = None
-    properties: dict[str, str | int | float] = Field(default_factory=dict)
-
-
-class GphotoCameraConfig(Settings):
-    """A camera of libgphoto2; see `drivers.gphoto.GphotoCamera`."""
-
-    model: str = ""
-    settings: dict[str, str | int | float] = Field(default_factory=dict)
-    delete: bool = False
+def settings_of(kind: type[Any]) -> type[Settings]:
+    """Return the model that reads a driver's dataclass of options, and refuses unknown keys."""
+    hints = get_type_hints(kind, include_extras=True)
+    found: dict[str, Any] = {
+        one.name: (
+            hints[one.name],
+            one.default
+            if one.default_factory is MISSING
+            else Field(default_factory=one.default_factory),
+        )
+        for one in fields(kind)
+    }
+    return create_model(kind.__name__, __base__=Settings, **found)
 
 
 def parse_camera(spec: str) -> CameraChoice:

@@ -20,27 +20,20 @@ from numpy.typing import NDArray
 from drivers.apt import ACTUATORS, Actuator, AptAxis, AptStage
 from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
+from drivers.cameras import CAMERA_HELP, CAMERAS
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import DriverError, TransportTimeoutError
-from drivers.folder import FolderCamera
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
 from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.ports import find_port, list_serial_ports
-from drivers.ptp import PtpCamera, PtpSession
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
 from drivers.transport import SerialTransport, Transport
 from drivers.u3v import open_u3v
-from drivers.usb import open_device
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
-from emmc_rig.bench.camera_config import (
-    CameraChoice,
-    GphotoCameraConfig,
-    MicroManagerCameraConfig,
-    parse_camera,
-)
+from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
 from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.bench.stage_config import (
     AptAxisConfig,
@@ -261,7 +254,7 @@ def simulated_rig(
         if trigger is not None:
             return open_u3v(backend=bus, clock=clock)
         # The card lies in this computer's memory, hence from_card.
-        return _ptp_camera(clock, bus, shape=shape, cfa=cfa, from_card=True)
+        return open_ptp("", clock, bus, shape, cfa, from_card=True)
 
     def announced(name: str) -> None:
         digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
@@ -496,76 +489,41 @@ def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]
 def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
     """Open the camera that `spec` names: a kind, a colon and its address.
 
-    `ptp:` or `ptp:SERIAL`, `u3v:` or `u3v:SERIAL`, `mm:CONFIG.cfg`, `folder:DIR`, `simulated`,
-    that of a plug-in, or a YAML file (`emmc_rig.bench.camera_config`). `backend`: of pyusb, for a
-    simulated bus.
+    One of `drivers.cameras`, `simulated`, that of a plug-in, or a YAML file
+    (`emmc_rig.bench.camera_config`). `backend`: of pyusb, for a simulated bus.
     Raises AppError for any other kind, or an error of the driver.
     """
     choice = parse_camera(spec)
+    if choice.kind == SIMULATED:
+        return open_ptp("", clock, simulated_bus(clock), from_card=True)
     if choice.kind in CAMERAS:
-        return CAMERAS[choice.kind](choice, clock, backend)
-    others = camera_kinds() - CAMERAS.keys()
+        driver = CAMERAS[choice.kind].load()
+        return driver.open_camera(choice.address, clock, backend, *_options(choice, driver))
+    others = plug_ins(plugins.CAMERAS)
     if choice.kind not in others:
-        kinds = ", ".join((CAMERA_KINDS, *(f"{name}:" for name in sorted(others))))
+        kinds = ", ".join((CAMERA_HELP, SIMULATED, *(f"{name}:" for name in sorted(others))))
         raise AppError(f"{choice.source}: no such kind of camera; use {kinds}")
     return open_plug_in(plugins.CAMERAS, choice.kind, choice.address, clock, **choice.options)
 
 
 def camera_kinds() -> set[str]:
     """Return every kind of camera that `--camera` takes; a plug-in replaces none of ours."""
-    return {*CAMERAS, *plug_ins(plugins.CAMERAS)}
+    return {*CAMERAS, SIMULATED, *plug_ins(plugins.CAMERAS)}
 
 
-def _ptp_camera(
-    clock: Clock,
-    backend: Any,
-    serial: str = "",
-    shape: tuple[int, int] | None = None,
-    cfa: str | None = None,
-    from_card: bool = False,
-) -> PtpCamera:
-    device = open_device(PTP_INTERFACE, serial=serial, backend=backend, wanted="PTP camera")
-    return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
+def _options(choice: CameraChoice, driver: Any) -> tuple[Any, ...]:
+    """Return the settings of a camera's YAML file as its driver takes them, () where it has none.
 
-
-def _no_options(choice: CameraChoice) -> str:
-    """Return the address of a camera that takes no further settings; AppError where some are."""
+    Raises AppError for settings that the driver does not know.
+    """
+    kind = getattr(driver, "OPTIONS", None)
+    if kind is not None:
+        given = validated(settings_of(kind), choice.options, choice.source, AppError)
+        return (kind(**{name: getattr(given, name) for name in type(given).model_fields}),)
     if choice.options:
         extra = ", ".join(choice.options)
         raise AppError(f"{choice.source}: {choice.kind} takes only an address, not {extra}")
-    return choice.address
-
-
-def _open_ptp(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    return _ptp_camera(clock, backend, _no_options(choice))
-
-
-def _open_u3v(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    return open_u3v(_no_options(choice), backend=backend, clock=clock)
-
-
-def _open_folder(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    return FolderCamera(_no_options(choice) or ".", clock)
-
-
-def _open_simulated(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    """Return a PTP camera on a simulated bus, which looks at a built-in scene."""
-    return _ptp_camera(clock, simulated_bus(clock), from_card=True)
-
-
-def _open_micromanager(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    from drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
-
-    config = validated(MicroManagerCameraConfig, choice.options, choice.source, AppError)
-    setup = CameraSetup(**config.model_dump())
-    return MicroManagerCamera(load_core(choice.address), setup, clock)
-
-
-def _open_gphoto(choice: CameraChoice, clock: Clock, backend: Any) -> CameraDevice:
-    from drivers.gphoto import GphotoCamera
-
-    config = validated(GphotoCameraConfig, choice.options, choice.source, AppError)
-    return GphotoCamera(choice.address, clock=clock, **config.model_dump())
+    return ()
 
 
 def simulated_bus(clock: Clock) -> SimulatedUsb:
@@ -573,18 +531,6 @@ def simulated_bus(clock: Clock) -> SimulatedUsb:
     return SimulatedUsb(clock, PtpUsbFunction(scene_simulator(clock)))
 
 
-CAMERAS: dict[str, Callable[[CameraChoice, Clock, Any], CameraDevice]] = {
-    "ptp": _open_ptp,
-    "u3v": _open_u3v,
-    "folder": _open_folder,
-    "simulated": _open_simulated,
-    "gphoto2": _open_gphoto,
-    "mm": _open_micromanager,
-}
-CAMERA_KINDS = (
-    "ptp:, ptp:SERIAL, u3v:, u3v:SERIAL, gphoto2:, gphoto2:PORT, mm:CONFIG.cfg, folder:DIR, "
-    "simulated"
-)
 SCENE_SIZE = (240, 320)
 
 

@@ -1,28 +1,18 @@
-"""`emmc-rig devices` for cameras: info, snap and live, on whatever `open_camera` opens."""
+"""`emmc-rig devices` for cameras: info and snap, on whatever `open_camera` opens."""
 
 from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console, Group
-from rich.live import Live
-from rich.text import Text
 
-from emmc_rig.acquisition.keyboard import pressed_keys
-from emmc_rig.commands.output import (
-    Quiet,
-    give_result,
-    json_wanted,
-    show_table,
-    shown_progress,
-    tell,
-)
+from drivers.cameras import CAMERA_HELP
+from emmc_rig.commands.output import Quiet, give_result, show_table, shown_progress, tell
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file, refuse_inside_session
 
@@ -31,13 +21,9 @@ if TYPE_CHECKING:
     from drivers.raw import RawFrame
     from emmc_rig.pages.frame_view import FrameFigures
 
-SAVE_KEY, END_KEYS = "s", "q\x1b"
-
 CameraSpec = Annotated[
     str,
-    typer.Option(
-        "--camera", help="ptp:, u3v:, gphoto2:, mm:CONFIG.cfg, folder:DIR, simulated or a YAML file"
-    ),
+    typer.Option("--camera", help=f"{CAMERA_HELP}, simulated or a YAML file"),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
@@ -63,7 +49,6 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the program's `devices`."""
     app.command("camera")(camera_info)
     app.command("snap")(snap)
-    app.command("live")(live)
 
 
 def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
@@ -100,48 +85,6 @@ def snap(
                 saved.append(str(save_frame(folder, frame)))
                 tell(f"{saved[-1]}: {frame_line(frame, frame_figures(frame))}")
     give_result(out, saved=saved)
-
-
-def live(
-    camera: CameraSpec = "ptp:",
-    rig: RigOption = None,
-    exposure: ExposureOption = None,
-    gain: GainOption = None,
-    frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="stop after so many (default: Ctrl-C)")
-    ] = None,
-    save_every: Annotated[
-        int | None, typer.Option("--save-every", min=1, help="save every so many frames")
-    ] = None,
-    out: OutFolder = Path("emmc-snaps"),
-) -> None:
-    """Watch the histogram, the saturation and the focus; s saves the next frame, q ends."""
-    from emmc_rig.files.results import parse_seconds
-    from emmc_rig.pages.frame_view import frame_figures, histogram, histogram_text
-
-    exposure_s = parse_seconds(exposure, "--exposure")
-    folder = frames_folder(out) if save_every else None
-    console = Console()
-    device = open_camera(_chosen(camera, rig))
-    with closing(device), pressed_keys() as pressed, suppress(KeyboardInterrupt):
-        choose(device, exposure_s, gain)
-        drawn_live = console.is_terminal and not json_wanted.get()
-        showing = Live(console=console, auto_refresh=False) if drawn_live else None
-        with showing or nullcontext(), closing(_frames(device)) as stream:
-            for number, frame in enumerate(itertools.islice(stream, frames), start=1):
-                figures = frame_figures(frame)
-                line = f"{number}: {frame_line(frame, figures)}"
-                key = pressed()
-                if key == SAVE_KEY or (save_every and number % save_every == 0):
-                    folder = folder or frames_folder(out)
-                    line += f"; saved {save_frame(folder, frame)}"
-                if showing is None:
-                    tell(line)
-                else:
-                    drawn = Group(histogram_text(histogram(frame)), Text(line))
-                    showing.update(drawn, refresh=True)
-                if key and key in END_KEYS:
-                    break
 
 
 def simulated_protocol(rig: str) -> str:
@@ -238,16 +181,6 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
         with new_file(path) as partial:
             partial.write_bytes(data)
     return original
-
-
-def _frames(device: Camera) -> Generator[RawFrame, None, None]:
-    """Yield frames as fast as the camera gives them."""
-    stream = getattr(device, "stream", None)
-    if stream is not None:
-        yield from stream()
-        return
-    while True:
-        yield device.snap()
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drivers.cameras import CAMERAS
 from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
@@ -78,19 +79,20 @@ def list_devices(rig: RigOption = None) -> None:
 
 
 def _list_cameras(backend: Any = None) -> None:
-    """Print the PTP and USB3 Vision cameras that are plugged in; `backend`: of pyusb."""
+    """Print the cameras that are plugged in; `backend`: of pyusb."""
     from drivers.errors import DriverError
-    from drivers.ptp_usb import PTP_INTERFACE
-    from drivers.u3v_codec import CONTROL
     from drivers.usb import list_devices as list_usb
 
-    found = []
-    for kind, interface in (("ptp", PTP_INTERFACE), ("u3v", CONTROL)):
-        try:
-            found += [(kind, one) for one in list_usb(interface, backend)]
-        except DriverError as fault:
-            tell(f"USB cameras cannot be listed: {fault}")
-            return
+    try:
+        found = [
+            (kind, one)
+            for kind, protocol in CAMERAS.items()
+            if protocol.interface
+            for one in list_usb(protocol.interface, backend)
+        ]
+    except DriverError as fault:
+        tell(f"USB cameras cannot be listed: {fault}")
+        return
     if not found:
         tell("no USB camera: plug one in and switch it on, or try --camera simulated")
         return

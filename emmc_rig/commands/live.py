@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from drivers.cameras import CAMERA_HELP
 from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.output import say, shown_progress, tell
@@ -29,7 +30,7 @@ def live(
     context: typer.Context,
     rig: RigOption = None,
     camera: Annotated[
-        str | None, typer.Option("--camera", help="ptp:SERIAL, u3v:SERIAL, folder:DIR or simulated")
+        str | None, typer.Option("--camera", help=f"{CAMERA_HELP} or simulated")
     ] = None,
     stage: Annotated[
         str | None, typer.Option("--stage", help="zaber:PORT, grbl:PORT, apt:PORT or a YAML file")

@@ -209,7 +209,7 @@ def sheet(
     ] = None,
     pictures: Annotated[int, typer.Option("--pictures", min=0, help="most to show")] = 200,
 ) -> None:
-    """Write the contact sheet: frames, timeline, events, as one HTML page."""
+    """Write the contact sheet: frames, events, times, as one HTML page."""
     from emmc_rig.pages.session_sheet import write_sheet
     from emmc_rig.session.session import REPORT, Session
 

@@ -1,19 +1,39 @@
-"""The fixtures of the suites for devices that are opened by name: a plugin of pytest."""
+"""Fixtures of the suites for a device that is opened by name: a plugin of pytest."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from typing import Any
 
 import pytest
 
 from drivers.camera import Camera
-from emmc_rig.conformance.rigs import NamedStage
+from drivers.stage import Stage
 
 pytest.register_assert_rewrite("emmc_rig.conformance.cameras", "emmc_rig.conformance.stages")
 
-FIRMWARE_FIXTURES = {"simulated", "in_memory"}
-"""Of tests that make faults in simulated firmware, which a named device has none of."""
+
+class NamedStage:
+    """The stage that a name opens, as `--stage` takes it, opened anew with other settings."""
+
+    def __init__(self, spec: str) -> None:
+        self._spec = spec
+        self._stage: Stage | None = None
+
+    def make_stage(self, **settings: Any) -> Stage:
+        """Open the stage; one opened before is closed first."""
+        from emmc_rig.bench.hardware import open_stage
+
+        self.close()
+        self._stage = open_stage(self._spec, settings=settings)
+        return self._stage
+
+    def close(self) -> None:
+        """Close the stage."""
+        if self._stage is not None:
+            self._stage.close()
+            self._stage = None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -21,23 +41,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", required=True, help="as --stage or --camera of emmc-rig take it")
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what only simulated firmware can show."""
-    items[:] = [one for one in items if not FIRMWARE_FIXTURES & set(_fixtures(one))]
-
-
-def _fixtures(item: pytest.Item) -> list[str]:
-    return getattr(item, "fixturenames", [])
-
-
-def _device(request: pytest.FixtureRequest) -> str:
-    return str(request.config.getoption("--device"))
-
-
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[NamedStage]:
     """The stage of that name."""
-    with closing(NamedStage(_device(request))) as named:
+    with closing(NamedStage(str(request.config.getoption("--device")))) as named:
         yield named
 
 
@@ -46,5 +53,5 @@ def camera(request: pytest.FixtureRequest) -> Iterator[Camera]:
     """The camera of that name."""
     from emmc_rig.bench.hardware import open_camera
 
-    with closing(open_camera(_device(request))) as opened:
+    with closing(open_camera(str(request.config.getoption("--device")))) as opened:
         yield opened

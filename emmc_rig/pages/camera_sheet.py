@@ -6,14 +6,12 @@ import textwrap
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Ellipse, Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
@@ -35,32 +33,9 @@ SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
 WEIGHTS_SHOWN = 20
 MASK_STATES_SHOWN = 6
-PANELS_IN_ROW = (5, 6)
 HALF_CELLS_SHOWN = 8
-NEAR_SENSOR = 0.1
 SMALLEST_EIGENVALUE = 1e-10
 INK, FAINT, BLOCKED, RAY, WARNING = "#1b1f27", "#8a919e", "#2b2f38", "#c2410c", "#b45309"
-
-
-class MaskFigures(TypedDict):
-    """One mask's geometry; None where it has no finite value."""
-
-    view_shift_samples: float | None
-    magnification: float | None
-    fresnel_number: float | None
-
-
-class CameraFigures(TypedDict):
-    """What a camera measures; see `camera_figures`."""
-
-    sampling_rate: float
-    light_efficiency: float
-    dark_share: float
-    block_condition_median: float | None
-    block_condition_worst_percent: float | None
-    row_norm_spread: float
-    total_exposure_s: float
-    masks: dict[str, MaskFigures]
 
 
 @dataclass(frozen=True)
@@ -107,7 +82,7 @@ def _sensor_name(camera: Camera) -> str:
     return name if k == 1 else f"{name}, {k} x {k} binned"
 
 
-def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> CameraFigures:
+def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str, Any]:
     """Return what a camera measures, on a light field of `size` (rows, columns) samples.
 
     sampling_rate: measurements per light-field value (rows over columns of Psi).
@@ -122,23 +97,20 @@ def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> CameraFi
         a cell (None in contact with the sensor).
     Raises CameraError when the camera cannot be built at that size.
     """
-    return _figures(camera, build_imaging_matrix(camera, size))
-
-
-def _figures(camera: Camera, psi: ImagingMatrix) -> CameraFigures:
+    psi = build_imaging_matrix(camera, size)
     norms = psi.row_norms()
     lit = norms[norms > 0]
     conditions = _block_conditions(psi)
-    return CameraFigures(
-        sampling_rate=psi.shape[0] / psi.shape[1],
-        light_efficiency=psi.light_efficiency(),
-        dark_share=1 - lit.size / norms.size,
-        block_condition_median=_quantile(conditions, 0.5),
-        block_condition_worst_percent=_quantile(conditions, 0.99),
-        row_norm_spread=float(np.quantile(lit, 0.99) / np.quantile(lit, 0.01)),
-        total_exposure_s=float(camera.exposures_s().sum()),
-        masks={name: _mask_figures(camera, mask) for name, mask in camera.masks.items()},
-    )
+    return {
+        "sampling_rate": psi.shape[0] / psi.shape[1],
+        "light_efficiency": psi.light_efficiency(),
+        "dark_share": 1 - lit.size / norms.size,
+        "block_condition_median": _quantile(conditions, 0.5),
+        "block_condition_worst_percent": _quantile(conditions, 0.99),
+        "row_norm_spread": float(np.quantile(lit, 0.99) / np.quantile(lit, 0.01)),
+        "total_exposure_s": float(camera.exposures_s().sum()),
+        "masks": {name: _mask_figures(camera, mask) for name, mask in camera.masks.items()},
+    }
 
 
 def _block_conditions(psi: ImagingMatrix) -> NDArray[np.float64]:
@@ -156,36 +128,36 @@ def _quantile(values: NDArray[np.float64], share: float) -> float | None:
     return found if np.isfinite(found) else None
 
 
-def _mask_figures(camera: Camera, mask: Mask) -> MaskFigures:
+def _mask_figures(camera: Camera, mask: Mask) -> dict[str, float | None]:
     ratio = mask.distance_mm / camera.lens.distance_mm
     at_lens = ratio >= 1 - 1e-9
     seen_um = (1 - ratio) * camera.sensor.sample_pitch_um
     shift_um = ratio * camera.lens.aperture_cell_um
-    return MaskFigures(
-        view_shift_samples=None if at_lens else shift_um / seen_um,
-        magnification=None if at_lens else 1 / (1 - ratio),
-        fresnel_number=fresnel_number(mask.cell_um, mask.distance_mm) if ratio else None,
-    )
+    return {
+        "view_shift_samples": None if at_lens else shift_um / seen_um,
+        "magnification": None if at_lens else 1 / (1 - ratio),
+        "fresnel_number": fresnel_number(mask.cell_um, mask.distance_mm) if ratio else None,
+    }
 
 
 def draw_camera(camera: Camera, path: Path) -> None:
-    """Write a drawing of a camera as PNG, 1400 px wide: optics, masks, weights, figures.
+    """Write a drawing of a camera as PNG, 1400 px wide: optics, masks, weights.
 
     Raises CameraError when the camera cannot be built, AppError when the file cannot be written.
     """
     size = _square(camera, SHEET_SAMPLES)
     psi = build_imaging_matrix(camera, size)
-    plates = draw_plates(camera, size)
-    states = _mask_states(camera, plates)
-    heights = [0.6, 3.2, 3.5]
-    if states:
-        heights.insert(2, 13 / _panels_in_row(states[:MASK_STATES_SHOWN]) + 1.1)
+    states = _mask_states(camera, draw_plates(camera, size))
+    heights = [0.6, 2.8, *([3.6] if states else []), 3.5]
     figure = Figure(figsize=(14, sum(heights)), dpi=100, layout="constrained")
     bands = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    _draw_heading(bands[0], camera)
-    _draw_optics(bands[1], camera, plates, _figures(camera, psi))
+    bands[0].text(0.01, 0.62, camera.title, fontsize=17, weight="bold", color=INK, va="center")
+    bands[0].text(0.01, 0.12, camera.reference, fontsize=10.5, color=FAINT, va="center")
+    optics, text = bands[1].subplots(1, 2)
+    _draw_axis(optics, camera)
+    _write_figures(text, camera, psi)
     if states:
-        _draw_masks(bands[2], camera, plates, states)
+        _draw_masks(bands[2], camera, states)
     _draw_weights(bands[-1], camera, psi)
     try:
         with whole_file(path) as partial:
@@ -194,180 +166,54 @@ def draw_camera(camera: Camera, path: Path) -> None:
         raise AppError(f"{path}: cannot be written ({fault.strerror})") from fault
 
 
-def _draw_heading(band: SubFigure, camera: Camera) -> None:
-    band.text(0.01, 0.62, camera.title, fontsize=17, weight="bold", color=INK, va="center")
-    band.text(0.01, 0.12, camera.reference, fontsize=10.5, color=FAINT, va="center")
-
-
-def _draw_optics(
-    band: SubFigure, camera: Camera, plates: dict[str, Plate], figures: CameraFigures
-) -> None:
-    near = [
-        name
-        for name in camera.shot_masks(0)
-        if 0 < camera.masks[name].distance_mm < NEAR_SENSOR * camera.lens.distance_mm
-    ]
-    if near:
-        whole, zoom, text = band.subplots(1, 3, width_ratios=[1.05, 1, 1])
-        _draw_zoom(zoom, camera, {name: plates[name] for name in near})
-    else:
-        whole, text = band.subplots(1, 2)
-    _draw_axis(whole, camera, plates)
-    _write_figures(text, camera, figures)
-
-
-def _cells_on_axis(camera: Camera, name: str, plate: Plate) -> tuple[NDArray, NDArray]:
-    """Return the cells met by the x axis in shot 0: their left edges in um, their colours."""
-    offset_x, offset_y = camera.shots[0].offset_um.get(name, (0.0, 0.0))
-    _, rows, columns, _ = plate.cells.shape
-    row = int(np.clip((-offset_y / plate.cell_um + rows / 2), 0, rows - 1))
-    edges_um = (np.arange(columns) - columns / 2) * plate.cell_um + offset_x
-    return edges_um, plate.cells[0, row]
-
-
-def _draw_axis(axes: Axes, camera: Camera, plates: dict[str, Plate]) -> None:
+def _draw_axis(axes: Axes, camera: Camera) -> None:
     """Draw the camera along its optical axis, in mm; only the sensor is drawn larger than it is."""
     lens_mm, cell_mm = camera.lens.distance_mm, camera.lens.aperture_cell_mm
-    views_mm = centred_grid(camera.views[1], cell_mm)
     half_mm = camera.views[1] * cell_mm / 2
-    for view in views_mm:
+    for view in centred_grid(camera.views[1], cell_mm):
         axes.plot([0, lens_mm], [0, view], color=RAY, lw=0.7, alpha=0.7)
     axes.axhline(0, color=FAINT, lw=0.6, ls=(0, (6, 3, 1, 3)))
-    axes.add_patch(
-        Ellipse(
-            (lens_mm, 0), 0.07 * lens_mm, 2.1 * half_mm, fc="#dbeafe", ec="#1d4ed8", lw=1, alpha=0.7
-        )
-    )
+    lens = Ellipse((lens_mm, 0), 0.07 * lens_mm, 2.1 * half_mm, fc="#dbeafe", ec="#1d4ed8")
+    axes.add_patch(lens)
     axes.plot([0, 0], [-0.35 * half_mm, 0.35 * half_mm], color=INK, lw=4, solid_capstyle="butt")
     for name in camera.shot_masks(0):
-        mask = camera.masks[name]
-        if mask.distance_mm < NEAR_SENSOR * lens_mm:
-            span_mm = 0.5 * half_mm
-            axes.plot([mask.distance_mm] * 2, [-span_mm, span_mm], color="#7c3aed", lw=1, ls="--")
-            continue
-        edges_um, colours = _cells_on_axis(camera, name, plates[name])
-        width_mm = 0.025 * lens_mm
-        left_mm = mask.distance_mm - width_mm / 2
-        _draw_cells(axes, left_mm, width_mm, edges_um * 1e-3, mask.cell_um * 1e-3, colours)
+        distance_mm = camera.masks[name].distance_mm
+        axes.plot([distance_mm] * 2, [-half_mm, half_mm], color="#7c3aed", lw=1.5, ls="--")
+        axes.text(distance_mm, 1.05 * half_mm, name, ha="center", va="bottom", fontsize=8.5)
     axes.set_xlim(-0.08 * lens_mm, 1.1 * lens_mm)
-    axes.set_ylim(-1.3 * half_mm, 1.3 * half_mm)
-    _label(axes, "optical axis, mm (sensor drawn larger)", "")
+    axes.set_ylim(-1.3 * half_mm, 1.4 * half_mm)
+    _label(axes, "optical axis, mm (sensor drawn larger)")
     axes.set_title("camera, shot 0, one pixel's rays to the views", fontsize=10)
 
 
-def _draw_zoom(axes: Axes, camera: Camera, plates: dict[str, Plate]) -> None:
-    """Draw the masks near the sensor: which cells the rays of one pixel meet."""
-    pitch_um, k = camera.sensor.sample_pitch_um, camera.sensor.binning
-    lens_um = camera.lens.distance_mm * 1e3
-    views_um = centred_grid(camera.views[1], camera.lens.aperture_cell_um)
-    farthest_mm = max(plate.distance_mm for plate in plates.values())
-    reach_um = (
-        views_um[-1] * farthest_mm * 1e3 / lens_um
-        + 1.6 * max(plate.cell_um for plate in plates.values())
-        + 2 * pitch_um * k
-    )
-    depth_mm = 0.09 * farthest_mm
-    tile = cfa_tile(camera.sensor.cfa)[0]
-    pixels = np.arange(-64, 64)
-    colours = tile[pixels % len(tile)]
-    _draw_cells(axes, -depth_mm, depth_mm, pixels * pitch_um * k, pitch_um * k, colours)
-    for name, plate in plates.items():
-        edges_um, cells = _cells_on_axis(camera, name, plate)
-        _draw_cells(
-            axes, plate.distance_mm - depth_mm / 2, depth_mm, edges_um, plate.cell_um, cells
-        )
-        axes.text(plate.distance_mm, 1.03 * reach_um, name, ha="center", va="bottom", fontsize=8.5)
-    reach_mm = 1.35 * farthest_mm
-    start_um = pitch_um / 2
-    for view in views_um:
-        end_um = float(mask_position(start_um, view, reach_mm * 1e3, lens_um))
-        axes.plot([0, reach_mm], [start_um, end_um], color=RAY, lw=1)
-    axes.set_xlim(-2 * depth_mm, reach_mm)
-    axes.set_ylim(-reach_um, reach_um)
-    _label(axes, "distance from the sensor, mm", "x, um")
-    axes.set_title("near the sensor\n", fontsize=10)
-
-
-def _draw_cells(
-    axes: Axes,
-    start: float,
-    depth: float,
-    edges: NDArray[np.floating],
-    width: float,
-    colours: NDArray[np.float32],
-) -> None:
-    cells = [Rectangle((start, edge), depth, width) for edge in edges]
-    axes.add_collection(
-        PatchCollection(cells, facecolors=np.clip(colours, 0, 1), edgecolors=FAINT, linewidths=0.4)
-    )
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
+def _label(axes: Axes, x: str) -> None:
     axes.set_xlabel(x, fontsize=8.5)
-    axes.set_ylabel(y, fontsize=8.5)
     axes.tick_params(labelsize=8)
 
 
-def _write_figures(axes: Axes, camera: Camera, figures: CameraFigures) -> None:
+def _write_figures(axes: Axes, camera: Camera, psi: ImagingMatrix) -> None:
     axes.set_axis_off()
-    shots = len(camera.shots)
-    rate = Fraction(figures["sampling_rate"]).limit_denominator(100_000)
-    lines = [
-        ("sensor", f"{_sensor_name(camera)}, {camera.sensor.sample_pitch_um:g} um per sample"),
-        ("views", _views(camera)),
-        ("shots", f"{shots}, {1e3 * figures['total_exposure_s']:.3g} ms in all{_filters(camera)}"),
-        ("sampling rate", f"{rate} measurements per value"),
-        ("light", f"{figures['light_efficiency']:.1%}, dark {figures['dark_share']:.2%}"),
-        ("row norms", f"spread {figures['row_norm_spread']:.2f}"),
-        ("pixel blocks", _conditions(figures, shots)),
-    ]
-    for name, mask in camera.masks.items():
-        found = figures["masks"][name]
-        lines.append((f"'{name}'", f"at {mask.distance_mm:g} mm, cells {mask.cell_um:g} um"))
-        lines.append(("", _shadow(found)))
-    height = 1 / max(len(lines) + 3, 13)
-    for index, (key, value) in enumerate(lines):
-        level = 1 - index * height
-        axes.text(0.03, level, key, fontsize=9.5, color=FAINT, va="top", transform=axes.transAxes)
-        axes.text(0.27, level, value, fontsize=9.5, color=INK, va="top", transform=axes.transAxes)
-    for index, warning in enumerate(camera.warnings()):
-        level = 1 - (len(lines) + 0.5 + 3 * index) * height
-        wrapped = textwrap.fill(warning, 62)
-        axes.text(
-            0.03, level, wrapped, fontsize=9, color=WARNING, va="top", transform=axes.transAxes
-        )
-
-
-def _views(camera: Camera) -> str:
     lens = camera.lens
     open_mm = lens.aperture_cell_mm * lens.aperture_fill
     width = f"{open_mm:g} mm wide" if open_mm else "points"
-    return f"{camera.views[0]} x {camera.views[1]}, {lens.aperture_cell_mm:g} mm apart, {width}"
-
-
-def _filters(camera: Camera) -> str:
-    used = [shot.filter for shot in camera.shots]
-    return "" if set(used) == {"none"} else f" ({', '.join(used)})"
-
-
-def _conditions(figures: CameraFigures, shots: int) -> str:
-    if shots == 1:
-        return "one number each, one shot"
-
-    def shown(value: float | None) -> str:
-        return "singular" if value is None else f"{value:.3g}"
-
-    median = shown(figures["block_condition_median"])
-    return f"condition {median}, worst 1 % {shown(figures['block_condition_worst_percent'])}"
-
-
-def _shadow(found: MaskFigures) -> str:
-    number = found["fresnel_number"]
-    diffraction = "in contact" if number is None else f"Fresnel {number:.3g}"
-    shift, magnification = found["view_shift_samples"], found["magnification"]
-    if shift is None or magnification is None:
-        return "at the lens: one value per view"
-    return f"shift {shift:.3g} samples a view, x{magnification:.4f}, {diffraction}"
+    exposure_ms = 1e3 * float(camera.exposures_s().sum())
+    lines = [
+        ("sensor", f"{_sensor_name(camera)}, {camera.sensor.sample_pitch_um:g} um per sample"),
+        ("views", f"{camera.views[0]} x {camera.views[1]}, {lens.aperture_cell_mm:g} mm apart, "
+         f"{width}"),
+        ("shots", f"{len(camera.shots)}, {exposure_ms:.3g} ms in all"),
+        ("sampling rate", f"{Fraction(*psi.shape)} measurements per value"),
+        ("light", f"{psi.light_efficiency():.1%}"),
+        *((f"'{name}'", f"at {mask.distance_mm:g} mm, cells {mask.cell_um:g} um")
+          for name, mask in camera.masks.items()),
+        *(("", textwrap.fill(warning, 62)) for warning in camera.warnings()),
+    ]  # fmt: skip
+    level = 1.0
+    for key, value in lines:
+        color = INK if key else WARNING
+        for x, text, ink in ((0.03, key, FAINT), (0.2, value, color)):
+            axes.text(x, level, text, fontsize=9.5, color=ink, va="top", transform=axes.transAxes)
+        level -= 0.09 * (1 + value.count("\n"))
 
 
 @dataclass(frozen=True)
@@ -375,6 +221,7 @@ class _MaskState:
     """A mask as it stands during some shots."""
 
     name: str
+    plate: Plate
     frame: int
     offset_um: tuple[float, float]
     shots: list[int]
@@ -387,42 +234,30 @@ def _mask_states(camera: Camera, plates: dict[str, Plate]) -> list[_MaskState]:
         for name in camera.shot_masks(shot):
             frame = shot % len(plates[name].cells)
             offset = settings.offset_um.get(name, (0.0, 0.0))
-            found = states.setdefault((name, frame, offset), _MaskState(name, frame, offset, []))
-            found.shots.append(shot)
+            state = _MaskState(name, plates[name], frame, offset, [])
+            states.setdefault((name, frame, offset), state).shots.append(shot)
     return list(states.values())
 
 
-def _draw_masks(
-    band: SubFigure, camera: Camera, plates: dict[str, Plate], states: list[_MaskState]
-) -> None:
+def _draw_masks(band: SubFigure, camera: Camera, states: list[_MaskState]) -> None:
     """Draw masks as the beam meets them, one panel for each of the first states."""
     shown = states[:MASK_STATES_SHOWN]
     more = f", the first {len(shown)} of {len(states)} states" if len(states) > len(shown) else ""
     _band_title(band, f"masks around the optical axis{more}; dots: one pixel's rays to the views")
-    any_moved = any(any(state.offset_um) for state in shown)
-    panels = band.subplots(1, _panels_in_row(shown), squeeze=False)[0]
+    panels = band.subplots(1, max(len(shown), 5), squeeze=False)[0]
     for axes, state in zip(panels, shown, strict=False):
-        _draw_plate(axes, camera, plates[state.name], state.frame, state.offset_um)
-        moved = f"\nat ({state.offset_um[0]:g}, {state.offset_um[1]:g}) um" if any_moved else ""
-        axes.set_title(
-            f"{state.name}, {_counted(state.shots, len(camera.shots))}{moved}", fontsize=9
-        )
+        _draw_plate(axes, camera, state.plate, state.frame, state.offset_um)
+        x, y = state.offset_um
+        moved = f"\nat ({x:g}, {y:g}) um" if x or y else ""
+        every = len(state.shots) == len(camera.shots)
+        shots = "all shots" if every else f"shot {', '.join(map(str, state.shots))}"
+        axes.set_title(f"{state.name}, {shots}{moved}", fontsize=9)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
 
 
-def _panels_in_row(states: list[_MaskState]) -> int:
-    return int(np.clip(len(states), *PANELS_IN_ROW))
-
-
 def _band_title(band: SubFigure, title: str) -> None:
     band.suptitle(title, fontsize=10.5, x=0.01, ha="left", color=INK)
-
-
-def _counted(shots: list[int], total: int) -> str:
-    if len(shots) == total:
-        return "the one shot" if total == 1 else "all shots"
-    return f"shot {', '.join(str(shot) for shot in shots)}"
 
 
 def _draw_plate(
@@ -458,7 +293,7 @@ def _draw_plate(
     shown = min(half_x, half_y) if far else max(rays_um, HALF_CELLS_SHOWN * plate.cell_um)
     axes.set_xlim(-shown * unit, shown * unit)
     axes.set_ylim(shown * unit, -shown * unit)
-    _label(axes, f"x, {name}", "")
+    _label(axes, f"x, {name}")
 
 
 def _draw_weights(band: SubFigure, camera: Camera, psi: ImagingMatrix) -> None:
@@ -479,9 +314,8 @@ def _draw_weights(band: SubFigure, camera: Camera, psi: ImagingMatrix) -> None:
     for axes, (title, unit, picture) in zip(band.subplots(1, 4), panels, strict=True):
         axes.imshow(np.clip(picture, 0, 1), interpolation="nearest")
         axes.set_title(title, fontsize=9)
-        axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        _label(axes, unit, "")
+        axes.locator_params(nbins=5, integer=True)
+        _label(axes, unit)
 
 
 def _crop(picture: NDArray[np.float32]) -> NDArray[np.float32]:

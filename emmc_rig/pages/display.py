@@ -17,7 +17,7 @@ JPEG_QUALITIES = (88, 78, 68, 58, 48, 38)
 """Tried from the first until a picture is small enough; the last is taken in any case."""
 TILE_MULTIPLE_PX = 16  # a JPEG block never straddles two views
 SPRITE_PIXELS = 24_000_000  # canvases above this fail on small machines; larger views are reduced
-PART_PIXELS, PART_BYTES = 6_000_000, 1_300_000
+PART_PIXELS = 4_500_000
 """Of a light field that is part of a report, which stays below 8 MB."""
 HEAT = (
     (13, 16, 38),

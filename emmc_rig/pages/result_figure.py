@@ -17,8 +17,7 @@ from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
 from emmc_rig.pages.display import DisplayCurve, finite, round_up, three_colours
-from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
-from emmc_rig.pages.tiles import (
+from emmc_rig.pages.paper_figure import (
     FRAMES,
     WIDTH_IN,
     CloseUp,
@@ -30,6 +29,7 @@ from emmc_rig.pages.tiles import (
     caption_of,
     draw_tiles,
 )
+from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 
 Array = NDArray[np.floating]
 CLOSE_UP_SHARE = 0.16
@@ -105,17 +105,16 @@ def draw_results(
         rows = [Row([*shown, *beside])]
     else:
         before = [None] * (len(columns) - len(results))
-        common, rare = _split(maps, names[len(before) :])
-        rows = [Row(shown), *(Row([*before, *row.tiles], row.label) for row in common)]
-        for at in range(0, len(rare), len(columns)):
-            some = rare[at : at + len(columns)]
-            rows.append(Row([*[None] * (len(columns) - len(some)), *some]))
+        rows = [Row(shown), *(Row([*before, *row.tiles], row.label) for row in maps)]
     sentences = [
         f"View {view} of {reference.shape[0]}x{reference.shape[1]}, {height}x{width} pixels.",
         f"Epipolar plane image of row {line} (dotted), all views of a row downwards.",
-        *(["Error: root mean square over colours, of this view. PSNR and SSIM are of all views, "
-           "peak 1."] if measured else []),
-    ]  # fmt: skip
+    ]
+    if measured:
+        sentences.append(
+            "Error: root mean square over colours, of this view. PSNR and SSIM are of all views, "
+            "peak 1."
+        )
     sources = [
         f"{name}: {_source(one)}"
         for name, one in zip(names, columns, strict=True)
@@ -172,25 +171,6 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
             tiles = [Tile("", values, scale=scale) for values in maps]
             rows.append(Row([*tiles[:-1], replace(tiles[-1], bar=True)], label))
     return rows
-
-
-def _split(maps: Sequence[Row], names: Sequence[str]) -> tuple[list[Row], list[Tile]]:
-    """Return the rows that most results fill, and the tiles of the others, with method and scale.
-
-    A row of one map beside an empty place is half a page of nothing.
-    """
-    common, rare = [], []
-    for row in maps:
-        drawn = [tile is not None and tile.picture is not None for tile in row.tiles]
-        if 2 * sum(drawn) > len(drawn):
-            common.append(row)
-            continue
-        rare += [
-            replace(tile, title=f"{name}: {row.label}", bar=True)
-            for tile, name, there in zip(row.tiles, names, drawn, strict=True)
-            if tile is not None and there
-        ]
-    return common, rare
 
 
 def _ends(maps: Sequence[Array | None]) -> tuple[float, float]:

@@ -30,15 +30,7 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.pages.timeline import (
-    COLOURS,
-    LEGEND,
-    SHOWN_FRAMES,
-    overlap,
-    run_entries,
-    session_metrics,
-    timeline_svg,
-)
+from emmc_rig.pages.timeline import overlap, run_entries, session_metrics
 from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
@@ -85,7 +77,7 @@ def quick_pictures(session: Session) -> int:
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
-    sections = [Section("timeline", "Timeline", _timeline(session))]
+    sections = []
     taken = decisions(session.journal.entries)
     if taken:
         last = ended(session.journal.entries)
@@ -162,8 +154,11 @@ def _cards(session: Session) -> list[Card]:
     runs = run_entries(session.journal.entries)
     if runs:
         last = overlap(runs[-1])
-        note = f"of {last.writing_s:.1f} s of hashing and writing, while the bench worked"
-        cards.append(Card("Hidden writing", f"{last.hidden_share:.0%}", note))
+        note = (
+            f"in the last run: {last.moving_s:.1f} s moving, {last.exposing_s:.1f} s exposing, "
+            f"{last.writing_s:.1f} s writing, {last.hidden_share:.0%} of it while the bench worked"
+        )
+        cards.append(Card("Time", f"{last.seconds:.1f} s", note))
     return cards
 
 
@@ -252,31 +247,6 @@ def small_jpeg(frame: RawFrame, balance: Balance = AS_READ) -> bytes:
     size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-
-
-def _timeline(session: Session) -> str:
-    runs = run_entries(session.journal.entries)
-    if not runs:
-        return fragment("session_timeline.html", run=None)
-    longest = max(runs, key=len)
-    run = longest[0]["run"]
-    decided = [one for one in decisions(session.journal.entries) if one["run"] == run]
-    # Shots, and what is decided between them, come last.
-    shown = longest[-SHOWN_FRAMES:] if decided else longest[:SHOWN_FRAMES]
-    return fragment(
-        "session_timeline.html",
-        run=run,
-        which="last" if decided else "first",
-        shown=len(shown),
-        frames=len(longest),
-        overlap=overlap(longest),
-        legend=[
-            (COLOURS[name], meaning)
-            for name, meaning in LEGEND.items()
-            if decided or name != "decide"
-        ],
-        drawing=timeline_svg(shown, decided),
-    )
 
 
 def events(session: Session) -> Iterator[tuple[str, str]]:

@@ -1,42 +1,16 @@
-"""The timeline of a capture, bench and disk, from the journal's spans: figures and a chart."""
+"""How the runs of a capture spent their time, bench and disk, from the journal's spans."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
-from matplotlib.ticker import MaxNLocator
-
-from emmc_rig.pages.page import fragment
 from emmc_rig.session.decisions import decisions
 from emmc_rig.session.exposure import shot_exposures
 from emmc_rig.session.journal import Entry
 from emmc_rig.session.session import Session
 
 BENCH = ("attend", "move", "settle", "expose", "read back", "check")
-COLOURS = {
-    "attend": "#8a94a3",
-    "move": "#1d5a9e",
-    "settle": "#7fb0e6",
-    "expose": "#c4720b",
-    "read back": "#8a94a3",
-    "check": "#8a94a3",
-    "decide": "#7b4ea3",
-    "hand over": "#b42318",
-    "write": "#18794e",
-}
-LEGEND = {
-    "move": "move",
-    "settle": "settle",
-    "expose": "expose and download",
-    "check": "attend, read back, check",
-    "decide": "reconstruct, choose the next shot",
-    "hand over": "wait for the disk",
-    "write": "hash, write, sync",
-}
-SHOWN_FRAMES = 24
-WIDTH_PX, LANE_PX, LEFT_PX, AXIS_PX = 1380, 26, 56, 22
-
 Span = tuple[float, float]
 
 
@@ -124,54 +98,3 @@ def _common(ones: Sequence[Span], others: Sequence[Span]) -> float:
         else:
             j += 1
     return total
-
-
-@dataclass(frozen=True)
-class _Bar:
-    """A span as the chart shows it, in pixels."""
-
-    lane: int
-    x: float
-    width: float
-    colour: str
-    words: str
-
-
-def timeline_svg(entries: Sequence[Entry], decided: Sequence[Entry] = ()) -> str:
-    """Return a chart of frames of a run as SVG: the bench above, the disk below.
-
-    decided: what was decided in that run; those are shown that come after the first frame.
-    """
-    begin_s = min((span[0] for one in entries for span in one["spans_s"].values()), default=0.0)
-    after = [one for one in decided if one["spans_s"]["decide"][0] >= begin_s]
-    spans = [
-        (name, span[0], span[1], entry.get("id", "decision"))
-        for entry in (*entries, *after)
-        for name, span in entry["spans_s"].items()
-        if name in COLOURS
-    ]
-    if not spans:
-        return ""
-    start_s = min(span[1] for span in spans)
-    length_s = max(max(span[2] for span in spans) - start_s, 1e-9)
-    scale = (WIDTH_PX - LEFT_PX - 10) / length_s
-    bars = [
-        _Bar(
-            int(name == "write"),
-            LEFT_PX + (first_s - start_s) * scale,
-            max(0.6, (last_s - first_s) * scale),
-            COLOURS[name],
-            f"{frame_id}: {LEGEND.get(name, name)}, {(last_s - first_s) * 1e3:.1f} ms",
-        )
-        for name, first_s, last_s, frame_id in spans
-    ]
-    ticks = [at for at in MaxNLocator(8).tick_values(0, length_s) if 0 <= at <= length_s]
-    return fragment(
-        "timeline.html",
-        bars=bars,
-        ticks=[(LEFT_PX + at * scale, at) for at in ticks],
-        width=WIDTH_PX,
-        left=LEFT_PX,
-        lane=LANE_PX,
-        axis=AXIS_PX,
-    )

@@ -99,19 +99,17 @@ def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, objec
 
 
 def viewer_data(
-    content: Export,
-    atlases: bool = True,
-    lossless: bool = False,
-    most_pixels: int = SPRITE_PIXELS,
+    content: Export, lossless: bool = False, most_pixels: int = SPRITE_PIXELS
 ) -> dict[str, object]:
-    """Return what viewer.js reads; without atlases it takes those of the report it is part of.
+    """Return what viewer.js reads.
 
     Disparity is estimated where the light field comes without. most_pixels: of all views.
     """
     shown = reduced(content.light_field, most_pixels)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
-    curve = DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
+    truth = content.truth
+    curve = DisplayCurve.fitted_to(content.light_field if truth is None else truth)
     centre = _resized(centre_disparity(content.light_field, content.disparity), shown) * np.float32(
         shrink
     )
@@ -127,7 +125,8 @@ def viewer_data(
         "scale": shrink,
         "tile": TILE_MULTIPLE_PX,
         "gamma": curve.gamma,
-        **(_atlases(curve, shown, content, lossless) if atlases else {}),
+        "estimate": _atlas(curve, shown, lossless),
+        "truth": None if truth is None else _atlas(curve, reduced(truth, most_pixels), lossless),
         "disparity": {"atlas": _grey_atlas(codes), "low": low, "high": low + span},
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
         "overlays": [_overlay(one, shown) for one in overlays_of(content)],
@@ -185,16 +184,6 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
         "colours": one.colours, "names": one.names,
         "picture": png_of(picture),
     }  # fmt: skip
-
-
-def _atlases(
-    curve: DisplayCurve, shown: Array, content: Export, lossless: bool
-) -> dict[str, str | None]:
-    truth = None if content.truth is None else reduced(content.truth)
-    return {
-        "estimate": _atlas(curve, shown, lossless),
-        "truth": None if truth is None else _atlas(curve, truth, lossless),
-    }
 
 
 def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:

@@ -188,8 +188,8 @@ def reconstruct_folder(
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    tile: see `compute_blocks`. as_zarr: write light field and maps as one Zarr group, by the pool, and
-    no pictures.
+    tile: see `compute_blocks`. as_zarr: write light field and maps as one Zarr group, by the pool,
+    and no pictures.
     """
     find_method(method)
     settings = settings or MethodSettings()

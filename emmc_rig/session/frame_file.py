@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from drivers.camera import CameraIdentity
+from drivers.cameras import CAMERAS
 from drivers.dng import MONO, encode_dng, private_data
 from drivers.errors import DriverError, RawFrameError
 from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
@@ -23,7 +24,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Entry
 
 STREAMED = ".bin"
-"""Frames of USB3 Vision cameras: leader, payload and trailer."""
+"""Frames that the drivers of `drivers.cameras` decode by themselves."""
 CAMERA_DIGEST = "camera_sha256"
 """In the journal line of a frame whose file is a DNG of the mosaic: digest of the bytes in it."""
 UNSTORABLE = "the camera's frame cannot be stored so that it is read back: mend its driver"
@@ -84,17 +85,15 @@ def decode_frame(data: bytes, entry: Entry) -> RawFrame:
             sha256=entry[CAMERA_DIGEST],
         )
     elif Path(entry["file"]).suffix == STREAMED:
-        # Its kernels take half a second to load, and most cameras write files.
-        from drivers.u3v import decode_u3v
-        from drivers.u3v_codec import LEADER_PREFIX, begins_with
-
-        if not begins_with(data, LEADER_PREFIX):
+        protocols = (one for one in CAMERAS.values() if one.frame_prefix)
+        driver = next((one for one in protocols if data.startswith(one.frame_prefix)), None)
+        if driver is None:
             raise RawFrameError(
                 f"{entry['file']} is in a format that only the plug-in of its camera knows: "
                 "emmc-rig 0.2 stored it without its mosaic"
             )
         black_dn = float(entry["black_level_dn"][0][0])
-        frame = decode_u3v(data, black_dn, entry["white_level_dn"])
+        frame = driver.load().decode_frame(data, black_dn, entry["white_level_dn"])
     else:
         frame = decode_raw(data)
     return replace(frame, exposure_s=entry["exposure_s"], gain=entry["gain"])

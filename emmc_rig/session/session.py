@@ -11,7 +11,7 @@
         amended-1-plan.yaml, ...camera.json, ...rig.json, ...frames.json
                        the plan as edited meanwhile, and what follows from it: these hold now
         session.lock   while a program writes the session: which one (see `lock`)
-        report.html    pictures, timeline, events; with metrics.json and files.json
+        report.html    pictures, events, times; with metrics.json and files.json
         calibration/, reconstruction/   what `calibrate` and `reconstruct` made of it
 
 Where a capture ends when the scene needs no more shots, the journal says which are spared: these

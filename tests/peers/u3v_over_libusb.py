@@ -25,7 +25,9 @@ from usbfs import mock  # noqa: E402
 from drivers.clock import SYSTEM_CLOCK  # noqa: E402
 from drivers.genapi import Features  # noqa: E402
 from drivers.pixel_formats import BY_CODE, unpack  # noqa: E402
-from drivers.u3v import list_u3v, open_u3v  # noqa: E402
+from drivers.u3v import open_u3v  # noqa: E402
+from drivers.u3v_codec import CONTROL  # noqa: E402
+from drivers.usb import list_devices  # noqa: E402
 from simulators.u3v import U3vCameraSimulator  # noqa: E402
 from simulators.usb import SimulatedUsb  # noqa: E402
 
@@ -107,7 +109,7 @@ def with_driver():
     simulator = U3vCameraSimulator(lambda exposure_s: MOSAIC, SYSTEM_CLOCK, SHAPE, "gbrg")
     testbed, usbfs = mock(SimulatedUsb(SYSTEM_CLOCK, simulator))
     KEPT.append(testbed)
-    listings = list_u3v()
+    listings = list_devices(CONTROL)
     frames = []
     for _ in range(SESSIONS):
         camera = open_u3v("U1")

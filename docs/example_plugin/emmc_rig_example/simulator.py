@@ -43,7 +43,6 @@ class ExampleController(SimulatedController):
         self._motor = Motor(spec, self._clock)
         self._speed_um_s = TOP_SPEED_UM_S
         self._homed = self._homing = self._stalled = False
-        self._drift_um = 0.0
 
     def _advance(self) -> None:
         end = self._motor.advance()
@@ -54,8 +53,6 @@ class ExampleController(SimulatedController):
         elif end is End.ARRIVED and self._homing:
             self._motor.count_from_here()
             self._homed = True
-        self._motor.drift(self._drift_um)
-        self._drift_um = 0.0
 
     def _next_event_s(self) -> float | None:
         return self._motor.ends_s
@@ -67,26 +64,17 @@ class ExampleController(SimulatedController):
                 number, verb, *values = unseal(line)
             except (GarbledReplyError, ValueError):
                 continue
-            if not self._dropped(line):
-                word = "ok" if self._obey(verb, [int(value) for value in values]) else "no"
-                self._answer(number, word)
+            word = "ok" if self._obey(verb, [int(value) for value in values]) else "no"
+            self._answer(number, word)
 
     def _obey(self, verb: str, values: list[int]) -> bool:
         motor, acceleration_um_s2 = self._motor, SPEC.acceleration_um_s2
         if verb == "home":
             self._homing, self._homed, self._stalled = True, False, False
-            if self.faults.strikes("stall"):
-                motor.go(motor.counted_um / 2, self._speed_um_s, acceleration_um_s2, stalls=True)
-            else:
-                motor.seek(0.0, self._speed_um_s, acceleration_um_s2)
+            motor.seek(0.0, self._speed_um_s, acceleration_um_s2)
         elif verb == "move" and self._homed and 0 <= values[0] * STEP_UM <= SPEC.travel_um:
             self._homing = False
-            if self.faults.strikes("drift"):
-                self._drift_um = self.drift_um
-            motor.busy_forever |= self.faults.strikes("busy_forever")
-            stalls = self.faults.strikes("stall")
-            target_um = values[0] * STEP_UM
-            motor.go(target_um, self._speed_um_s, acceleration_um_s2, stalls, self._start_s())
+            motor.go(values[0] * STEP_UM, self._speed_um_s, acceleration_um_s2)
         elif verb == "stop":
             motor.brake(acceleration_um_s2)
         elif verb == "speed":

@@ -1,6 +1,7 @@
 """The example's stage and camera against what every stage and camera must do."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from emmc_rig_example.stage import ExampleStage
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import CaptureError, GarbledReplyError
+from drivers.stage import DEFAULT_SETTINGS
 from emmc_rig.conformance.cameras import *  # noqa: F403
-from emmc_rig.conformance.rigs import StageRig
 from emmc_rig.conformance.stages import *  # noqa: F403
+from simulators.clock import ManualClock
 
 PROGRAM = """
 import sys
@@ -25,38 +27,18 @@ open(sys.argv[2], "wb").write(data)
 """
 
 
-class ExampleRig(StageRig):
-    replies_are_numbered = True
+class ExampleRig:
+    """Opens the stage over new firmware, in time that passes at once."""
 
-    def make_device(self):
-        return ExampleController(self.clock)
-
-    def make_from(self, settings):
-        return ExampleStage(self.transport, self.clock, settings)
-
-    def true_um(self, axis):
-        return self.device.position_um()
-
-    def is_move(self, occasion):
-        return b" move " in occasion.command
-
-    def is_question(self, occasion):
-        return b" status" in occasion.command
-
-
-@pytest.fixture(params=["memory", "pty"])
-def simulated(request, opened, tmp_path):
-    return ExampleRig(request.param, opened, tmp_path)
+    def make_stage(self, **settings):
+        clock = ManualClock()
+        transport = ExampleController(clock).transport()
+        return ExampleStage(transport, clock, replace(DEFAULT_SETTINGS, **settings))
 
 
 @pytest.fixture
-def rig(simulated):
-    return simulated
-
-
-@pytest.fixture
-def in_memory(opened, tmp_path):
-    return ExampleRig("memory", opened, tmp_path)
+def rig():
+    return ExampleRig()
 
 
 @pytest.fixture

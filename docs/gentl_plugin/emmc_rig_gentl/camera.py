@@ -20,7 +20,7 @@ from harvesters.core import Harvester
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import Clock
 from drivers.dng import frame_of_array
-from drivers.errors import CameraClosedError, CameraSettingError, DriverError, FrameLostError
+from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, DriverError
 from drivers.pixel_formats import FORMATS
 from drivers.raw import RawFrame
 
@@ -180,15 +180,15 @@ class GenTlCamera:
         try:
             with self._acquirer.fetch(timeout=exposure_s + FRAME_GRACE_S) as buffer:
                 if not buffer.is_complete():
-                    raise FrameLostError("it did not come whole")
+                    raise CaptureError("it did not come whole")
                 component = buffer.payload.components[0]
                 # The buffer goes back to the producer: what is in it must be copied.
                 mosaic = np.array(component.data, dtype=np.uint16)
                 shape = (int(component.height), int(component.width))
         except TimeoutException as error:
-            raise FrameLostError("no frame came from the camera") from error
+            raise CaptureError("no frame came from the camera") from error
         if shape != self.shape or mosaic.size != shape[0] * shape[1]:
-            raise FrameLostError(f"it has {shape[0]}x{shape[1]} pixels instead of {self.shape}")
+            raise CaptureError(f"it has {shape[0]}x{shape[1]} pixels instead of {self.shape}")
         return frame_of_array(
             mosaic.reshape(shape),
             self.cfa,

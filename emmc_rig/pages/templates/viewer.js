@@ -1,5 +1,5 @@
 "use strict";
-// Pictures in the page as canvases that hold their pixels; each is decoded once, whoever asks: report.js does too.
+// Pictures in the page as canvases that hold their pixels; each is decoded once.
 const decoded = (() => {
   const known = new Map();
   async function decode(uri) {
@@ -650,12 +650,6 @@ function failed(error) {
 return { take: (next) => take(next).catch(failed) };
 })();
 
-// What a page holds itself; a report holds the views for more than the viewer.
-const viewerShown = (() => {
-  const own = document.getElementById("viewer-data");
-  if (!own) return null;
-  const data = JSON.parse(own.textContent);
-  if (data.estimate) return lightFieldViewer.take(data);
-  const { estimate, truth } = JSON.parse(document.getElementById("data").textContent);
-  return lightFieldViewer.take({ ...data, estimate, truth });
-})();
+// What a page holds itself; the live page hands light fields over as they come.
+const own = document.getElementById("viewer-data");
+if (own) lightFieldViewer.take(JSON.parse(own.textContent));

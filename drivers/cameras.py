@@ -1,0 +1,40 @@
+"""The camera protocols, a row each: a new one is its row here and its module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+
+@dataclass(frozen=True)
+class CameraProtocol:
+    """One kind of camera, and the module that drives it, imported when it is used.
+
+    module: has `open_camera(address, clock, backend)`, whose backend is pyusb's; where it also has
+    a dataclass OPTIONS, that is a fourth argument, and its fields are settings of a camera's YAML
+    file. address: what follows the kind and a colon. interface: class, subclass and protocol on
+    USB, by which such cameras are listed. frame_prefix: first bytes of its frames where
+    `drivers.raw` does not know them; `decode_frame(data, black_level_dn, white_level_dn)` of the
+    module reads these.
+    """
+
+    module: str
+    address: str
+    interface: tuple[int, int, int] | None = None
+    frame_prefix: bytes = b""
+
+    def load(self) -> Any:
+        """Return the module."""
+        return import_module(self.module)
+
+
+CAMERAS = {
+    "ptp": CameraProtocol("drivers.ptp", "SERIAL", (0x06, 0x01, 0x01)),
+    "u3v": CameraProtocol("drivers.u3v", "SERIAL", (0xEF, 0x05, 0x00), b"U3VL"),
+    "gphoto2": CameraProtocol("drivers.gphoto", "PORT"),
+    "mm": CameraProtocol("drivers.micromanager", "CONFIG.cfg"),
+    "folder": CameraProtocol("drivers.folder", "DIR"),
+}
+CAMERA_HELP = ", ".join(f"{kind}:{one.address}" for kind, one in CAMERAS.items())
+"""What `--camera` takes, for help texts and refusals."""
