@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import train_dictionary
+from learning import LearningSettings
 from train_dictionary import draw_atoms, train
+from training_patches import PatchSettings
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
 from reconstruction.dictionary import Dictionary
-from reconstruction.learning import LearningSettings
-from reconstruction.training_patches import PatchSettings
 
 PATCHING = PatchSettings(rows=4, columns=4, count=120)
 LEARNING = LearningSettings(atoms=24, sparsity=3, iterations=3)

@@ -23,6 +23,7 @@ import yaml
 from numpy.typing import NDArray
 from random_worlds import DARKEST, world
 from scipy.optimize import minimize
+from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.cameras import camera_file
@@ -31,7 +32,6 @@ from emmc_rig.files.results import command_line
 from emmc_rig.model.camera import Camera, load_camera, pixel_light
 from emmc_rig.model.masks import Parameters
 from emmc_rig.model.reading import read_yaml
-from reconstruction.training_patches import cut_patches
 
 Array = NDArray[np.float64]
 PATCH_PX = 5

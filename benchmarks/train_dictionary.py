@@ -18,7 +18,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from learning import Iteration, LearningSettings, LearningState, learn_ksvd
 from numpy.typing import NDArray
+from training_patches import PatchSettings, training_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.folders import new_file, refuse_new_file
@@ -26,8 +28,6 @@ from emmc_rig.files.results import command_line, parse_size, versions
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.files import whole_file
 from reconstruction.dictionary import Dictionary
-from reconstruction.learning import Iteration, LearningSettings, LearningState, learn_ksvd
-from reconstruction.training_patches import PatchSettings, training_patches
 
 CHECKPOINT_INTERVAL_S = 60.0
 SHOWN_ATOMS, ZOOM, GAP_PX = 400, 3, 2

@@ -28,6 +28,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parent / "unrolled_plugin"))
 from emmc_rig_unrolled.network import Capture, Unrolled, captured
 from emmc_rig_unrolled.weights import Architecture, NetworkWeights
+from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.cameras import find_camera
@@ -36,7 +37,6 @@ from emmc_rig.files.results import command_line, versions
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.files import whole_file
-from reconstruction.training_patches import cut_patches
 
 CAMERAS = "scenario-ii-cfa", "rgbw-bayer-1shot", "rgbw-bayer-3shots", "rgbw-mono"
 VIEWS = 5, 5

@@ -129,7 +129,7 @@ def stage_map(commanded_um: Sequence[tuple[float, float]], places: Sequence[Plac
     scale = np.array([max(np.ptp(commanded[:, 0]), 1e-9), max(np.ptp(commanded[:, 1]), 1e-9), 1])
     if np.linalg.matrix_rank(rows / scale, tol=1e-6) < 3:
         raise CalibrationError("the stage positions lie on one line: move along x and along y")
-    found, *_ = np.linalg.lstsq(rows, real, rcond=None)
+    found = np.asarray(np.linalg.lstsq(rows, real, rcond=None)[0], np.float64)
     left = real - rows @ found
     variance = np.square(left).sum(axis=0) / max(len(left) - 3, 1)
     covariances = [np.linalg.inv(rows.T @ rows) * one for one in variance]

@@ -2,6 +2,7 @@
 
 import json
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,9 @@ from emmc_rig.processing import budget
 from emmc_rig.processing.budget import COST, method_within, timed
 from reconstruction.methods import reconstruct
 from simulators.scenes import render
+
+NOT_READ: Any = None
+"""Psi and frames, where a trial on them is replaced."""
 
 
 @pytest.mark.parametrize(
@@ -35,7 +39,7 @@ def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
     monkeypatch.setattr(budget, "timed", lambda psi, frames: 10.0)
     for text, method in (("60", "adaptive"), ("35", "adaptive"), ("34", "adaptive-fast"),
                          ("9", "tv"), ("0.5", "tv")):  # fmt: skip
-        taken, why = method_within(None, None, text)
+        taken, why = method_within(NOT_READ, NOT_READ, text)
         assert taken == method
         assert f"about {10 * COST[method]:.2g} s" in why
         assert ("none keeps to" in why) == (text == "0.5")

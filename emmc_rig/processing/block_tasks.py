@@ -270,9 +270,11 @@ def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> tuple[Su
     if kept is not None:
         if _sha256(job.kept / FRAMES) != kept["frames"]:
             _write_arrays(job.kept / FRAMES, arrays)
-        survey = {k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()}
-        survey["settings"] = MethodSettings.model_validate(survey["settings"])
-        return Survey(**survey), kept["survey_cpu_seconds"]
+        known: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()
+        }
+        known["settings"] = MethodSettings.model_validate(known["settings"])
+        return Survey(**known), kept["survey_cpu_seconds"]
     for path in job.kept.iterdir():
         path.unlink()
     sha256 = _write_arrays(job.kept / FRAMES, arrays)

@@ -13,6 +13,7 @@ import statistics
 import time
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from calibration.errors import CalibrationError
@@ -137,7 +138,7 @@ class Worker:
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
-        self._started: tuple[multiprocessing.process.BaseProcess, Connection] | None = None
+        self._started: tuple[BaseProcess, Connection] | None = None
 
     def __enter__(self) -> Worker:
         return self
@@ -164,7 +165,7 @@ class Worker:
         return {"failed": f"not done after {self.limit_s:.0f} s"}
 
     @staticmethod
-    def _start() -> tuple[multiprocessing.process.BaseProcess, Connection]:
+    def _start() -> tuple[BaseProcess, Connection]:
         context = multiprocessing.get_context("spawn")
         mine, its = context.Pipe()
         process = context.Process(target=_serve, args=(its,), daemon=True)

@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-
-from emmc_rig.model.settings import validated
-from reconstruction import learning
-from reconstruction.batch_omp import NO_ATOM, batch_omp
-from reconstruction.errors import DictionaryError
-from reconstruction.learning import (
+from learning import (
     LearningSettings,
     LearningState,
     first_state,
@@ -15,12 +10,17 @@ from reconstruction.learning import (
     ksvd_step,
     learn_ksvd,
 )
-from reconstruction.training_patches import (
+from training_patches import (
     PatchSettings,
     coreset,
     cut_patches,
     training_patches,
 )
+
+from emmc_rig.model.settings import validated
+from reconstruction import learning
+from reconstruction.batch_omp import NO_ATOM, batch_omp
+from reconstruction.errors import DictionaryError
 
 SHAPE = (2, 2, 3, 4, 1)
 SAMPLES = 48
