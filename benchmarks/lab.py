@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent.parent / "docs" / "results"
 GROUP_A = ("dragons", "dice", "fish", "buttercup", "occlusions", "begonia", "antinous")
 GROUP_B = ("messerschmitt", "bikes", "isochart", "general11", "lytro1", "lytro2")
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
-SMALLEST = (24, 32)
+SMALLEST = (32, 40)
 
 
 def arguments(
