@@ -403,10 +403,7 @@ def test_saturated_readings_say_at_least_how_bright_it_was(glare, method):
     assert "saturated" in known.screening[-1]
     assert not any("saturated" in note for note in unknown.screening)
     seen = psi.forward(known.light_field)
-    # Of surfaces, whose texture is smooth, one reading of 106 reaches 0.76.
-    far_short = seen[~usable] < 0.8 * readings[~usable]
-    assert far_short.mean() <= (0 if method == "tv" else 0.01)
-    assert (seen[~usable] > 0.75 * readings[~usable]).all()
+    assert (seen[~usable] > 0.8 * readings[~usable]).all()
 
 
 def test_readings_that_somebody_leaves_out_are_no_bounds(glare):
@@ -527,7 +524,7 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
 
 
-@pytest.mark.parametrize("scene", ["deep-occlusions", "non-lambertian", "wide-disparity"])
+@pytest.mark.parametrize("scene", ["deep-occlusions", "wide-disparity"])
 def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
     given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
     result, verdict = reconstruct_judged(

@@ -19,15 +19,11 @@ Array = NDArray[np.floating]
 Patches = Callable[[NDArray[np.bool_]], Array]
 """Returns a light field (v, u, y, x, c) of sparse patches to average with in place of total
 variation's, given which readings to fit and the order in which its views lie."""
-FREE_SHOTS = 2
-"""Shots from which surfaces are averaged with total variation, where no patches are given: with
-three shots +0.11 dB in the mean of group A (`adaptive-fast`, 96x128), with one +0.03 dB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """The models of surfaces, and last, from two shots on, one without: sparse patches or total
-    variation.
+    """The models of surfaces, and last one without: sparse patches or total variation.
 
     light_fields: (v, u, y, x, c) of each; residuals: frames less what each predicts, (shot,
     pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's scale. patched:
@@ -93,10 +89,9 @@ def fitted_models(
     assert scene is not None
     if patches is not None:
         light_fields.append(patches(given.usable & ~held))
-    elif given.psi.shots >= FREE_SHOTS:
+    else:
         light_fields.append(survey.plain)
-    for light_field in light_fields[len(settings.misfits) :]:
-        residuals.append(given.frames - given.psi.forward(light_field))
+    residuals.append(given.frames - given.psi.forward(light_fields[-1]))
     return Fits(light_fields, residuals, scene, patches is not None)
 
 

@@ -8,8 +8,8 @@
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `texture`, `shrinkage`, `refine`, `sweep`).
-5. Textures that follow the readings more or less closely and, from two shots on, sparse patches or
-   total variation are averaged by how well they predict readings kept from all of them (`fits`,
+5. Textures that follow the readings more or less closely, and sparse patches from two shots on or
+   total variation, are averaged by how well they predict readings kept from all of them (`fits`,
    `mixture`), which also calibrate the standard deviation of the result (`uncertainty`).
 
 Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
@@ -120,9 +120,8 @@ def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) ->
     size, k = survey.given.psi.size, survey.given.psi.binning
     kinds = texture_map(survey.volume, size, k)
     models = model_map(kinds, fits.scene)
-    if len(mean.shares) > len(settings.misfits):
-        free = mean.shares[-1] > MOSTLY
-        models[free.repeat(k, axis=0).repeat(k, axis=1)] = MODELS.index("free")
+    free = mean.shares[-1] > MOSTLY
+    models[free.repeat(k, axis=0).repeat(k, axis=1)] = MODELS.index("free")
     maps = {
         "disparity": fits.scene.centre,
         "disparity_sigma": np.sqrt(search.variance_per_pixel(survey.volume, size, k)),

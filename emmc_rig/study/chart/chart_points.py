@@ -19,7 +19,7 @@ from emmc_rig.study.trial import Capture
 from reconstruction.methods import METHODS, MethodSettings, installed_methods
 from simulators.scenes import SCENES
 
-FAST_SCENES = ("near-planar", "deep-occlusions", "wide-disparity")
+FAST_SCENES = ("near-planar", "deep-occlusions")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
 CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-2shots", "rgbw-bayer-3shots", "rgbw-mono")
 FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0, "limit_s": 300.0}

@@ -115,7 +115,8 @@ CAVEATS = (
     "Angular: 0 dB is what one picture copied to every view scores; below, parallax is worse than "
     "none. Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
     "Seconds are the median of repeats after a warm-up, one point at a time in a process of their "
-    "own; the dictionary is made beforehand. Memory is that of the whole process.",
+    "own; the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
+    "dictionary.",
 )
 MEANS = {
     "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",

@@ -52,8 +52,8 @@ class Job:
 def measured(job: Job) -> dict:
     """Return the figures of a job, as plain data.
 
-    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. peak_mib: resident
-    memory of the process at most during the timed runs, less the truth, which no method needs.
+    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. peak_mib: memory
+    that the timed runs take at most, beyond the process with Psi, frames and dictionary.
     """
     trial, method = trial_of(job.point.capture), job.point.configuration.method
     settings = job.point.configuration.settings
@@ -61,6 +61,7 @@ def measured(job: Job) -> dict:
     _window(trial).solved(method, settings, job.dictionary)
     load = os.getloadavg()[0]
     forget_peak()
+    held_mib = peak_memory_mib()
     wall, cpu, result = [], [], None
     while len(wall) < job.repeats and (not wall or sum(wall) < job.enough_s):
         result = None
@@ -69,7 +70,7 @@ def measured(job: Job) -> dict:
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
     assert result is not None
-    peak_mib = peak_memory_mib() - trial.truth.nbytes / 2**20
+    peak_mib = peak_memory_mib() - held_mib
     scores = scored(
         result.light_field, trial.truth, trial.disparity_px, result.maps.get("disparity")
     )
