@@ -200,16 +200,6 @@ def test_an_update_with_many_power_iterations_is_the_singular_vector():
     np.testing.assert_allclose(np.abs(weights[:, 0]), size[0] * np.abs(left[:, 0]), atol=1e-3)
 
 
-def test_an_update_in_parts_is_the_same(monkeypatch):
-    _, patches = planted(300, atoms=4, sparsity=2, noise=0.1)
-    results = []
-    for rows in (2048, 50):
-        monkeypatch.setattr(learning, "_ROWS_AT_ONCE", rows)
-        settings = settings_of(atoms=4, sparsity=2, iterations=3)
-        results.append(learn_ksvd(patches, SHAPE, settings).atoms)
-    np.testing.assert_allclose(*results, atol=1e-4)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_planted_dictionary_is_recovered(seed):
     truth, patches = planted(3000, noise=0.03, seed=seed)
