@@ -104,19 +104,19 @@ def first_state(
     wanted = settings.atoms - len(fixed)
     order = np.random.default_rng(settings.seed).permutation(len(patches))
     chosen = np.empty((wanted, patches.shape[1]), np.float32)
-    found = 0
+    filled = 0
     for start in range(0, len(order), _ROWS_AT_ONCE):
         rows = patches[order[start : start + _ROWS_AT_ONCE]]
         left = rows - (rows @ fixed.T) @ fixed
         norms = np.linalg.norm(left, axis=1)
-        good = np.flatnonzero(norms > 1e-3 * np.linalg.norm(rows, axis=1))[: wanted - found]
-        chosen[found : found + len(good)] = left[good] / norms[good, None]
-        found += len(good)
-        if found == wanted:
+        good = np.flatnonzero(norms > 1e-3 * np.linalg.norm(rows, axis=1))[: wanted - filled]
+        chosen[filled : filled + len(good)] = left[good] / norms[good, None]
+        filled += len(good)
+        if filled == wanted:
             break
-    if found < wanted:
+    if filled < wanted:
         raise DictionaryError(
-            f"only {found} of {len(patches)} patches are not flat, too few to start "
+            f"only {filled} of {len(patches)} patches are not flat, too few to start "
             f"{settings.atoms} atoms: give more patches or ask for fewer atoms"
         )
     codes = len(patches), settings.sparsity

@@ -5,10 +5,10 @@
         files.json           the command, and the SHA-256 of every file it wrote
         .emmc-rig.partial/   while a command writes: new/, moves.json, kept/, lock
 
-A command writes into `new`. When all of it is on the disk, `moves.json` says so; then the files of
-the earlier result go, the new ones are renamed into their places, and the hidden folder goes. Moves
-that were interrupted are finished, by the command itself or by the next one into the folder. Those
-that version 0.2 began had first moved the earlier result to `earlier`.
+A command writes into `new`. When all of it is on the disk, `moves.json` says so; then files of the
+earlier result are deleted, the new ones renamed into their places, and the hidden folder goes.
+Moves that were interrupted are finished, by the command itself or by the next one into the folder;
+also those of version 0.2, which first moved the earlier result to `earlier`.
 
 Nothing is written where a session of `emmc-rig capture` lies: see `refuse_inside_session`.
 """
@@ -127,9 +127,9 @@ def result_folder(
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
     finally:
-        for one in made:
+        for path in made:
             with suppress(OSError):
-                one.rmdir()
+                path.rmdir()
 
 
 def kept_folder(new: Path) -> Path:
@@ -192,17 +192,13 @@ def refuse_inside_session(out: Path, belongs_to: Path | None = None) -> None:
     real = Path(os.path.realpath(out))
     if belongs_to is not None and real == Path(os.path.realpath(belongs_to)):
         return
-    for one in (real, *real.parents):
-        if _like_session(one):
-            where = "is" if one == real else "lies inside"
+    for place in (real, *real.parents):
+        if any(os.path.isfile(place / name) for name in (SESSION_JOURNAL, SESSION_HEADER)):
+            where = "is" if place == real else "lies inside"
             raise AppError(
-                f"{out}: {where} the session {one}, where nothing else is written; choose another "
-                "place"
+                f"{out}: {where} the session {place}, where nothing else is written; choose "
+                "another place"
             )
-
-
-def _like_session(folder: Path) -> bool:
-    return any(os.path.isfile(folder / name) for name in (SESSION_JOURNAL, SESSION_HEADER))
 
 
 def _refuse_holding(folder: Path, out: Path) -> None:
@@ -219,10 +215,10 @@ def _make_folders(folder: Path, out: Path) -> list[Path]:
     if os.path.isfile(folder):
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
     missing = []
-    for one in (folder, *folder.parents):
-        if os.path.exists(one):
+    for place in (folder, *folder.parents):
+        if os.path.exists(place):
             break
-        missing.append(one)
+        missing.append(place)
     folder.mkdir(parents=True, exist_ok=True)
     return missing
 
@@ -354,7 +350,7 @@ def _take_place(folder: Path, out: Path, earlier: Listing, command: str, adds: b
 
 
 def _finish_moves(folder: Path) -> None:
-    """Finish the moves that `moves.json` tells of, as often as it is needed; else do nothing.
+    """Finish the moves that `moves.json` lists; without such a file, do nothing.
 
     Raises AppError where somebody changed, after a kill, what would be replaced.
     """

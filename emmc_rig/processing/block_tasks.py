@@ -344,9 +344,9 @@ class Blocks:
     def verdict(self) -> Verdict:
         """Return the verdict on all blocks; raises AppError where none could be judged."""
         judged = [
-            judged_block(said.verdict, block, self.job.psi.binning)
-            for block, said in zip(self.grid, self.done, strict=True)
-            if said.verdict is not None
+            judged_block(done.verdict, block, self.job.psi.binning)
+            for block, done in zip(self.grid, self.done, strict=True)
+            if done.verdict is not None
         ]
         if not judged:
             raise AppError("no usable pixel: every one is saturated or excluded")
@@ -437,13 +437,13 @@ def compute_blocks(
     if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):
-        said = done_block(task)
-        if said is None:
+        computed = done_block(task)
+        if computed is None:
             raise AppError(
                 f"{task.path('h5')}: a worker wrote it, but it cannot be read here; put frames, "
                 "Psi and --out on a disk that all workers share"
             )
-        done[task.block.name] = said
+        done[task.block.name] = computed
         on_block(len(done), len(tasks))
     ordered = [done[block.name] for block in grid]
     took_s = time.perf_counter() - started

@@ -63,10 +63,10 @@ def ceiling_for(memory: int, requests: Sequence[Request]) -> tuple[Ceiling, int,
         settings = request.settings or MethodSettings()
         need = max(need, task_bytes(psi, assumed_grid(psi, settings)))
         own = max(own, own_bytes(psi, settings, request.as_zarr, request.truth is not None))
-    one, two = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
-    if len(requests) > 1 and two.total - two.own >= 2 * need:
-        return two, two.workers(need), 2
-    return one, one.workers(need), 1
+    single, double = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
+    if len(requests) > 1 and double.total - double.own >= 2 * need:
+        return double, double.workers(need), 2
+    return single, single.workers(need), 1
 
 
 def reconstruct_captures(

@@ -135,7 +135,7 @@ def _as_frames(
         if not is_level:
             raise refusal(noise_sigma, "noise_sigma", "the readings' standard deviation, 0 or more")
     if isinstance(frames, Frames):
-        given = frames
+        taken = frames
     else:
         readings = numbers_of(frames, "frames", FRAMES_TAKES)
         everywhere = np.ones(readings.shape, dtype=bool)
@@ -144,17 +144,17 @@ def _as_frames(
             everywhere &= np.isfinite(deviation)
         else:
             deviation = np.zeros(readings.shape)
-        given = Frames(readings, deviation, everywhere)
+        taken = Frames(readings, deviation, everywhere)
     if noise_sigma is not None:
-        given = replace(given, deviation=np.full(given.shape, noise_sigma))
+        taken = replace(taken, deviation=np.full(taken.shape, noise_sigma))
     if usable is None:
-        return given
+        return taken
     if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
         raise refusal(usable, "usable", "a boolean array (shot, pixel_y, pixel_x)")
-    if usable.shape == given.shape:
+    if usable.shape == taken.shape:
         # Why they are not to be used is not known: not that there was at least so much light.
-        given = replace(given, readings=np.where(usable, given.readings, 0))
-    return replace(given, usable=usable)
+        taken = replace(taken, readings=np.where(usable, taken.readings, 0))
+    return replace(taken, usable=usable)
 
 
 def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:
