@@ -92,7 +92,7 @@ def result_folder(
     """Yield a folder to write into; its files appear in `out` together when the block succeeds.
 
     The files of an earlier result of the same command are replaced; whatever else is in the folder
-    stays. After a failure everything is as it was.
+    stays. After a failure everything is as it was; after one in the moves, they are finished.
 
     Args:
         out: the folder; made where missing.

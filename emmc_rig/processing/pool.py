@@ -131,6 +131,7 @@ class Processes(Pool):
     def __init__(self, size: int, ceiling: Ceiling | None = None) -> None:
         super().__init__(size)
         self.ceiling = ceiling
+        # Processes read one end, which no one writes to, and end when the other is closed.
         self._theirs, self._mine = multiprocessing.Pipe(duplex=False)
 
     def _start(self) -> Executor:
@@ -189,6 +190,7 @@ class Processes(Pool):
         self._mine.close()
         with self._lock:
             self._shut_down()
+            self._theirs.close()
 
 
 def fingerprint() -> dict[str, str]:
