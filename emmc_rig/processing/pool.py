@@ -20,7 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import one_line
@@ -225,7 +225,7 @@ class Cluster(Pool):
         self.losses = KilledWorker, Cancelled, CancelledError, CommClosedError
         self._address = address
         try:
-            self._client = Client(address, timeout=CONNECT_S, set_as_default=False)
+            self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError, RuntimeError) as fault:
             raise WorkersError(
                 f"--cluster {address}: no Dask scheduler answers there; start one by `dask "
