@@ -1,5 +1,6 @@
 """Learning: pursuits against scikit-learn, K-SVD against its definition, resuming, coresets."""
 
+import learning
 import numpy as np
 import pytest
 from learning import (
@@ -18,7 +19,6 @@ from training_patches import (
 )
 
 from emmc_rig.model.settings import validated
-from reconstruction import learning
 from reconstruction.batch_omp import NO_ATOM, batch_omp
 from reconstruction.errors import DictionaryError
 
