@@ -15,19 +15,17 @@ dictionaries 4 K n, the Gram matrix 4 K^2: 1.8 GB there. Bytes of the updates: 8
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.sparse import csr_array
 
-from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.settings import Settings
-from reconstruction.batch_omp import NO_ATOM, Array, bands, batch_omp
+from reconstruction.batch_omp import NO_ATOM, Array, batch_omp
 from reconstruction.errors import DictionaryError
 
 _ROWS_AT_ONCE = 2048
@@ -106,19 +104,19 @@ def first_state(
     wanted = settings.atoms - len(fixed)
     order = np.random.default_rng(settings.seed).permutation(len(patches))
     chosen = np.empty((wanted, patches.shape[1]), np.float32)
-    found = 0
+    filled = 0
     for start in range(0, len(order), _ROWS_AT_ONCE):
         rows = patches[order[start : start + _ROWS_AT_ONCE]]
         left = rows - (rows @ fixed.T) @ fixed
         norms = np.linalg.norm(left, axis=1)
-        good = np.flatnonzero(norms > 1e-3 * np.linalg.norm(rows, axis=1))[: wanted - found]
-        chosen[found : found + len(good)] = left[good] / norms[good, None]
-        found += len(good)
-        if found == wanted:
+        good = np.flatnonzero(norms > 1e-3 * np.linalg.norm(rows, axis=1))[: wanted - filled]
+        chosen[filled : filled + len(good)] = left[good] / norms[good, None]
+        filled += len(good)
+        if filled == wanted:
             break
-    if found < wanted:
+    if filled < wanted:
         raise DictionaryError(
-            f"only {found} of {len(patches)} patches are not flat, too few to start "
+            f"only {filled} of {len(patches)} patches are not flat, too few to start "
             f"{settings.atoms} atoms: give more patches or ask for fewer atoms"
         )
     codes = len(patches), settings.sparsity
@@ -201,42 +199,18 @@ def check_patches(patches: Array, settings: LearningSettings, patch_shape: tuple
         raise DictionaryError("training patches hold values that are not finite: leave them out")
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _residual(atoms, patch, indices, coefficients, out):
-    """Set out (sample,) to the patch less its code, and return its squared norm."""
-    out[:] = patch
-    for k in range(indices.size):
-        if indices[k] >= 0:
-            atom, weight = atoms[indices[k]], coefficients[k]
-            for i in range(out.size):
-                out[i] -= weight * atom[i]
-    total = 0.0
-    for i in range(out.size):
-        total += np.float64(out[i]) * out[i]
-    return total
+def _parts(count: int) -> list[slice]:
+    """Return slices over so many patches, of which one is in memory beside them at a time."""
+    return [slice(first, first + _ROWS_AT_ONCE) for first in range(0, count, _ROWS_AT_ONCE)]
 
 
-@njit(cache=True, nogil=True)
-def _errors_of_rows(atoms, patches, indices, coefficients, errors):
-    spare = np.empty(patches.shape[1], patches.dtype)
-    for row in range(len(patches)):
-        errors[row] = _residual(atoms, patches[row], indices[row], coefficients[row], spare)
-
-
-@njit(cache=True, nogil=True)
-def _keep_better_rows(
-    atoms, patches, old_indices, old_coefficients, indices, coefficients, residuals, errors
-):
-    spare = np.empty(patches.shape[1], patches.dtype)
-    for row in range(len(patches)):
-        new, old = residuals[row], spare
-        errors[row] = _residual(atoms, patches[row], indices[row], coefficients[row], new)
-        before = _residual(atoms, patches[row], old_indices[row], old_coefficients[row], old)
-        if before <= errors[row]:
-            errors[row] = before
-            new[:] = old
-            indices[row] = old_indices[row]
-            coefficients[row] = old_coefficients[row]
+def _residuals(atoms: Array, patches: Array, indices: NDArray, coefficients: Array) -> Array:
+    """Return patches less their codes (patch, sample)."""
+    starts = np.arange(len(indices) + 1) * indices.shape[1]
+    columns = np.where(indices >= 0, indices, 0).ravel()
+    weights = np.where(indices >= 0, coefficients, np.float32(0)).ravel()
+    codes = csr_array((weights, columns, starts), shape=(len(indices), len(atoms)))
+    return patches - codes @ atoms
 
 
 def _keep_better(
@@ -248,22 +222,15 @@ def _keep_better(
 ) -> NDArray[np.float64]:
     """Put a patch's old code back where the new one is no better; set residuals, return squares."""
     errors = np.empty(len(patches))
-
-    def rows(band: tuple[int, int]) -> None:
-        part = slice(*band)
-        _keep_better_rows(
-            state.atoms,
-            patches[part],
-            state.indices[part],
-            state.coefficients[part],
-            indices[part],
-            coefficients[part],
-            residuals[part],
-            errors[part],
-        )
-
-    with ThreadPoolExecutor(get_num_threads()) as pool:
-        list(pool.map(rows, bands(len(patches))))
+    for part in _parts(len(patches)):
+        new = _residuals(state.atoms, patches[part], indices[part], coefficients[part])
+        old_code = state.indices[part], state.coefficients[part]
+        old = _residuals(state.atoms, patches[part], *old_code)
+        after, before = squared_norms(new), squared_norms(old)
+        worse = before <= after
+        residuals[part] = np.where(worse[:, None], old, new)
+        indices[part][worse], coefficients[part][worse] = (code[worse] for code in old_code)
+        errors[part] = np.minimum(before, after)
     return errors
 
 
@@ -303,35 +270,19 @@ def _update_atoms(
     weights = coefficients.reshape(-1)
     for atom in range(fixed, len(atoms)):
         places = order[begins[atom] : begins[atom + 1]]
-        if not places.size:
-            continue
-        old_atom, old_weights = atoms[atom].copy(), weights[places]
-        parts = np.array_split(places // indices.shape[1], -(-len(places) // _ROWS_AT_ONCE))
-        cuts = np.cumsum([0, *map(len, parts)])
-        gathered = [residuals[part] for part in parts] if len(parts) == 1 else None
-        new_weights = old_weights
-        new_atom = old_atom
+        users = places // indices.shape[1]
+        rows, old_atom, old_weights = residuals[users], atoms[atom].copy(), weights[places]
+        new_atom, new_weights = old_atom, old_weights
         for _ in range(power_iterations):
-            total = (new_weights @ old_weights) * old_atom
-            for i, part in enumerate(parts):
-                rows = gathered[i] if gathered else residuals[part]
-                total += new_weights[cuts[i] : cuts[i + 1]] @ rows
+            total = (new_weights @ old_weights) * old_atom + new_weights @ rows
             length = np.linalg.norm(total)
-            if length == 0:
+            if length == 0:  # also where no patch uses the atom
                 break
             new_atom = total / length
-            new_weights = (old_atom @ new_atom) * old_weights
-            for i, part in enumerate(parts):
-                rows = gathered[i] if gathered else residuals[part]
-                new_weights[cuts[i] : cuts[i + 1]] += rows @ new_atom
+            new_weights = (old_atom @ new_atom) * old_weights + rows @ new_atom
         change = np.stack([old_atom, -new_atom])
-        for i, part in enumerate(parts):
-            rows = gathered[i] if gathered else residuals[part]
-            both = np.stack([old_weights, new_weights])[:, cuts[i] : cuts[i + 1]]
-            rows += both.T @ change
-            residuals[part] = rows
-        atoms[atom] = new_atom
-        weights[places] = new_weights
+        residuals[users] = rows + np.stack([old_weights, new_weights]).T @ change
+        atoms[atom], weights[places] = new_atom, new_weights
 
 
 def _replace_atoms(
@@ -345,15 +296,16 @@ def _replace_atoms(
     poor = poor_atoms(state.atoms, uses, settings, fixed)
     if not poor.size:
         return state, 0
-    errors = np.empty(len(patches))
-
-    def rows(band: tuple[int, int]) -> None:
-        part = slice(*band)
-        codes = state.indices[part], state.coefficients[part]
-        _errors_of_rows(state.atoms, patches[part], *codes, errors[part])
-
-    with ThreadPoolExecutor(get_num_threads()) as pool:
-        list(pool.map(rows, bands(len(patches))))
+    errors = np.concatenate(
+        [
+            squared_norms(
+                _residuals(
+                    state.atoms, patches[part], state.indices[part], state.coefficients[part]
+                )
+            )
+            for part in _parts(len(patches))
+        ]
+    )
     worst = np.argsort(-errors, kind="stable")[: len(poor)]
     worst = worst[errors[worst] > 0]
     poor = poor[: len(worst)]

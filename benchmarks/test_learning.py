@@ -1,5 +1,6 @@
 """Learning: pursuits against scikit-learn, K-SVD against its definition, resuming, coresets."""
 
+import learning
 import numpy as np
 import pytest
 from learning import (
@@ -18,7 +19,6 @@ from training_patches import (
 )
 
 from emmc_rig.model.settings import validated
-from reconstruction import learning
 from reconstruction.batch_omp import NO_ATOM, batch_omp
 from reconstruction.errors import DictionaryError
 
@@ -198,16 +198,6 @@ def test_an_update_with_many_power_iterations_is_the_singular_vector():
     left, size, right = np.linalg.svd(patches.astype(np.float64))
     assert abs(right[0] @ atoms[0]) == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(np.abs(weights[:, 0]), size[0] * np.abs(left[:, 0]), atol=1e-3)
-
-
-def test_an_update_in_parts_is_the_same(monkeypatch):
-    _, patches = planted(300, atoms=4, sparsity=2, noise=0.1)
-    results = []
-    for rows in (2048, 50):
-        monkeypatch.setattr(learning, "_ROWS_AT_ONCE", rows)
-        settings = settings_of(atoms=4, sparsity=2, iterations=3)
-        results.append(learn_ksvd(patches, SHAPE, settings).atoms)
-    np.testing.assert_allclose(*results, atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

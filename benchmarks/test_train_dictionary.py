@@ -32,7 +32,7 @@ def test_a_stopped_training_goes_on_to_the_undisturbed_atoms(scenes, tmp_path, m
     def stop(*_):
         raise KeyboardInterrupt
 
-    # The first step that is told is kept, and then the training stops.
+    # The first step is kept, and then the training stops.
     monkeypatch.setattr(train_dictionary, "CHECKPOINT_INTERVAL_S", -1.0)
     with monkeypatch.context() as patch:
         save = train_dictionary.save_checkpoint

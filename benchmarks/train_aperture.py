@@ -27,7 +27,7 @@ from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.cameras import camera_file
-from emmc_rig.files.folders import new_file, refuse_new_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line
 from emmc_rig.model.camera import Camera, load_camera, pixel_light
 from emmc_rig.model.masks import Parameters
@@ -197,7 +197,8 @@ def train(camera_name: str, out: Path, worlds: int, seed: int) -> None:
     """
     if out.suffix not in (".yaml", ".yml"):
         raise AppError(f"--out {out}: a camera's file ends in .yaml")
-    refuse_new_file(out)
+    if out.exists():
+        raise AppError(f"{out}: exists already; choose another name")
     path = camera_file(camera_name)
     camera = load_camera(path)
     aperture = aperture_of(camera)

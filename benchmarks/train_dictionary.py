@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from training_patches import PatchSettings, training_patches
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.files.folders import new_file, refuse_new_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line, parse_size, versions
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.files import whole_file
@@ -69,7 +69,8 @@ def train(
     if out.suffix not in (".h5", ".hdf5"):
         raise AppError(f"--out {out}: a dictionary's file ends in .h5")
     for path in (out, picture):
-        refuse_new_file(path)
+        if path.exists():
+            raise AppError(f"{path}: exists already; choose another name")
     patches = training_patches(
         [lambda spec=spec: open_scene(spec).light_field for spec in scenes],
         patching,

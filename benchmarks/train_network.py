@@ -32,7 +32,7 @@ from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import new_file, refuse_new_file
+from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line, versions
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
@@ -193,7 +193,8 @@ class Learner:
 
 def train(out: Path, data: TrainingData, architecture: Architecture, steps: int) -> NetworkWeights:
     """Write the weights after so many steps in all to `out`; return them."""
-    refuse_new_file(out)
+    if out.exists():
+        raise AppError(f"{out}: exists already; choose another name")
     kept = out.with_suffix(".checkpoint.pt")
     recipe = {
         "cameras": list(data.cameras), "scenes": list(data.scenes), "crop": data.crop,

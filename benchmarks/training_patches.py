@@ -115,9 +115,9 @@ def training_patches(
     kind = (0, 0, 0)
     for number, scene in enumerate(scenes):
         light_field = scene()
-        found = light_field.shape[0], light_field.shape[1], light_field.shape[4]
-        kind = kind if number else found
-        _check(light_field, number, found, kind, settings)
+        own_kind = light_field.shape[0], light_field.shape[1], light_field.shape[4]
+        kind = kind if number else own_kind
+        _check(light_field, number, own_kind, kind, settings)
         filled = edges[number]
         for batch in _candidates(light_field, number, edges, settings):
             pixels = batch.reshape(len(batch), -1, batch.shape[-1])
@@ -147,15 +147,15 @@ def training_patches(
 def _check(
     light_field: Array,
     number: int,
-    found: tuple[int, int, int],
+    own_kind: tuple[int, int, int],
     kind: tuple[int, int, int],
     settings: PatchSettings,
 ) -> None:
     height, width = light_field.shape[2:4]
-    if found != kind:
+    if own_kind != kind:
         raise DictionaryError(
-            f"scene {number} has {found[0]}x{found[1]} views of {found[2]} colours, the first "
-            f"{kind[0]}x{kind[1]} of {kind[2]}: train on scenes of the same views"
+            f"scene {number} has {own_kind[0]}x{own_kind[1]} views of {own_kind[2]} colours, the "
+            f"first {kind[0]}x{kind[1]} of {kind[2]}: train on scenes of the same views"
         )
     if height < settings.rows or width < settings.columns:
         raise DictionaryError(

@@ -37,20 +37,8 @@ WRITERS = {
     "calibrate --drift": ("frames", "--known", "frames"),
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
-    "chart --ablation": (*SIZE,),
-    "chart --constants": (*SIZE,),
-    "chart --guard": (*SIZE,),
-    "chart --kernels": (*SIZE,),
-    "chart --live": (*SIZE,),
-    "chart --next-shot": (*SIZE,),
-    **({"chart --pages": (*SIZE,)} if shutil.which("chromedriver") else {}),
-    "chart --peers": (*SIZE,),
-    "chart --solvers": (),
-    "chart --stated": (*SIZE,),
-    "chart --trends": (*SIZE,),
     "demo": (*SIZE,),
     "design": (),
-    "design --check": (),
     "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
@@ -59,14 +47,10 @@ WRITERS = {
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "reconstruct --tile": (8, "frames"),
-    "session bench": (),
     "session export": ("made-session",),
     "session sheet": ("made-session",),
     "simulate": (*SIZE,),
     "stability": ("--fast",),
-    "stability --theory": ("--fast",),
-    "stability --verdicts": ("--fast",),
-    "stability --worst": ("--fast",),
     "tables": ("--fast",),
 }  # fmt: skip
 READERS = {
@@ -75,17 +59,9 @@ READERS = {
     "session prune", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
-    "chart --ablation": "ablation.jsonl",
-    "chart --constants": "constants.jsonl",
     "chart": "points.jsonl",
-    "chart --next-shot": "next_shots.jsonl",
-    "chart --trends": "trends.jsonl",
     "design": "simulations.jsonl",
-    "design --check": "simulations.jsonl",
     "stability": "points.jsonl",
-    "stability --theory": "points.jsonl",
-    "stability --verdicts": "verdicts.jsonl",
-    "stability --worst": "worst.jsonl",
     "tables": "cells.jsonl",
 }
 """What lies in a folder that a study goes on with."""
@@ -257,7 +233,7 @@ def test_every_command_states_its_stage_before_its_work_begins(world, tmp_path, 
     monkeypatch.setattr("emmc_rig.commands.capture.emit", stop)
     out = tmp_path / ("new.h5" if typed in ONE_FILE else "new")
     before = files_of(world)
-    code, err = called(typed, "--json", *(() if typed == "session bench" else ("--out", out)))
+    code, err = called(typed, "--json", "--out", out)
     assert events[-1] == "stage", err
     assert not {"result", "error"} & set(events)
     assert code == 130
@@ -270,6 +246,4 @@ def test_a_plan_in_a_session_begins_no_session_inside_it(world, monkeypatch):
     code, _, err = program("capture", "held/session/plan.yaml", *RIG)
     assert code == 1
     assert "lies inside the session" in err
-    code, _, err = program("session", "bench", "--folder", "held/session")
-    assert code == 1
     assert files_of(world) == before

@@ -62,6 +62,23 @@ def test_a_view_between_has_near_before_far_where_they_truly_are(scene, v, u):
     assert missed.mean() < np.abs(nearest - truth)[INNER][clear].mean() / 3
 
 
+def test_surfaces_far_apart_are_drawn_the_near_one_before_the_far_one():
+    """Weights fall exponentially with the distance behind the nearest surface, and none overflows.
+
+    A gap of 30 px between views: behind the outline, some views see the far plane alone.
+    """
+    far_px, near_px = -15.0, 15.0
+    seen = [[layered(v, u, far_px, near_px) for u in range(5)] for v in range(5)]
+    light_field = np.array([[picture for picture, _ in row] for row in seen])
+    disparities = np.array([[disparity for _, disparity in row] for row in seen])
+    drawn = between(light_field, disparities, 2.25, 2.5)
+    truth, depth = layered(2.25, 2.5, far_px, near_px)
+    inside = cv2.erode((depth == near_px).astype(np.uint8), np.ones((9, 9))) > 0
+    assert inside.sum() > 200
+    assert np.abs(drawn - truth)[inside].max() < 0.01
+    assert np.isfinite(drawn).all()
+
+
 def test_what_every_view_sees_follows_from_the_centre(scene):
     _, disparities = scene
     made = view_disparities(centre_view(disparities[..., None])[..., 0], VIEWS)

@@ -256,29 +256,72 @@ def test_whatever_ends_a_command_anywhere_the_folder_is_one_whole_result(
     assert at > 20
 
 
-def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out):
+def killed_after(out, renames):
+    """Write NEW over OLD, and be killed after so many files took their places."""
+    done = []
+
+    def replace(source, target, real=os.replace):
+        if len(done) > renames:  # the first is the journal itself
+            raise Killed
+        done.append(target)
+        real(source, target)
+
     with pytest.MonkeyPatch.context() as patch:
-        moves = []
-
-        def rename(source, target, real=os.rename):
-            moves.append(target)
-            if len(moves) == 6:  # four files of the earlier result are away, one new is in place
-                raise Killed
-            real(source, target)
-
-        patch.setattr(os, "rename", rename)
-        patch.setattr("emmc_rig.files.folders._undo", lambda folder: None)
+        patch.setattr(os, "replace", replace)
         with suppress(Killed):
             write(out, NEW)
-    (out / "light_field.h5").write_text("edited")
+    assert (out / PARTIAL / "moves.json").exists()
+
+
+@pytest.mark.parametrize("name", ["light_field.h5", "metrics.json"])
+def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out, name):
+    """light_field.h5 has taken its place by then, metrics.json is the earlier one yet."""
+    killed_after(out, 1)
+    (out / name).write_text("edited")
     for _ in range(2):
-        with pytest.raises(AppError, match="was edited after a command was killed"):
-            write(out, NEW)
-        assert (out / "light_field.h5").read_text() == "edited"
-    (out / "light_field.h5").rename(out.parent / "mine")
+        with pytest.raises(AppError, match=f"{name} is not what `emmc-rig simulate` wrote"):
+            write(out, OLD)
+        assert (out / name).read_text() == "edited"
+    (out / name).rename(out.parent / "mine")
     failing_command(out)
-    assert {name: (out / name).read_text() for name in OLD} == OLD
+    # What had taken its place is where its owner moved it, everything else is the new result.
+    moved = {name} & {"light_field.h5"}
+    written = {other: (out / other).read_text() for other in NEW if other not in moved}
+    assert written == {other: text for other, text in NEW.items() if other not in moved}
+    assert not any((out / other).exists() for other in moved)
     assert not (out / PARTIAL).exists()
+
+
+def test_a_file_of_somebody_that_came_after_a_kill_is_kept_and_reported(out):
+    killed_after(out, 0)
+    (out / "light_field.h5").write_text("mine")
+    with pytest.raises(AppError, match=r"light_field\.h5 is there and of no earlier result"):
+        write(out, OLD)
+    assert (out / "light_field.h5").read_text() == "mine"
+
+
+@pytest.mark.parametrize("moved_away", range(5))
+@pytest.mark.parametrize("in_place", range(5))
+def test_moves_that_version_0_2_left_are_finished(out, moved_away, in_place):
+    """It moved all of the earlier result away, files.json first, and then the new files in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("emmc_rig.files.folders._finish_moves", lambda folder: None)
+        write(out, NEW)
+    partial, leaving = out / PARTIAL, [FILES, *sorted(OLD)]
+    moves = json.loads((partial / "moves.json").read_text())
+    for name in leaving[: moved_away if in_place == 0 else 4]:
+        (partial / "earlier" / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).rename(partial / "earlier" / name)
+    for name in list(moves["new"])[:in_place]:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (partial / "new" / name).rename(out / name)
+    (partial / "moves.json").write_text(json.dumps({"earlier": leaving, "new": moves["new"]}))
+    failing_command(out)
+    assert {name: (out / name).read_text() for name in NEW} == NEW
+    assert set(json.loads((out / FILES).read_text())["files"]) == set(NEW)
+    assert (out / "thesis.txt").read_text() == "years of work"
+    assert not any((out / name).exists() for name in OLD if name not in NEW)
+    assert not partial.exists()
 
 
 KILLED = """

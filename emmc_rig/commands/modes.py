@@ -15,56 +15,22 @@ from typer.main import get_command
 from emmc_rig.commands.output import emit, json_wanted
 from emmc_rig.errors import ERRORS
 
-TIMED = {"camera", "size", "repeats", "out"}
-STUDIED = {"scene", "camera", "size", "out"}
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
         "session": {"route", "sensor", "stage", "out"},
-        "check": {
-            "camera",
-            "size",
-            "target",
-            "rays",
-            "seed",
-            "leave_out",
-            "few",
-            "stage",
-            "psnr",
-            "out",
-        },
         "plan": {"camera", "size", "target", "rays", "seed", "leave_out", "few", "frames", "out"},
     },
     "capture": {"schema": set(), "new": {"out"}},
-    "chart": {
-        "solvers": {"camera", "dictionary", "out"},
-        "peers": TIMED,
-        "kernels": TIMED,
-        "guard": STUDIED,
-        "live": STUDIED,
-        "pages": STUDIED | {"seed"},
-        "stated": STUDIED,
-        "trends": STUDIED | {"seed"},
-        "ablation": STUDIED | {"seed"},
-        "constants": STUDIED | {"seed"},
-        "next_shot": STUDIED | {"seed", "until"},
-    },
-    "design": {"check": {"bench", "scene", "size", "seed", "out"}},
     "export": {"list_formats": set()},
     "reconstruct": {"list_methods": set()},
-    "stability": {
-        "faults": set(),
-        "verdicts": STUDIED | {"fast", "fault", "method", "seed", "constants"},
-        "worst": STUDIED | {"fast", "method", "dictionary", "seed"},
-    },
+    "stability": {"faults": set()},
 }
 """By command and mode, as its function names them: what else may be given."""
 NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
-    "calibrate": {"known": "drift", "frames": "plan", "psnr": "check", "sensor": "session"},
+    "calibrate": {"known": "drift", "frames": "plan", "sensor": "session"},
     "cameras": {"out": "name"},
-    "chart": {"until": "next_shot"},
     "export": {"truth": "result"},
-    "stability": {"constants": "verdicts"},
 }
 """By command, an option and the one, or those, without which it does nothing."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")

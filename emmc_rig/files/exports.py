@@ -55,7 +55,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
         true = _true(truth, light_field.shape, metrics)
         if true.shape != light_field.shape:
             raise SceneError(f"{truth}: shape {true.shape}, but {spec} has {light_field.shape}")
-    fitting = {name: one for name, one in maps.items() if _fits(one, light_field.shape)}
+    fitting = {name: values for name, values in maps.items() if _fits(values, light_field.shape)}
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
             name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")

@@ -3,12 +3,12 @@
     OUT/
         metrics.json, ...    what a command wrote
         files.json           the command, and the SHA-256 of every file it wrote
-        .emmc-rig.partial/   while a command writes: new/, earlier/, moves.json, kept/, lock
+        .emmc-rig.partial/   while a command writes: new/, moves.json, kept/, lock
 
-A command writes into `new`. When it is done, the files of the earlier result move to `earlier`,
-the new ones take their places, and the hidden folder goes. `moves.json` is there from before the
-first move until after the last: moves that were interrupted are undone, by the command itself after
-an error or Ctrl-C, by the next command into the folder where the program was killed.
+A command writes into `new`. When all of it is on the disk, `moves.json` says so; then files of the
+earlier result are deleted, the new ones renamed into their places, and the hidden folder goes.
+Moves that were interrupted are finished, by the command itself or by the next one into the folder;
+also those of version 0.2, which first moved the earlier result to `earlier`.
 
 Nothing is written where a session of `emmc-rig capture` lies: see `refuse_inside_session`.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -91,7 +92,7 @@ def result_folder(
     """Yield a folder to write into; its files appear in `out` together when the block succeeds.
 
     The files of an earlier result of the same command are replaced; whatever else is in the folder
-    stays. After a failure everything is as it was.
+    stays. After a failure everything is as it was; after one in the moves, they are finished.
 
     Args:
         out: the folder; made where missing.
@@ -113,7 +114,7 @@ def result_folder(
         refuse_inside_session(out, belongs_to)
         made = _make_folders(folder, out)
         with _workplace(folder / PARTIAL, resumes):
-            _undo(folder)
+            _finish_moves(folder)
             earlier = _replaceable(folder, out, command, adds)
             if not adds:
                 _refuse_holding(folder, out)
@@ -126,9 +127,9 @@ def result_folder(
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
     finally:
-        for one in made:
+        for path in made:
             with suppress(OSError):
-                one.rmdir()
+                path.rmdir()
 
 
 def kept_folder(new: Path) -> Path:
@@ -149,7 +150,7 @@ def new_file(path: Path) -> Iterator[Path]:
     when it came meanwhile, where a session is, and where nothing can be written.
     """
     path = _free(path)
-    place = _place_beside(path)
+    place = path.with_name(f".{path.name}{PARTIAL}")
     try:
         with _workplace(place):
             yield place / path.name
@@ -165,26 +166,11 @@ def new_file(path: Path) -> Iterator[Path]:
         ) from fault
 
 
-def refuse_new_file(path: Path) -> None:
-    """Raise what `new_file` would, before the work is done."""
-    try:
-        with _workplace(_place_beside(_free(path))):
-            pass
-    except OSError as fault:
-        raise AppError(
-            f"{path}: cannot be written ({fault.strerror or fault}); choose another place"
-        ) from fault
-
-
 def _free(path: Path) -> Path:
     refuse_inside_session(path)
     if os.path.lexists(path):
         raise AppError(f"{path}: exists already; choose another name, or move it away first")
     return Path(os.path.abspath(path))
-
-
-def _place_beside(path: Path) -> Path:
-    return path.with_name(f".{path.name}{PARTIAL}")
 
 
 def refuse_missing(folder: Path, remedy: str) -> None:
@@ -206,17 +192,13 @@ def refuse_inside_session(out: Path, belongs_to: Path | None = None) -> None:
     real = Path(os.path.realpath(out))
     if belongs_to is not None and real == Path(os.path.realpath(belongs_to)):
         return
-    for one in (real, *real.parents):
-        if _like_session(one):
-            where = "is" if one == real else "lies inside"
+    for place in (real, *real.parents):
+        if any(os.path.isfile(place / name) for name in (SESSION_JOURNAL, SESSION_HEADER)):
+            where = "is" if place == real else "lies inside"
             raise AppError(
-                f"{out}: {where} the session {one}, where nothing else is written; choose another "
-                "place"
+                f"{out}: {where} the session {place}, where nothing else is written; choose "
+                "another place"
             )
-
-
-def _like_session(folder: Path) -> bool:
-    return any(os.path.isfile(folder / name) for name in (SESSION_JOURNAL, SESSION_HEADER))
 
 
 def _refuse_holding(folder: Path, out: Path) -> None:
@@ -233,10 +215,10 @@ def _make_folders(folder: Path, out: Path) -> list[Path]:
     if os.path.isfile(folder):
         raise AppError(f"--out {out}: a file of that name exists; choose another folder")
     missing = []
-    for one in (folder, *folder.parents):
-        if os.path.exists(one):
+    for place in (folder, *folder.parents):
+        if os.path.exists(place):
             break
-        missing.append(one)
+        missing.append(place)
     folder.mkdir(parents=True, exist_ok=True)
     return missing
 
@@ -279,34 +261,23 @@ def _held(place: Path) -> Callable[[], None]:
             continue  # whoever held it has removed it meanwhile
 
 
-def _holds_work(kept: Path) -> bool:
-    return not kept.is_symlink() and any(kept.iterdir())
-
-
 def _clear(place: Path, spared: str | None = None) -> None:
     """Empty a hidden folder of this program; nothing behind a link is touched.
 
     spared: the one folder in it that stays, unless it is empty.
     """
-    for folder, inner, names in os.walk(place, topdown=False):
-        at = Path(folder).relative_to(place).parts
-        if spared is not None and at[:1] == (spared,):
+    for path in list(place.iterdir()):
+        is_folder = path.is_dir() and not path.is_symlink()
+        if path.name == LOCK or (path.name == spared and is_folder and any(path.iterdir())):
             continue
-        if not at and spared in inner and _holds_work(place / spared):
-            inner.remove(spared)
-        for name in names:
-            if at or name != LOCK:
-                os.unlink(os.path.join(folder, name))
-        for name in inner:
-            path = os.path.join(folder, name)
-            os.unlink(path) if os.path.islink(path) else os.rmdir(path)
+        shutil.rmtree(path) if is_folder else path.unlink()
 
 
 def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
     """Return the earlier result, empty where there is none; raises AppError."""
     earlier = Listing.read(folder)
     if earlier is None:
-        if not adds and any(one.name != PARTIAL for one in folder.iterdir()):
+        if not adds and any(path.name != PARTIAL for path in folder.iterdir()):
             raise AppError(
                 f"--out {out}: the folder holds something else than an earlier result; choose "
                 "another folder or empty it"
@@ -316,7 +287,7 @@ def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
         raise AppError(
             f"--out {out}: holds the result of `emmc-rig {earlier.command}`; choose another folder"
         )
-    _refuse_edited(folder, out, earlier)
+    _refuse_foreign(folder, out, earlier.files, earlier)
     return earlier
 
 
@@ -326,20 +297,26 @@ def refuse_edited(out: Path, command: str) -> None:
         _replaceable(Path(os.path.realpath(out)), out, command, adds=True)
 
 
-def _refuse_edited(folder: Path, out: Path, earlier: Listing) -> None:
-    for name, sha256 in earlier.files.items():
-        path = folder / name
-        if os.path.lexists(path) and (_behind_link(folder, name) or _digest(path) != sha256):
-            raise AppError(
-                f"--out {out}: {name} is not what `emmc-rig {earlier.command}` wrote; move it away "
-                "or choose another folder"
-            )
+def _refuse_foreign(folder: Path, out: Path, names: Iterable[str], earlier: Listing) -> None:
+    """Raise AppError where something at one of these names is not what the earlier result wrote."""
+    for name in names:
+        for path in (folder / name, *_above(folder, name)):
+            is_in_the_way = path.is_file() or path == folder / name
+            inside = path.relative_to(folder).as_posix()
+            if path.is_symlink() or (
+                is_in_the_way and path.exists() and _digest(path) != earlier.files.get(inside)
+            ):
+                what = (
+                    f"{name} is not what `emmc-rig {earlier.command}` wrote"
+                    if name in earlier.files
+                    else f"{inside} is there and of no earlier result"
+                )
+                raise AppError(f"--out {out}: {what}; move it away or choose another folder")
 
 
-def _behind_link(folder: Path, name: str) -> bool:
-    path = folder / name
-    above = [one for one in path.parents if folder in one.parents]
-    return any(one.is_symlink() for one in (path, *above))
+def _above(folder: Path, name: str) -> list[Path]:
+    """Return the folders of a file within a result's folder, the innermost first."""
+    return [path for path in (folder / name).parents if folder in path.parents]
 
 
 def _digest(path: Path) -> str:
@@ -357,73 +334,49 @@ def _take_place(folder: Path, out: Path, earlier: Listing, command: str, adds: b
     kept = {name: sha for name, sha in earlier.files.items() if adds and name not in new}
     listing = Listing(command, {**kept, **new}).text()
     new[FILES] = _write_synced(partial / NEW / FILES, listing)
+    replaced = {FILES: _digest(folder / FILES), **earlier.files}
     # Somebody may have edited it since the command began.
-    _refuse_edited(folder, out, earlier)
-    leaving = [
-        name
-        for name in (FILES, *earlier.files)
-        if name not in kept and os.path.lexists(folder / name)
-    ]
-    for name in new:
-        above = [one for one in (folder / name).parents if folder in one.parents]
-        in_the_way = [one for one in above if one.is_symlink() or one.is_file()]
-        if name not in leaving and os.path.lexists(folder / name):
-            in_the_way.append(folder / name)
-        if in_the_way:
-            raise AppError(
-                f"--out {out}: {in_the_way[0].relative_to(folder)} is there and of no earlier "
-                "result; move it away or choose another folder"
-            )
-    _write_synced(partial / "moves", json.dumps({"earlier": leaving, "new": new}))
+    _refuse_foreign(folder, out, {**replaced, **new}, Listing(earlier.command, replaced))
+    gone = {name: sha for name, sha in replaced.items() if name not in kept}
+    _write_synced(partial / "moves", json.dumps({"command": command, "earlier": gone, "new": new}))
     os.replace(partial / "moves", partial / MOVES)
     try:
-        for name in leaving:
-            _move(folder / name, partial / EARLIER / name)
-        for name in new:
-            _move(partial / NEW / name, folder / name)
-        _sync_folders(folder, [*leaving, *new])
-        (partial / MOVES).unlink()
+        _finish_moves(folder)
     except BaseException:
-        _undo(folder)
+        # After Ctrl-C, or a fault that has passed; otherwise the next command finishes them.
+        with suppress(OSError):
+            _finish_moves(folder)
         raise
-    _remove_empty(folder, leaving)
 
 
-def _undo(folder: Path) -> None:
-    """Undo moves that were interrupted, so that the earlier result is whole; else do nothing."""
+def _finish_moves(folder: Path) -> None:
+    """Finish the moves that `moves.json` lists; without such a file, do nothing.
+
+    Raises AppError where somebody changed, after a kill, what would be replaced.
+    """
     partial = folder / PARTIAL
     try:
         moves = parse_json((partial / MOVES).read_bytes(), str(partial / MOVES), AppError)
     except FileNotFoundError:
         return
-    for name, sha256 in moves["new"].items():
-        path = folder / name
-        # What still lies in `new` was not moved, so that the name is the earlier file's yet.
-        still_new = (partial / NEW / name).exists()
-        restored = name in moves["earlier"] and not (partial / EARLIER / name).exists()
-        if not still_new and not restored and os.path.lexists(path):
-            if _digest(path) != sha256:
-                raise AppError(
-                    f"{path}: was edited after a command was killed here; move it away, and the "
-                    f"earlier result comes back from {partial}"
-                )
-            path.unlink()
-    for name in moves["earlier"]:
-        if (partial / EARLIER / name).exists():
-            if os.path.lexists(folder / name):
-                raise AppError(
-                    f"{folder / name}: came after a command was killed here; move it away, and the "
-                    f"earlier result comes back from {partial}"
-                )
-            _move(partial / EARLIER / name, folder / name)
-    _remove_empty(folder, moves["new"])
+    command, earlier = moves.get("command", ""), moves["earlier"]
+    if isinstance(earlier, list):  # of version 0.2, whose files.json was the first to move
+        was = Listing.read(partial / EARLIER) or Listing.read(folder) or Listing("")
+        command, known = was.command, {FILES: _digest(folder / FILES), **was.files}
+        earlier = {name: known[name] for name in earlier}
+    left = [name for name in moves["new"] if (partial / NEW / name).exists()]
+    obsolete = [name for name in earlier if name not in moves["new"]]
+    _refuse_foreign(folder, folder, (*left, *obsolete), Listing(command, earlier))
+    for name in obsolete:
+        (folder / name).unlink(missing_ok=True)
+    _remove_empty(folder, obsolete)
+    for name in left:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(partial / NEW / name, folder / name)
+    _sync_folders(folder, [*obsolete, *left])
     (partial / MOVES).unlink()
-    _clear(partial)
-
-
-def _move(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    os.rename(source, target)
+    for name in (NEW, EARLIER):
+        shutil.rmtree(partial / name, ignore_errors=True)
 
 
 def _synced(new: Path) -> Iterator[tuple[str, str]]:
@@ -441,10 +394,8 @@ def _sync(path: Path) -> None:
 
 def _write_synced(path: Path, text: str) -> str:
     """Write a file to the disk; return its SHA-256."""
-    with open(path, "xb") as file:
-        file.write(text.encode())
-        file.flush()
-        os.fsync(file.fileno())
+    path.write_bytes(text.encode())
+    _sync(path)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -463,7 +414,7 @@ def _sync_folders(folder: Path, names: Iterable[str]) -> None:
 
 def _remove_empty(folder: Path, names: Iterable[str]) -> None:
     """Remove the folders inside `folder` that these files leave empty."""
-    above = {one for name in names for one in (folder / name).parents if folder in one.parents}
-    for one in sorted(above, key=lambda path: len(path.parts), reverse=True):
+    above = {path for name in names for path in _above(folder, name)}
+    for path in sorted(above, key=lambda path: len(path.parts), reverse=True):
         with suppress(OSError):
-            one.rmdir()
+            path.rmdir()

@@ -20,8 +20,8 @@ def peak_memory_mib() -> float:
         status = Path("/proc/self/status").read_text("ascii", errors="replace")
     except OSError:
         status = ""
-    if found := re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE):
-        return int(found[1]) / 1024
+    if match := re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE):
+        return int(match[1]) / 1024
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 

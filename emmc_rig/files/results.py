@@ -39,23 +39,23 @@ def parse_size(
 
 def parse_psnr(text: str, option: str) -> float:
     """Return the dB of "28dB" or "28"; raises AppError for anything else."""
-    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
-    if found is None or not float(found[1]) > 0:
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
+    if match is None or not float(match[1]) > 0:
         raise WrongUsageError(f"{option} {text}: write a PSNR, for instance 28dB")
-    return float(found[1])
+    return float(match[1])
 
 
 def parse_seconds(text: str | None, option: str) -> float | None:
     """Return the seconds of "20ms", "0.02", "30s", "2min" or "1h"; raises WrongUsageError."""
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+\.?\d*(?:e[+-]?\d+)?|\.\d+)\s*([a-z]*)", text.strip().lower())
-    if found is None or found[2] not in _SECONDS or not float(found[1]) > 0:
+    match = re.fullmatch(r"(\d+\.?\d*(?:e[+-]?\d+)?|\.\d+)\s*([a-z]*)", text.strip().lower())
+    if match is None or match[2] not in _SECONDS or not float(match[1]) > 0:
         raise WrongUsageError(
             f"{option} {text}: write a time above 0, in seconds or with a unit, for instance 0.02, "
             "20ms or 2min"
         )
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:

@@ -231,7 +231,7 @@ def _described(name: str, views: tuple[int, int], size: tuple[int, int], seed: i
 def _measured(spec: str) -> tuple[np.ndarray, str]:
     """The light field in a folder or file, and a sentence about it."""
     path = Path(spec)
-    held = next((one for one in FORMATS.values() if one.holds and one.holds(path)), None)
+    held = next((form for form in FORMATS.values() if form.holds and form.holds(path)), None)
     if held is not None and held.read is not None:
         light_field = check_light_field(held.read(path), spec)
         kind = f"{held.name} {'folder' if path.is_dir() else 'file'}"
@@ -254,11 +254,11 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
             f"built in are {', '.join(SCENES)}"
         )
     n_v, n_u, height, width, _ = light_field.shape
-    order, said = order_of(light_field), ""
+    order, remark = order_of(light_field), ""
     if order != ViewOrder.AS_NAMED:
-        said = f": {order.words}, says their parallax; put right"
-        warnings.warn(f"{spec}{said}", ViewOrderWarning, stacklevel=3)
-    described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels{said}"
+        remark = f": {order.words}, says their parallax; put right"
+        warnings.warn(f"{spec}{remark}", ViewOrderWarning, stacklevel=3)
+    described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels{remark}"
     return order.arranged(light_field), described
 
 

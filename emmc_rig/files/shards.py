@@ -109,9 +109,9 @@ class StoredGroup:
 
     def array(self, name: str) -> NDArray:
         """Return an array, all of it; raises ValueError where its files cannot hold so much."""
-        found = self._group[name]
-        check_fits(found.nbytes, self._folder)
-        return np.asarray(found[...])
+        stored = self._group[name]
+        check_fits(stored.nbytes, self._folder)
+        return np.asarray(stored[...])
 
 
 def check_fits(unpacked_bytes: int, folder: Path) -> None:
@@ -138,12 +138,12 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
     """Return an array of a group, not read; raises AppError where there is none."""
     zarr = _zarr()
     try:
-        found = zarr.open_group(folder, mode=mode)[name]
+        array = zarr.open_group(folder, mode=mode)[name]
     except _FAULTS as fault:
         raise AppError(
             f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
         ) from fault
-    return found
+    return array
 
 
 def load_light_field(folder: Path) -> NDArray[np.float32]:
@@ -151,7 +151,7 @@ def load_light_field(folder: Path) -> NDArray[np.float32]:
     stored = opened_array(folder, "light_field")
     try:
         check_fits(stored.nbytes, folder)
-        found = np.asarray(stored[...])
+        light_field = np.asarray(stored[...])
     except _FAULTS as fault:
         raise SceneError(f"{shown_path(folder)}: damaged ({one_line(fault)})") from fault
-    return check_light_field(found, shown_path(folder)).astype(np.float32)
+    return check_light_field(light_field, shown_path(folder)).astype(np.float32)

@@ -47,18 +47,18 @@ def _set(data: Any, key: Key, value: float) -> Any:
         return value
     first, rest = key[0], key[1:]
     if isinstance(data, list):
-        return [_set(one, rest, value) if i == first else one for i, one in enumerate(data)]
-    found = data if isinstance(data, dict) else {}
-    return {**found, first: _set(found.get(first), rest, value)}
+        return [_set(item, rest, value) if i == first else item for i, item in enumerate(data)]
+    mapping = data if isinstance(data, dict) else {}
+    return {**mapping, first: _set(mapping.get(first), rest, value)}
 
 
 def _with_value(text: str, key: Key, number: str) -> str:
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     for depth, name in enumerate(key):
-        found = _child(node, name)
-        if found is None:
+        child = _child(node, name)
+        if child is None:
             return _inserted(text, node, key[depth:], number)
-        node = found
+        node = child
     if isinstance(node, yaml.CollectionNode) and not node.flow_style:
         return text
     return text[: node.start_mark.index] + number + text[node.end_mark.index :]

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -166,15 +165,13 @@ def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
         return _sha256(partial)
 
 
-def survey_task(job: BlockJob) -> tuple[Survey, float]:
-    """Settle in a worker what holds for the whole capture; return it, and its CPU seconds."""
-    started = time.process_time()
+def survey_task(job: BlockJob) -> Survey:
+    """Settle in a worker what holds for the whole capture."""
     readings, usable = job.frames(EVERYWHERE)
-    survey = surveyed(
+    return surveyed(
         job.method, job.psi, readings, job.noise_sigma, usable, job.opened_dictionary(),
         job.settings,
     )  # fmt: skip
-    return survey, time.process_time() - started
 
 
 def block_task(task: BlockTask) -> None:
@@ -182,7 +179,7 @@ def block_task(task: BlockTask) -> None:
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
-    started, cpu = time.perf_counter(), time.process_time()
+    started = time.perf_counter()
     try:
         solved = _solved(task)
     except ERRORS as fault:
@@ -204,7 +201,6 @@ def block_task(task: BlockTask) -> None:
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
             "variance": _variance(task.block, solved.arrays),
             "seconds": time.perf_counter() - started,
-            "cpu_seconds": time.process_time() - cpu,
             "peak_mib": peak_memory_mib(),
         },
     )
@@ -234,8 +230,6 @@ class DoneBlock:
     result: Reconstruction
     verdict: Verdict | None
     variance: float | None
-    seconds: float
-    cpu_seconds: float
     peak_mib: float
 
 
@@ -255,15 +249,13 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     )
     evidence = kept["evidence"]
     verdict = None if evidence is None else verdict_from(Evidence.from_dict(evidence))
-    measured = (kept[key] for key in ("variance", "seconds", "cpu_seconds", "peak_mib"))
-    return DoneBlock(result, verdict, *measured)
+    return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
 
 
-def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> tuple[Survey, float]:
+def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> Survey:
     """Return what holds for all blocks, from an earlier run where it is of the same capture.
 
     Frames are on the disk then. alone: there is one block, which settles everything by itself.
-    Returns the survey and its CPU seconds.
     """
     arrays = {"readings": frames.readings, "usable": frames.usable}
     kept = _read_json(job.kept / JOB, job.fingerprint)
@@ -274,23 +266,17 @@ def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> tuple[Su
             k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()
         }
         known["settings"] = MethodSettings.model_validate(known["settings"])
-        return Survey(**known), kept["survey_cpu_seconds"]
+        return Survey(**known)
     for path in job.kept.iterdir():
         path.unlink()
     sha256 = _write_arrays(job.kept / FRAMES, arrays)
     if alone:
-        survey, cpu_s = Survey.of_one_block(job.settings, len(frames.readings)), 0.0
+        survey = Survey.of_one_block(job.settings, len(frames.readings))
     else:
-        ((_, (survey, cpu_s)),) = pool.run(survey_task, [job])
+        ((_, survey),) = pool.run(survey_task, [job])
     plain = {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
-    _write_json(
-        job.kept / JOB,
-        {
-            "fingerprint": job.fingerprint, "frames": sha256, "survey": plain,
-            "survey_cpu_seconds": cpu_s,
-        },
-    )  # fmt: skip
-    return survey, cpu_s
+    _write_json(job.kept / JOB, {"fingerprint": job.fingerprint, "frames": sha256, "survey": plain})
+    return survey
 
 
 @dataclass(frozen=True)
@@ -303,7 +289,6 @@ class Blocks:
     job: BlockJob
     grid: Grid
     survey: Survey
-    survey_cpu_s: float
     done: Sequence[DoneBlock]
     seconds: float
     workers: int
@@ -312,16 +297,11 @@ class Blocks:
         """Return what metrics.json has of the blocks.
 
         peak_gib: the largest resident memory of a worker, workers: at a time, program_peak_gib: of
-        this process, task_bytes: that travel to a worker for a block, all measured.
+        this process.
         """
-        task = BlockTask(self.job, self.survey, self.grid.block(0, 0))
         return {
             "blocks": list(self.grid.shape),
             "stated_db": self.stated_db,
-            "block_seconds": [block.seconds for block in self.done],
-            "block_cpu_seconds": [block.cpu_seconds for block in self.done],
-            "survey_cpu_seconds": self.survey_cpu_s,
-            "task_bytes": len(pickle.dumps(task)),
             "workers": self.workers,
             "peak_gib": max(block.peak_mib for block in self.done) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
@@ -344,9 +324,9 @@ class Blocks:
     def verdict(self) -> Verdict:
         """Return the verdict on all blocks; raises AppError where none could be judged."""
         judged = [
-            judged_block(said.verdict, block, self.job.psi.binning)
-            for block, said in zip(self.grid, self.done, strict=True)
-            if said.verdict is not None
+            judged_block(done.verdict, block, self.job.psi.binning)
+            for block, done in zip(self.grid, self.done, strict=True)
+            if done.verdict is not None
         ]
         if not judged:
             raise AppError("no usable pixel: every one is saturated or excluded")
@@ -426,7 +406,7 @@ def compute_blocks(
     multiple = multiple_of(psi.binning, dictionary, job.settings)
     grid = Grid(psi.size, multiple, 0, job.settings.blocks)
     pool.fit(task_bytes(psi, grid))
-    survey, survey_cpu_s = _settled(job, frames, pool, len(grid) == 1)
+    survey = _settled(job, frames, pool, len(grid) == 1)
     grid = replace(grid, halo=survey.halo)
     pool.fit(task_bytes(psi, grid))
     tasks = [BlockTask(job, survey, block) for block in grid]
@@ -437,14 +417,14 @@ def compute_blocks(
     if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):
-        said = done_block(task)
-        if said is None:
+        computed = done_block(task)
+        if computed is None:
             raise AppError(
                 f"{task.path('h5')}: a worker wrote it, but it cannot be read here; put frames, "
                 "Psi and --out on a disk that all workers share"
             )
-        done[task.block.name] = said
+        done[task.block.name] = computed
         on_block(len(done), len(tasks))
     ordered = [done[block.name] for block in grid]
     took_s = time.perf_counter() - started
-    return Blocks(job, grid, survey, survey_cpu_s, ordered, took_s, pool.size)
+    return Blocks(job, grid, survey, ordered, took_s, pool.size)

@@ -63,28 +63,10 @@ def ceiling_for(memory: int, requests: Sequence[Request]) -> tuple[Ceiling, int,
         settings = request.settings or MethodSettings()
         need = max(need, task_bytes(psi, assumed_grid(psi, settings)))
         own = max(own, own_bytes(psi, settings, request.as_zarr, request.truth is not None))
-    one, two = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
-    if len(requests) > 1 and two.total - two.own >= 2 * need:
-        return two, two.workers(need), 2
-    return one, one.workers(need), 1
-
-
-def _one(request: Request, pool: Pool | None, on_step: Callable[[Progress], None]) -> dict:
-    place = request.folder / RECONSTRUCTION if is_session(request.folder) else None
-    with result_folder(request.out, "reconstruct", belongs_to=place, resumes=True) as folder:
-        try:
-            return reconstruct_folder(
-                request.folder, folder, request.method, request.psi, request.dictionary,
-                request.settings, request.truth, on_step, request.chosen, pool, request.tile,
-                request.as_zarr,
-            )  # fmt: skip
-        except KeyboardInterrupt as stop:
-            if not (folder.parent / KEPT).is_dir():
-                raise
-            raise StoppedError(
-                f"stopped by Ctrl-C; blocks that are done are kept in {request.out}, and the same "
-                "command goes on"
-            ) from stop
+    single, double = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
+    if len(requests) > 1 and double.total - double.own >= 2 * need:
+        return double, double.workers(need), 2
+    return single, single.workers(need), 1
 
 
 def reconstruct_captures(
@@ -104,33 +86,51 @@ def reconstruct_captures(
     alone = len(requests) == 1
     count, ceiling = workers or get_num_threads(), None
     # One more than the pool computes at a time is read ahead, or written behind.
-    captures = len(requests)
+    at_a_time = len(requests)
     if memory is not None:
-        ceiling, most, captures = ceiling_for(memory, requests)
+        ceiling, most, at_a_time = ceiling_for(memory, requests)
         count = min(count, most)
     shared = not alone or workers is not None or cluster is not None or memory is not None
     with opened_pool(count, cluster, ceiling) if shared else nullcontext() as pool:
-        if alone:
-            try:
-                yield requests[0], _one(requests[0], pool, on_step)
-            except ERRORS as fault:
-                yield requests[0], fault
+        if pool is None or alone:
+            yield requests[0], _outcome(requests[0], pool, on_step)
             return
-        assert pool is not None
-        with ThreadPoolExecutor(min(captures, pool.size + 1)) as threads:
+        with ThreadPoolExecutor(min(at_a_time, pool.size + 1)) as threads:
             futures = {
-                threads.submit(_one, request, pool, lambda _: None): request for request in requests
+                threads.submit(_outcome, request, pool, lambda _: None): request
+                for request in requests
             }
             try:
                 for done, future in enumerate(as_completed(futures), 1):
-                    fault = future.exception()
-                    if fault is not None and not isinstance(fault, ERRORS):
-                        raise fault
+                    outcome = future.result()
                     on_step(Progress(done, None, None, len(requests)))
-                    outcome = future.result() if fault is None else fault
                     yield futures[future], outcome
             except BaseException:
                 for future in futures:
                     future.cancel()
                 pool.end()
                 raise
+
+
+def _outcome(
+    request: Request, pool: Pool | None, on_step: Callable[[Progress], None]
+) -> dict | Exception:
+    """Return a capture's metrics, or what it failed by; raises StoppedError by Ctrl-C."""
+    place = request.folder / RECONSTRUCTION if is_session(request.folder) else None
+    try:
+        with result_folder(request.out, "reconstruct", belongs_to=place, resumes=True) as folder:
+            try:
+                return reconstruct_folder(
+                    request.folder, folder, request.method, request.psi, request.dictionary,
+                    request.settings, request.truth, on_step, request.chosen, pool, request.tile,
+                    request.as_zarr,
+                )  # fmt: skip
+            except KeyboardInterrupt as stop:
+                if not (folder.parent / KEPT).is_dir():
+                    raise
+                raise StoppedError(
+                    f"stopped by Ctrl-C; blocks that are done are kept in {request.out}, and the "
+                    "same command goes on"
+                ) from stop
+    except ERRORS as fault:
+        return fault

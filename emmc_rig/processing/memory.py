@@ -58,10 +58,10 @@ class Ceiling:
 
 def parse_memory(text: str) -> int:
     """Return the bytes of "2GiB" or "800MB"; raises WrongUsageError."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMG]?I?)B?", text.strip().upper())
-    if found is None or found[2] not in UNITS:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMG]?I?)B?", text.strip().upper())
+    if match is None or match[2] not in UNITS:
         raise WrongUsageError(f"--memory {text}: write bytes with a unit, for instance 2GiB")
-    return int(float(found[1]) * UNITS[found[2]])
+    return int(float(match[1]) * UNITS[match[2]])
 
 
 def task_bytes(psi: SavedPsi, grid: Grid) -> int:

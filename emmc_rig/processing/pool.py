@@ -131,6 +131,7 @@ class Processes(Pool):
     def __init__(self, size: int, ceiling: Ceiling | None = None) -> None:
         super().__init__(size)
         self.ceiling = ceiling
+        # Processes read one end, which no one writes to, and end when the other is closed.
         self._theirs, self._mine = multiprocessing.Pipe(duplex=False)
 
     def _start(self) -> Executor:
@@ -189,6 +190,7 @@ class Processes(Pool):
         self._mine.close()
         with self._lock:
             self._shut_down()
+            self._theirs.close()
 
 
 def fingerprint() -> dict[str, str]:
@@ -205,33 +207,38 @@ def _on_one_thread(task: Callable[[Item], Result], item: Item) -> Result:
 
 
 class Cluster(Pool):
-    """The workers of a Dask cluster, whose memory is the cluster's own concern."""
+    """The workers of a Dask cluster, whose memory is the cluster's own concern.
 
-    def __init__(self, client: Any, address: str) -> None:
-        from distributed import CancelledError as Cancelled
-        from distributed import KilledWorker
-        from distributed.comm.core import CommClosedError
+    address: of its scheduler. Raises WorkersError where none answers or its workers do not fit.
+    """
 
-        super().__init__(max(sum(client.nthreads().values()), 1))
-        self._client, self._address = client, address
+    def __init__(self, address: str) -> None:
+        try:
+            from distributed import CancelledError as Cancelled
+            from distributed import Client, KilledWorker
+            from distributed.comm.core import CommClosedError
+        except ImportError as fault:
+            raise WorkersError(
+                "--cluster needs Dask: pip install 'emmc-rig[cluster]'; --workers needs nothing "
+                "more"
+            ) from fault
         self.losses = KilledWorker, Cancelled, CancelledError, CommClosedError
+        self._address = address
+        try:
+            self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError, RuntimeError) as fault:
+            raise WorkersError(
+                f"--cluster {address}: no Dask scheduler answers there; start one by `dask "
+                "scheduler`, or see docs/scale.md"
+            ) from fault
+        try:
+            self._check_versions()
+            super().__init__(sum(self._client.nthreads().values()))
+        except BaseException:
+            self.end()
+            raise
 
-    def _start(self) -> Executor:
-        return self._client.get_executor(pure=False)
-
-    def _mend(self, executor: Executor, fault: BaseException) -> None:
-        raise WorkersError(
-            f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
-        ) from fault
-
-    def run(
-        self, task: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, see `Pool.run`."""
-        return super().run(partial(_on_one_thread, task), items)
-
-    def check(self) -> None:
-        """Raise WorkersError where there are no workers, or some with other versions."""
+    def _check_versions(self) -> None:
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
             by_worker: Mapping[str, dict[str, str]] = self._client.run(fingerprint)
@@ -253,33 +260,24 @@ class Cluster(Pool):
                     f"{mine}: install the same there"
                 )
 
+    def _start(self) -> Executor:
+        return self._client.get_executor(pure=False)
+
+    def _mend(self, executor: Executor, fault: BaseException) -> None:
+        raise WorkersError(
+            f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
+        ) from fault
+
+    def run(
+        self, task: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Yield each item with its result, see `Pool.run`."""
+        return super().run(partial(_on_one_thread, task), items)
+
     def end(self) -> None:
         """Leave the cluster, which goes on."""
         with suppress(Exception):
             self._client.close()
-
-
-def _connected(address: str) -> Cluster:
-    try:
-        from distributed import Client
-    except ImportError as fault:
-        raise WorkersError(
-            "--cluster needs Dask: pip install 'emmc-rig[cluster]'; --workers needs nothing more"
-        ) from fault
-    try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError, RuntimeError) as fault:
-        raise WorkersError(
-            f"--cluster {address}: no Dask scheduler answers there; start one by `dask scheduler`, "
-            "or see docs/scale.md"
-        ) from fault
-    cluster = Cluster(client, address)
-    try:
-        cluster.check()
-    except BaseException:
-        cluster.end()
-        raise
-    return cluster
 
 
 @contextmanager
@@ -291,7 +289,7 @@ def opened_pool(
     Processes start with the first task. ceiling: of memory, see `Processes`. Raises WorkersError.
     """
     before = {name: os.environ.get(name) for name in THREADS}
-    pool = Processes(workers, ceiling) if cluster is None else _connected(cluster)
+    pool = Processes(workers, ceiling) if cluster is None else Cluster(cluster)
     if cluster is None:
         os.environ.update(dict.fromkeys(THREADS, "1"))
     try:

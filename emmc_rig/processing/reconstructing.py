@@ -27,7 +27,7 @@ from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
-from emmc_rig.processing.block_tasks import BlockJob, compute_blocks, fingerprint_of
+from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
 from emmc_rig.processing.exposure import verdict_with_exposure, with_exposure
 from emmc_rig.processing.inputs import stored_frames
 from emmc_rig.processing.pool import Pool, opened_pool
@@ -91,27 +91,36 @@ def reconstruct(
         required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
     if on_step is not None and not callable(on_step):
         raise refusal(on_step, "on_step", "a function of the progress")
-    given = _as_frames(psi, frames, noise_sigma, usable)
-    atoms = None
-    if needs_dictionary:
-        made = isinstance(dictionary, Dictionary)
-        if not made and dictionary is not None:
-            required(dictionary, NAMES, "dictionary", "a dictionary, its file, or a built-in name")
-        views = psi.layout.views
-        atoms = dictionary if made else open_dictionary(dictionary, views, psi.binning)
-    settings = settings or MethodSettings()
-    # Not of each: estimated from the reading itself, it is least where noise made that small.
-    noise = given.noise_sigma
-    if is_one_block(psi.size, settings):
-        solved, verdict = reconstruct_judged(
-            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
-        )
-    else:
-        check_frames(psi.frames_shape, given.readings)
-        solved, verdict = reconstruct_in_blocks(
-            method, psi, given.readings, noise, atoms, settings, given.usable, on_step
-        )
-    return Result(solved, verdict, psi, given, None if atoms is None else atoms.kind)
+    if needs_dictionary and dictionary is not None and not isinstance(dictionary, Dictionary):
+        required(dictionary, NAMES, "dictionary", "a dictionary, its file, or a built-in name")
+    readings = _as_frames(psi, frames, noise_sigma, usable)
+    return _solved(psi, readings, method, dictionary, settings or MethodSettings(), on_step)
+
+
+def _solved(
+    psi: ImagingMatrix,
+    frames: Frames,
+    method: str,
+    dictionary: Dictionary | str | None,
+    settings: MethodSettings,
+    on_step: OnStep | None,
+) -> Result:
+    """Return the result of arguments that were checked, in this process."""
+    if not find_method(method).needs_dictionary:
+        dictionary = None
+    elif not isinstance(dictionary, Dictionary):
+        dictionary = open_dictionary(dictionary, psi.layout.views, psi.binning)
+    solve = reconstruct_judged
+    if not is_one_block(psi.size, settings):
+        check_frames(psi.frames_shape, frames.readings)
+        solve = reconstruct_in_blocks
+    # One deviation, not of each reading: estimated from the reading itself, it is least where noise
+    # made that small.
+    solved, verdict = solve(
+        method, psi, frames.readings, frames.noise_sigma, dictionary, settings, frames.usable,
+        on_step,
+    )  # fmt: skip
+    return Result(solved, verdict, psi, frames, None if dictionary is None else dictionary.kind)
 
 
 def _as_frames(
@@ -126,7 +135,7 @@ def _as_frames(
         if not is_level:
             raise refusal(noise_sigma, "noise_sigma", "the readings' standard deviation, 0 or more")
     if isinstance(frames, Frames):
-        given = frames
+        taken = frames
     else:
         readings = numbers_of(frames, "frames", FRAMES_TAKES)
         everywhere = np.ones(readings.shape, dtype=bool)
@@ -135,17 +144,17 @@ def _as_frames(
             everywhere &= np.isfinite(deviation)
         else:
             deviation = np.zeros(readings.shape)
-        given = Frames(readings, deviation, everywhere)
+        taken = Frames(readings, deviation, everywhere)
     if noise_sigma is not None:
-        given = replace(given, deviation=np.full(given.shape, noise_sigma))
+        taken = replace(taken, deviation=np.full(taken.shape, noise_sigma))
     if usable is None:
-        return given
+        return taken
     if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
         raise refusal(usable, "usable", "a boolean array (shot, pixel_y, pixel_x)")
-    if usable.shape == given.shape:
+    if usable.shape == taken.shape:
         # Why they are not to be used is not known: not that there was at least so much light.
-        given = replace(given, readings=np.where(usable, given.readings, 0))
-    return replace(given, usable=usable)
+        taken = replace(taken, readings=np.where(usable, taken.readings, 0))
+    return replace(taken, usable=usable)
 
 
 def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -194,73 +203,77 @@ def reconstruct_folder(
     find_method(method)
     settings = settings or MethodSettings()
     frames, psi_path = stored_frames(folder, out, psi_path)
-    session = Session(folder) if is_session(folder) else None
     saved = open_psi(psi_path)
-    one_block = is_one_block(saved.size, settings)
-    if one_block and pool is None and not as_zarr:
-        psi = saved.load()
-        result = reconstruct(
-            psi, frames, method, dictionary=dictionary_spec, settings=settings, on_step=on_step
-        )
-        return _written(result, {"chosen": chosen}, out, session, truth)
-    saved.verify()
-    check_frames(saved.frames_shape, frames.readings)
-    job = BlockJob(
-        kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
-        frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
-    )  # fmt: skip
+    in_memory = is_one_block(saved.size, settings) and not as_zarr
+    further: dict[str, Any] = {"chosen": chosen}
+    if in_memory and pool is None:
+        result = _solved(saved.load(), frames, method, dictionary_spec, settings, on_step)
+    else:
+        saved.verify()
+        check_frames(saved.frames_shape, frames.readings)
+        job = BlockJob(
+            kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
+            frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
+        )  # fmt: skip
 
-    def on_block(done: int, of: int) -> None:
-        if on_step is not None:
-            on_step(Progress(done, None, None, of))
+        def on_block(done: int, of: int) -> None:
+            if on_step is not None:
+                on_step(Progress(done, None, None, of))
 
-    with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
-        blocks = compute_blocks(job, frames, workers, tile, on_block)
-        if as_zarr:
-            blocks.write_shards(out / RESULT_GROUP, workers)
-    solved, verdict = blocks.result(), blocks.verdict()
-    if one_block and not as_zarr:
+        with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
+            blocks = compute_blocks(job, frames, workers, tile, on_block)
+            if as_zarr:
+                blocks.write_shards(out / RESULT_GROUP, workers)
+        further |= blocks.metrics()
+        if not in_memory:
+            return _write_blocks(blocks, frames, folder, out, truth, further)
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
-        whole = replace(solved, light_field=light_field, maps=arrays)
-        result = Result(whole, verdict, saved.load(), frames)
-        return _written(result, {"chosen": chosen, **blocks.metrics()}, out, session, truth)
-    if session is not None:
-        verdict = verdict_with_exposure(verdict, session)
-    metrics = {
-        **figures(solved, verdict, frames),
-        "shots": saved.shape[0],
-        "size": list(saved.size),
-        "psi_sha256": saved.checksum,
-        "dictionary": dictionary_spec,
-        "chosen": chosen,
-        **blocks.metrics(),
-    }
-    if as_zarr:
-        light_field = opened_array(out / RESULT_GROUP, "light_field")
-        metrics |= _compared(light_field, truth, saved)
-    else:
-        with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
-            file.attrs["method"] = method
-            for name, (shape, dtype) in blocks.shapes().items():
-                home = file if name == "light_field" else maps
-                blocks.write(name, home.create_dataset(name, shape, dtype))
-            metrics |= _compared(file["light_field"], truth, saved)
-    write_metrics(out, metrics)
-    return metrics
-
-
-def _written(
-    result: Result, further: dict[str, Any], out: Path, session: Session | None, truth: str | None
-) -> dict:
-    """Write a result that is in memory, judged by its session's exposures; return the metrics."""
-    if session is not None:
-        result = with_exposure(result, session)
+        solved = replace(blocks.result(), light_field=light_field, maps=arrays)
+        result = Result(solved, blocks.verdict(), saved.load(), frames)
+    if is_session(folder):
+        result = with_exposure(result, Session(folder))
     compared_with = _compared(result.light_field, truth, result.psi.layout)
     metrics = {**result.metrics(), **further, **compared_with}
     result.write(out, metrics)
+    return metrics
+
+
+def _write_blocks(
+    blocks: Blocks,
+    frames: Frames,
+    folder: Path,
+    out: Path,
+    truth: str | None,
+    further: Mapping[str, Any],
+) -> dict:
+    """Write what does not fit into memory, unless it is a Zarr group already; return the metrics.
+
+    folder: of the frames. further: metrics besides those of the result.
+    """
+    psi, verdict = blocks.job.psi, blocks.verdict()
+    if is_session(folder):
+        verdict = verdict_with_exposure(verdict, Session(folder))
+    metrics = {
+        **figures(blocks.result(), verdict, frames),
+        "shots": psi.shape[0],
+        "size": list(psi.size),
+        "psi_sha256": psi.checksum,
+        "dictionary": blocks.job.dictionary,
+        **further,
+    }
+    if (out / RESULT_GROUP).exists():
+        metrics |= _compared(opened_array(out / RESULT_GROUP, "light_field"), truth, psi)
+    else:
+        with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
+            file.attrs["method"] = blocks.job.method
+            for name, (shape, dtype) in blocks.shapes().items():
+                home = file if name == "light_field" else maps
+                blocks.write(name, home.create_dataset(name, shape, dtype))
+            metrics |= _compared(file["light_field"], truth, psi)
+    write_metrics(out, metrics)
     return metrics
 
 

@@ -109,9 +109,9 @@ class Result:
     @cached_property
     def misfit(self) -> NDArray[np.float32]:
         """How far readings are missed around each place (y, x), in deviations: about 1 is right."""
-        given = self.frames
+        frames = self.frames
         return missed_readings(
-            self.psi, self.light_field, given.readings, given.noise_sigma, given.usable
+            self.psi, self.light_field, frames.readings, frames.noise_sigma, frames.usable
         )
 
     @property
@@ -180,7 +180,7 @@ class Result:
         """
         from emmc_rig.pages.result_figure import draw_results  # matplotlib loads for a second
 
-        results = [self._export(truth), *(one._export() for one in others)]
+        results = [self._export(truth), *(other._export() for other in others)]
         return draw_results(results, settings).figure
 
     def show(self) -> Figure:

@@ -154,7 +154,7 @@ class Unrolled(nn.Module):
         guess = capture.guess.expand(views, -1, -1, -1)
         x, fixed = guess, self._fixed(capture, guess, spread[0])
         hidden = torch.zeros(())
-        found = []
+        stages = []
         for stage in range(self.architecture.stages):
             residual = capture.solved(capture.frames - capture.forward(x), spread[stage])
             seen = torch.cat([SCALE * (x - guess), SCALE * capture.adjoint(residual), fixed], 1)
@@ -169,8 +169,8 @@ class Unrolled(nn.Module):
             z = x + change / SCALE
             residual = capture.solved(capture.frames - capture.forward(z), spread[stage + 1])
             x = z + capture.adjoint(residual)
-            found.append(x)
-        return found
+            stages.append(x)
+        return stages
 
     @staticmethod
     def _fixed(capture: Capture, guess: Tensor, spread: Tensor) -> Tensor:
@@ -206,5 +206,5 @@ def estimated(
         raise ReconstructionError("the network's arrays do not fit its architecture") from fault
     capture = captured(psi, frames, variance, usable)
     with torch.no_grad():
-        found = capture.brightness * network(capture)[-1]
-    return found.permute(0, 2, 3, 1).reshape(psi.light_field_shape).numpy()
+        light_field = capture.brightness * network(capture)[-1]
+    return light_field.permute(0, 2, 3, 1).reshape(psi.light_field_shape).numpy()

@@ -4,9 +4,9 @@ from emmc_rig.files.formats import displays, geometry, hci, lytro, ome_zarr, pic
 from emmc_rig.files.formats.format import Export, Format
 
 FORMATS: dict[str, Format] = {
-    one.name: one
+    form.name: form
     for module in (pictures, hci, lytro, ome_zarr, displays, geometry)
-    for one in module.FORMATS
+    for form in module.FORMATS
 }
 
 __all__ = ["FORMATS", "Export", "Format"]

@@ -85,10 +85,10 @@ def _read_folder(path: Path) -> Array:
             f"{path}: {there} files input_Cam###.png, but {PARAMETERS} says {rows}x{columns}"
         )
     paths = [path / f"input_Cam{number:03}.png" for number in range(rows * columns)]
-    missing = next((one.name for one in paths if not one.is_file()), None)
+    missing = next((view.name for view in paths if not view.is_file()), None)
     if missing:
         raise AppError(f"{path}: {missing} is missing; copy it again")
-    views = [linear_of(read_picture(one)) for one in paths]
+    views = [linear_of(read_picture(view)) for view in paths]
     if len({view.shape for view in views}) > 1:
         raise AppError(f"{path}: the views differ in size")
     return np.stack(views).reshape(rows, columns, *views[0].shape)[::-1, ::-1]

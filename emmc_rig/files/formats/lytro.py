@@ -64,9 +64,9 @@ def _holds_eslf(path: Path) -> bool:
 
 
 def _read_eslf(path: Path) -> Array:
-    found = ESLF.fullmatch(path.name)
-    assert found is not None
-    rows, columns = int(found[1]), int(found[2])
+    match = ESLF.fullmatch(path.name)
+    assert match is not None
+    rows, columns = int(match[1]), int(match[2])
     picture = linear_of(read_picture(path))
     height, width, colours = picture.shape
     if not rows or not columns or height % rows or width % columns:

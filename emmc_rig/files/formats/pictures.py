@@ -62,8 +62,8 @@ def _write_exr(folder: Path, export: Export) -> None:
 def _views(path: Path, ending: str) -> dict[tuple[int, int], Path]:
     if not path.is_dir():
         return {}
-    found = ((VIEW.fullmatch(one.name), one) for one in path.iterdir())
-    return {(int(m[1]), int(m[2])): one for m, one in found if m and m[3] == ending}
+    named = ((VIEW.fullmatch(file.name), file) for file in path.iterdir())
+    return {(int(m[1]), int(m[2])): file for m, file in named if m and m[3] == ending}
 
 
 def _holds(path: Path, ending: str) -> bool:
