@@ -206,7 +206,7 @@ class GrblController(SimulatedController):
         self._lines.append(("".join(text.split()).upper(), len(line) + 1))
 
     def _advance(self) -> None:
-        """Bring motors, queue and homing to the present, move by move."""
+        """Advance motors, queue and homing to the time of the clock, move by move."""
         while True:
             ended_s = self._next_event_s()
             for letter, motor in self._motors.items():

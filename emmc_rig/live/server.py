@@ -106,7 +106,7 @@ class Page(Protocol):
     def state(self) -> dict[str, Any]:
         """Return the state, plain data with its `version`."""
 
-    def looked(self) -> None:
+    def touch(self) -> None:
         """Take note that somebody looks."""
 
     def listen(self, listener: Callable[[], None]) -> None:
@@ -157,7 +157,7 @@ class _News:
 
     def state(self, **more: Any) -> tuple[int, bytes]:
         """Return version and state as JSON, encoded once for all who ask."""
-        self._page.looked()
+        self._page.touch()
         if self._encoded[0] != self._page.version:
             state = self._page.state()
             data = json.dumps({**state, **more}, allow_nan=False, separators=(",", ":"))
@@ -307,7 +307,7 @@ def application(
             raise _RefusedError(400, f"{name}: these are not its values ({fault})") from fault
         return JSONResponse({"done": name, **done})
 
-    async def stranger(request: Request) -> Response:
+    async def wrong_token(request: Request) -> Response:
         raise _RefusedError(403, "wrong token")
 
     made = Starlette(
@@ -317,7 +317,7 @@ def application(
             Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
             Route("/{token}/", guarded(shown), methods=["GET"]),
             Route("/{token}/{name}", guarded(shown), methods=["GET"]),
-            Route("/{rest:path}", guarded(stranger), methods=["GET", "POST"]),
+            Route("/{rest:path}", guarded(wrong_token), methods=["GET", "POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
     )

@@ -127,7 +127,7 @@ class SessionPage(EventWatcher):
         with self._changed:
             return dict(self._state)
 
-    def looked(self) -> None:
+    def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
 
     def listen(self, listener: Callable[[], None]) -> None:

@@ -56,7 +56,7 @@ class SetupPage:
         """Return what the Watch knows."""
         return self._watch.state()
 
-    def looked(self) -> None:
+    def touch(self) -> None:
         """Let frames be taken."""
         self._watch.newest()
 
