@@ -458,7 +458,8 @@ class Grbl(Wire):
         return self(b"?").decode().strip()
 
     def place(self):
-        return [float(one) for one in re.search(r"MPos:([^|>]*)", self.report())[1].split(",")]
+        (place,) = re.findall(r"MPos:([^|>]*)", self.report())
+        return [float(one) for one in place.split(",")]
 
 
 @pytest.fixture
@@ -484,7 +485,7 @@ def test_grbl_lists_its_settings_in_the_documents_units(grbl):
                  "$120=10.000", "$130=200.000", "$132=200.000"):  # fmt: skip
         assert line in lines
     assert lines[-1] == "ok"
-    numbers = [int(re.match(r"\$(\d+)=", line)[1]) for line in lines[:-1]]
+    numbers = [int(line[1 : line.index("=")]) for line in lines[:-1]]
     assert numbers == sorted(numbers)
 
 

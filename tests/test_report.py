@@ -270,10 +270,12 @@ def test_a_uniform_error_gives_a_flat_map_and_its_textbook_psnr(content):
     cells = re.findall(r'<td style="background:hsl\(212 60% \d+%\)">(.*?)</td>', page)
     assert cells == ["20.0"] * 25
     (error,) = pictures(page, "Error map")
-    scale = float(re.search(r"<span>([\d.]+) and more</span>", page)[1])
+    (scale,) = (float(one) for one in re.findall(r"<span>([\d.]+) and more</span>", page))
     np.testing.assert_allclose(
         error,
-        np.broadcast_to(heat(np.uint8(255 * 0.1 / scale + 0.5)), error.shape)[..., ::-1],
+        np.broadcast_to(heat(np.array(255 * 0.1 / scale + 0.5, dtype=np.uint8)), error.shape)[
+            ..., ::-1
+        ],
         atol=4,
     )
 

@@ -86,25 +86,31 @@ class Page(Protocol):
     @property
     def files(self) -> tuple[str, ...]:
         """Files of the package `emmc_rig.live` or templates; the first is the page itself."""
+        ...
 
     @property
     def pictures(self) -> Mapping[str, Pictured]:
         """By name; each takes a query, and returns None while there is none."""
+        ...
 
     @property
     def actions(self) -> Mapping[str, Action]:
         """By name, what POST does; a mapping returned is part of the answer."""
+        ...
 
     @property
     def urgent(self) -> frozenset[str]:
         """The actions that wait for no other."""
+        ...
 
     @property
     def version(self) -> int:
         """Grows with every change of the state."""
+        ...
 
     def state(self) -> dict[str, Any]:
         """Return the state, plain data with its `version`."""
+        ...
 
     def touch(self) -> None:
         """Take note that somebody looks."""
