@@ -104,13 +104,6 @@ class AptStage(HostStage):
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
 
-    def hardware_info(self, axis: str) -> codec.HardwareInfo:
-        """Return model, serial number and firmware of the controller of an axis."""
-        self._require_axis(axis)
-        return codec.decode_info(
-            self._channels[axis].query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False)
-        )
-
     def _configure(self) -> None:
         self._homing_since_s.clear()
         self._velocities: dict[str, codec.VelocityParameters] = {}

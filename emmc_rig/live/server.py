@@ -113,7 +113,7 @@ class Page(Protocol):
         ...
 
     def touch(self) -> None:
-        """Take note that somebody looks."""
+        """Note that the page is being viewed."""
 
     def listen(self, listener: Callable[[], None]) -> None:
         """Let `listener` be called after every change, by whichever thread made it."""
