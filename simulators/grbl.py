@@ -673,7 +673,8 @@ class GrblController(SimulatedController):
             work_mm = {one: mm - self._offset_mm(one) for one, mm in machine_mm.items()}
             fields = [state, f"WPos:{self._coordinates(work_mm, unit)}"]
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
-        fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.0f},0")
+        decimals = 0 if unit == 1 else 1
+        fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.{decimals}f},0")
         moving = self._state not in ("Idle", "Alarm")
         if self._reports_to_offset:
             self._reports_to_offset -= 1

@@ -608,6 +608,9 @@ def test_grbl_reports_its_accessories_by_the_documents_letters(word, letters):
 def test_grbl_in_inches_reports_inches(grbl):
     grbl.say("$13=1")
     assert grbl.report().startswith("<Idle|MPos:-0.0394,-0.0394,-0.0394|")
+    # config.h: a rate has no decimals in millimetres and one in inches, 600 / 25.4.
+    assert grbl.say("$J=G91 G21 X-50 F600", after_s=2.0) == ["ok"]
+    assert "|FS:23.6,0" in grbl.report()
 
 
 def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
@@ -621,7 +624,7 @@ def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
 
 def test_a_hold_of_grbl_ends_in_hold_0_and_is_taken_up_by_a_tilde(grbl):
     grbl.say("G91 G1 F300 X-50", after_s=1.0)
-    assert grbl.report().startswith("<Run|")
+    assert re.match(r"<Run\|.*\|FS:300,0", grbl.report())
     assert grbl(b"!?").decode().startswith("<Hold:1|")
     grbl.clock.sleep(5.0)
     assert grbl.report().startswith("<Hold:0|")
