@@ -20,13 +20,15 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import Transport
+from drivers.transport import (
+    EXCHANGE_LIMIT_S,
+    FOREIGN_MESSAGES_TOLERATED,
+    Transport,
+    repeated,
+)
 
 _log = logging.getLogger(__name__)
 
-QUERY_ATTEMPTS = 3
-FOREIGN_MESSAGES_TOLERATED = 64
-EXCHANGE_LIMIT_S = 2.0
 HOMING_START_S = 1.0
 """A controller that has not begun to home by then did not get the command."""
 FAULTS_BY_BIT: Mapping[StatusBit, tuple[type[AxisFaultError], str]] = {
@@ -101,13 +103,6 @@ class AptStage(HostStage):
         """Return the speed of a move, as the controller last said it."""
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
-
-    def hardware_info(self, axis: str) -> codec.HardwareInfo:
-        """Return model, serial number and firmware of the controller of an axis."""
-        self._require_axis(axis)
-        return codec.decode_info(
-            self._channels[axis].query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False)
-        )
 
     def _configure(self) -> None:
         self._homing_since_s.clear()
@@ -248,15 +243,9 @@ class _Link:
 
     def query(self, raw: bytes, answer: Id, channel: "_Channel", channel_matters: bool) -> Message:
         """Send a question and return its answer, after a few attempts if need be."""
-        for attempt in range(1, QUERY_ATTEMPTS + 1):
-            try:
-                return self._exchange(raw, answer, channel, channel_matters)
-            except (TransportTimeoutError, GarbledReplyError) as error:
-                if attempt == QUERY_ATTEMPTS:
-                    raise
-                _log.warning("attempt %d for %s failed: %s", attempt, answer.name, error)
-                self.settle()
-        raise AssertionError("unreachable")
+        return repeated(
+            lambda: self._exchange(raw, answer, channel, channel_matters), answer.name, self.settle
+        )
 
     def settle(self) -> None:
         """Take everything off the wire until nothing comes: the next byte begins a message."""

@@ -17,14 +17,12 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import Transport
+from drivers.transport import EXCHANGE_LIMIT_S, Transport, repeated
 
 _log = logging.getLogger(__name__)
 
-QUERY_ATTEMPTS = 3
 LINES_TOLERATED = 200
 """Lines read for one answer; `$$` has about forty."""
-EXCHANGE_LIMIT_S = 2.0
 BOOT_S = 4.0
 """Opening the port resets an Arduino, which answers after its boot loader."""
 REPORTS_UNTIL_OFFSET = 40
@@ -305,23 +303,22 @@ class _Controller:
         Raises an `AxisFaultError` when the controller restarted, or was stopped by an alarm so
         severe that it no longer reports.
         """
-        for attempt in range(1, QUERY_ATTEMPTS + 1):
-            try:
-                with self._transport.lock:
-                    self._take_waiting()
-                    self._transport.write(codec.STATUS_QUERY)
-                    status = self._read_status()
-                self._raise_restart()
-                return status
-            except (TransportTimeoutError, GarbledReplyError) as error:
-                self._drain()
-                self.raise_alarm()
-                self._raise_restart()
-                if attempt == QUERY_ATTEMPTS:
-                    error.about(command="?")
-                    raise
-                _log.warning("attempt %d of '?' failed: %s", attempt, error)
-        raise AssertionError("unreachable")
+        return repeated(self._ask_status, "'?'")
+
+    def _ask_status(self) -> codec.Status:
+        try:
+            with self._transport.lock:
+                self._take_waiting()
+                self._transport.write(codec.STATUS_QUERY)
+                status = self._read_status()
+        except (TransportTimeoutError, GarbledReplyError) as error:
+            self._drain()
+            self.raise_alarm()
+            self._raise_restart()
+            error.about(command="?")
+            raise
+        self._raise_restart()
+        return status
 
     def machine_position_mm(self) -> tuple[codec.Status, tuple[float, ...]]:
         """Return a report and MPos, from WPos and the work offset where a report has only these."""

@@ -10,7 +10,7 @@ import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, Self, get_type_hints
 
 from drivers.errors import CameraFormatError
 
@@ -175,6 +175,11 @@ ARRAY = 0x4000
 TEXT = 0xFFFF
 
 Value = int | str | tuple[int, ...]
+U16 = Annotated[int, "H"]
+U32 = Annotated[int, "I"]
+U64 = Annotated[int, "Q"]
+Text = Annotated[str, "text"]
+Codes = Annotated[tuple[int, ...], "*H"]
 
 
 class _Reader:
@@ -262,14 +267,17 @@ def decode_handles(data: bytes) -> tuple[int, ...]:
 
 
 class _Dataset:
-    """Fields in wire order: a struct letter, "*" and a letter for a list, "text" for a string."""
+    """Fields in wire order, each with its layout: see `_Reader.take`, "*" of a list, "text"."""
 
-    LAYOUT: ClassVar[tuple[tuple[str, str], ...]]
+    @classmethod
+    def _layouts(cls) -> dict[str, str]:
+        hints = get_type_hints(cls, include_extras=True)
+        return {name: hint.__metadata__[0] for name, hint in hints.items()}
 
     def encode(self) -> bytes:
         """Return the dataset's bytes."""
         parts = []
-        for name, layout in self.LAYOUT:
+        for name, layout in self._layouts().items():
             value: Any = getattr(self, name)
             if layout == "text":
                 parts.append(encode_text(value))
@@ -284,7 +292,7 @@ class _Dataset:
         """Return the dataset in the bytes; raises `CameraFormatError`."""
         reader = _Reader(data)
         fields: dict[str, Any] = {}
-        for name, layout in cls.LAYOUT:
+        for name, layout in cls._layouts().items():
             if layout == "text":
                 fields[name] = reader.text()
             elif layout.startswith("*"):
@@ -294,110 +302,63 @@ class _Dataset:
         return cls(**fields)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DeviceInfo(_Dataset):
     """Who the camera is and what it can do (clause 5.5.2)."""
 
-    LAYOUT: ClassVar = (
-        ("standard_version", "H"),
-        ("vendor_extension", "I"),
-        ("vendor_extension_version", "H"),
-        ("vendor_extension_text", "text"),
-        ("functional_mode", "H"),
-        ("operations", "*H"),
-        ("events", "*H"),
-        ("properties", "*H"),
-        ("capture_formats", "*H"),
-        ("image_formats", "*H"),
-        ("maker", "text"),
-        ("model", "text"),
-        ("version", "text"),
-        ("serial", "text"),
-    )
-    operations: tuple[int, ...]
-    events: tuple[int, ...]
-    properties: tuple[int, ...]
-    capture_formats: tuple[int, ...]
-    image_formats: tuple[int, ...]
-    maker: str
-    model: str
-    version: str
-    serial: str
-    standard_version: int = 100
-    vendor_extension: int = 0
-    vendor_extension_version: int = 0
-    vendor_extension_text: str = ""
-    functional_mode: int = 0
+    standard_version: U16 = 100
+    vendor_extension: U32 = 0
+    vendor_extension_version: U16 = 0
+    vendor_extension_text: Text = ""
+    functional_mode: U16 = 0
+    operations: Codes
+    events: Codes
+    properties: Codes
+    capture_formats: Codes
+    image_formats: Codes
+    maker: Text
+    model: Text
+    version: Text
+    serial: Text
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StorageInfo(_Dataset):
     """A memory card (clause 5.5.3)."""
 
-    LAYOUT: ClassVar = (
-        ("storage_type", "H"),
-        ("filesystem", "H"),
-        ("access", "H"),
-        ("capacity_bytes", "Q"),
-        ("free_bytes", "Q"),
-        ("free_images", "I"),
-        ("description", "text"),
-        ("label", "text"),
-    )
-    capacity_bytes: int
-    free_bytes: int
-    free_images: int
-    description: str = ""
-    label: str = ""
-    storage_type: int = 4
-    filesystem: int = 3
-    access: int = 0
+    storage_type: U16 = 4
+    filesystem: U16 = 3
+    access: U16 = 0
+    capacity_bytes: U64
+    free_bytes: U64
+    free_images: U32
+    description: Text = ""
+    label: Text = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ObjectInfo(_Dataset):
     """A file or folder on the card (clause 5.5.4)."""
 
-    LAYOUT: ClassVar = (
-        ("storage", "I"),
-        ("format", "H"),
-        ("protection", "H"),
-        ("size", "I"),
-        ("thumb_format", "H"),
-        ("thumb_size", "I"),
-        ("thumb_columns", "I"),
-        ("thumb_rows", "I"),
-        ("columns", "I"),
-        ("rows", "I"),
-        ("bits", "I"),
-        ("parent", "I"),
-        ("association_type", "H"),
-        ("association_description", "I"),
-        ("sequence", "I"),
-        ("name", "text"),
-        ("captured", "text"),
-        ("modified", "text"),
-        ("keywords", "text"),
-    )
-    storage: int
-    format: int
-    size: int
-    parent: int
-    name: str
-    captured: str = ""
-    modified: str = ""
-    keywords: str = ""
-    protection: int = 0
-    thumb_format: int = 0
-    thumb_size: int = 0
-    thumb_columns: int = 0
-    thumb_rows: int = 0
-    columns: int = 0
-    rows: int = 0
-    bits: int = 0
-    association_type: int = 0
-    association_description: int = 0
-    sequence: int = 0
+    storage: U32
+    format: U16
+    protection: U16 = 0
+    size: U32
+    thumb_format: U16 = 0
+    thumb_size: U32 = 0
+    thumb_columns: U32 = 0
+    thumb_rows: U32 = 0
+    columns: U32 = 0
+    rows: U32 = 0
+    bits: U32 = 0
+    parent: U32
+    association_type: U16 = 0
+    association_description: U32 = 0
+    sequence: U32 = 0
+    name: Text
+    captured: Text = ""
+    modified: Text = ""
+    keywords: Text = ""
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ RAW_SUFFIXES = frozenset(
 )
 """What makers call the RAW files that LibRaw knows."""
 
-TOLD = {"maker": 271, "model": 272, "captured": 306, "serial": 42033}
-TOLD_IN_EXIF = {
+TAG_CODES = {"maker": 271, "model": 272, "captured": 306, "serial": 42033}
+EXIF_NAMES = {
     "iso": "ISOSpeedRatings",
     "aperture": "FNumber",
     "captured": "DateTimeOriginal",
@@ -239,8 +239,8 @@ def _read_tiff(data: bytes) -> _TiffTags:
             exif = exif if isinstance(exif, dict) else {}
             exposure_s = _exposure_s(tags, exif)
             description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
-            metadata = {name: tags.valueof(tag) for name, tag in TOLD.items()}
-            metadata |= {name: exif.get(key) for name, key in TOLD_IN_EXIF.items() if key in exif}
+            metadata = {name: tags.valueof(tag) for name, tag in TAG_CODES.items()}
+            metadata |= {name: exif.get(key) for name, key in EXIF_NAMES.items() if key in exif}
             pixels = read_in_place(data, tiff) if plain and missing <= 0 else None
     except Exception as error:  # tifffile raises whatever it runs into in damaged tags
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error

@@ -1,9 +1,12 @@
 """Byte streams to serial devices: one object owns one port, and the lock on its exchanges."""
 
 import errno
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TypeVar
 
 import serial
 
@@ -34,6 +37,32 @@ NETWORK_HOLDER = "another program over the network"
 QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
+QUERY_ATTEMPTS = 3
+FOREIGN_MESSAGES_TOLERATED = 64
+EXCHANGE_LIMIT_S = 2.0
+"""Longest wait for one answer among messages that are none."""
+
+_Answer = TypeVar("_Answer")
+_log = logging.getLogger(__name__)
+
+
+def repeated(
+    ask: Callable[[], _Answer],
+    what: str,
+    recover: Callable[[], None] = lambda: None,
+    faults: tuple[type[DriverError], ...] = (TransportTimeoutError, GarbledReplyError),
+) -> _Answer:
+    """Return the answer to what may be asked again without harm, after a few attempts if need be.
+
+    recover: called between them. Raises the fault of the last.
+    """
+    for attempt in range(1, QUERY_ATTEMPTS):
+        try:
+            return ask()
+        except faults as fault:
+            _log.warning("attempt %d of %s failed: %s", attempt, what, fault)
+            recover()
+    return ask()
 
 
 class Transport(ABC):

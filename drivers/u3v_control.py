@@ -6,7 +6,6 @@ since a write may have taken effect. Source: GenCP 1.1; USB3 Vision 1.0, control
 
 from __future__ import annotations
 
-import logging
 import struct
 import threading
 from collections.abc import Callable
@@ -21,21 +20,17 @@ from drivers.errors import (
     UsbStalledError,
     UsbTimeoutError,
 )
+from drivers.transport import FOREIGN_MESSAGES_TOLERATED, repeated
 from drivers.usb import UsbPipe
 
-_log = logging.getLogger(__name__)
-
-READ_ATTEMPTS = 3
 BUSY_LIMIT_S = 30.0
 """Longest that a camera may ask for by pending acknowledges, for one command."""
-FOREIGN_MESSAGES_TOLERATED = 64
 PENDING_TOLERATED = 4096
 FIRST_TIMEOUT_S = 1.0
 TIMEOUTS_S = (0.5, 10.0)
 """Bounds on the response time that the camera states."""
 DATA_SIZES = (8, 1 << 15)
 """Bounds on the data of one command, whatever lengths the camera states."""
-
 
 _MENDABLE = (UsbTimeoutError, UsbStalledError, CameraFormatError)
 
@@ -85,39 +80,31 @@ class U3vControl:
 
     def _read(self, address: int, length: int) -> bytes:
         what = f"to read {length} bytes at {address:#x}"
-        for attempt in range(1, READ_ATTEMPTS + 1):
-            try:
-                data = self._exchange(
-                    what,
-                    codec.READMEM_ACK,
-                    lambda request_id: codec.encode_read(request_id, address, length),
-                    length,
-                )
-                if len(data) != length:
-                    raise CameraFormatError(data, f"{len(data)} bytes instead of {length}")
-                return data
-            except _MENDABLE as error:
-                _log.warning("%s: attempt %d %s failed: %s", self.name, attempt, what, error)
-                self._recover(error)
-                if attempt == READ_ATTEMPTS:
-                    raise
-        raise AssertionError("unreachable")
+
+        def ask() -> bytes:
+            data = self._exchange(
+                what,
+                codec.READMEM_ACK,
+                lambda request_id: codec.encode_read(request_id, address, length),
+                length,
+            )
+            if len(data) != length:
+                raise CameraFormatError(data, f"{len(data)} bytes instead of {length}")
+            return data
+
+        return repeated(ask, f"{self.name} {what}", faults=_MENDABLE)
 
     def _write(self, address: int, data: bytes) -> None:
         what = f"to write {data[:8].hex()} at {address:#x}"
-        try:
-            answer = self._exchange(
-                what,
-                codec.WRITEMEM_ACK,
-                lambda request_id: codec.encode_write(request_id, address, data),
-                4,
-            )
-            # Old cameras leave the count out.
-            if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(data)):
-                raise CameraFormatError(answer, f"not all {len(data)} bytes were written")
-        except _MENDABLE as error:
-            self._recover(error)
-            raise
+        answer = self._exchange(
+            what,
+            codec.WRITEMEM_ACK,
+            lambda request_id: codec.encode_write(request_id, address, data),
+            4,
+        )
+        # Old cameras leave the count out.
+        if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(data)):
+            raise CameraFormatError(answer, f"not all {len(data)} bytes were written")
 
     def _recover(self, error: Exception) -> None:
         """Make the pipes usable again, and forget what is still in them."""
@@ -131,8 +118,12 @@ class U3vControl:
     ) -> bytes:
         with self._lock:
             request_id = next(self._request_ids)
-            self._command.write(encode(request_id), self._timeout_s)
-            raw, message = self._await(what, request_id, data_size)
+            try:
+                self._command.write(encode(request_id), self._timeout_s)
+                raw, message = self._await(what, request_id, data_size)
+            except _MENDABLE as error:
+                self._recover(error)
+                raise
         if message.status:
             meaning, advice = codec.STATUS.get(message.status, codec.UNKNOWN_STATUS)
             raise CameraRefusedError(what, f"{meaning} ({message.status:#06x})", advice)

@@ -24,14 +24,15 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import Transport
+from drivers.transport import (
+    EXCHANGE_LIMIT_S,
+    FOREIGN_MESSAGES_TOLERATED,
+    Transport,
+    repeated,
+)
 
 _log = logging.getLogger(__name__)
 
-QUERY_ATTEMPTS = 3
-FOREIGN_MESSAGES_TOLERATED = 64
-EXCHANGE_LIMIT_S = 2.0
-"""Longest wait for one answer among messages that are none."""
 TRIGGER = 1
 """Which of the device's triggers raises the output on arrival."""
 REFERENCE_FLAGS = {"WR", "WH"}
@@ -363,14 +364,7 @@ class _Chain:
 
     def query(self, device: int, number: int, data: str, name: str) -> codec.Reply:
         """Exchange a command that may be repeated without harm, a few times if need be."""
-        for attempt in range(1, QUERY_ATTEMPTS + 1):
-            try:
-                return self.ask(device, number, data, name)
-            except (TransportTimeoutError, GarbledReplyError) as error:
-                if attempt == QUERY_ATTEMPTS:
-                    raise
-                _log.warning("%s: attempt %d of %r failed: %s", name, attempt, data, error)
-        raise AssertionError("unreachable")
+        return repeated(lambda: self.ask(device, number, data, name), f"{data!r} to {name}")
 
     def ask(self, device: int, number: int, data: str, name: str) -> codec.Reply:
         """Exchange a command once; an error carries the command and the axis."""

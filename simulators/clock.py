@@ -1,7 +1,6 @@
 """Time that passes when someone sleeps, so that a simulated hour costs nothing."""
 
 import threading
-import time
 
 
 class ManualClock:
@@ -22,19 +21,3 @@ class ManualClock:
             raise ValueError(f"cannot sleep for {duration_s:g} s")
         with self._lock:
             self._now_s += duration_s
-
-
-class JumpingClock(ManualClock):
-    """As `ManualClock`, but real time passes too: for wires on which bytes really travel.
-
-    `pace` seconds pass in a real one.
-    """
-
-    def __init__(self, pace: float = 1.0) -> None:
-        super().__init__()
-        self.pace = pace
-        self._made_s = time.monotonic()
-
-    def now_s(self) -> float:
-        """Return the time in seconds since the clock was made."""
-        return super().now_s() + self.pace * (time.monotonic() - self._made_s)

@@ -72,7 +72,7 @@ class SimulatedController(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Bring the firmware to the present; what it says by itself it says with `_send`."""
+        """Advance to the time of the clock; what it says by itself it says with `_send`."""
 
     @abstractmethod
     def _next_event_s(self) -> float | None:

@@ -206,7 +206,7 @@ class GrblController(SimulatedController):
         self._lines.append(("".join(text.split()).upper(), len(line) + 1))
 
     def _advance(self) -> None:
-        """Bring motors, queue and homing to the present, move by move."""
+        """Advance motors, queue and homing to the time of the clock, move by move."""
         while True:
             ended_s = self._next_event_s()
             for letter, motor in self._motors.items():
@@ -673,7 +673,8 @@ class GrblController(SimulatedController):
             work_mm = {one: mm - self._offset_mm(one) for one, mm in machine_mm.items()}
             fields = [state, f"WPos:{self._coordinates(work_mm, unit)}"]
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
-        fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.0f},0")
+        decimals = 0 if unit == 1 else 1
+        fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.{decimals}f},0")
         moving = self._state not in ("Idle", "Alarm")
         if self._reports_to_offset:
             self._reports_to_offset -= 1

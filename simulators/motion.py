@@ -232,7 +232,7 @@ class Motor:
         self._counted_from_um += distance_um
 
     def advance(self) -> End | None:
-        """Bring the motor to the present; return how its motion ended, if it did just now."""
+        """Advance to the time of the clock; return how its motion ended, if it did just now."""
         if self._course is None:
             return None
         now_s = self._clock.now_s()

@@ -194,7 +194,7 @@ class PtpCameraSimulator:
             return self.events.popleft() if self.events else None
 
     def advance(self) -> None:
-        """Bring the camera to the present: a capture that is over puts its files on the card."""
+        """Advance to the time of the clock: a capture that is over puts its files on the card."""
         if self._due is None or self._clock.now_s() < self._due[0]:
             return
         _, exposure_s, transaction = self._due
@@ -267,7 +267,13 @@ class PtpCameraSimulator:
         if arguments[0] != STORAGE:
             return Answer(Code.INVALID_STORAGE)
         free = max(0, self._capacity_bytes - self._used_bytes)
-        info = StorageInfo(self._capacity_bytes, free, free >> 24, "card", "EMMC")
+        info = StorageInfo(
+            capacity_bytes=self._capacity_bytes,
+            free_bytes=free,
+            free_images=free >> 24,
+            description="card",
+            label="EMMC",
+        )
         return Answer(data=info.encode())
 
     def _object_handles(self, arguments: tuple[int, ...], *request: object) -> Answer:
@@ -392,11 +398,11 @@ class PtpCameraSimulator:
             handles.append(self._store(f"{name}.DNG", Format.DNG, data))
         for handle in handles:
             if not self.faults.strikes("drop_event"):
-                self._tell(EventCode.OBJECT_ADDED, transaction, handle)
+                self._queue_event(EventCode.OBJECT_ADDED, transaction, handle)
             if self.faults.strikes("duplicate_event"):
-                self._tell(EventCode.OBJECT_ADDED, transaction, handle)
+                self._queue_event(EventCode.OBJECT_ADDED, transaction, handle)
         if not self.faults.strikes("drop_complete"):
-            self._tell(EventCode.CAPTURE_COMPLETE, transaction)
+            self._queue_event(EventCode.CAPTURE_COMPLETE, transaction)
 
     def _amplified(self, mosaic: Array) -> Array:
         """Return the mosaic at the present ISO: signal and noise alike grow above the black."""
@@ -416,14 +422,20 @@ class PtpCameraSimulator:
             handle = self._last_handle
         moment = EPOCH + timedelta(seconds=self._clock.now_s())
         stamp = moment.strftime("%Y%m%dT%H%M%S")
-        folder = kind == Format.FOLDER
         info = ObjectInfo(
-            STORAGE, kind, len(data), parent, name, stamp, stamp, association_type=int(folder)
+            storage=STORAGE,
+            format=kind,
+            size=len(data),
+            parent=parent,
+            name=name,
+            captured=stamp,
+            modified=stamp,
+            association_type=int(kind == Format.FOLDER),
         )
         self.objects[handle] = (info, data)
         return handle
 
-    def _tell(self, code: int, transaction: int, *parameters: int) -> None:
+    def _queue_event(self, code: int, transaction: int, *parameters: int) -> None:
         self.events.append(Message(Kind.EVENT, code, transaction, parameters))
 
 

@@ -72,7 +72,7 @@ class _Axis:
         self._homing = False
 
     def advance(self) -> bool:
-        """Bring the axis to the present; return whether a move ended since the last time."""
+        """Advance to the time of the clock; return whether a move ended since the last time."""
         end = self.motor.advance()
         if end is None:
             return False

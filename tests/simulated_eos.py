@@ -144,7 +144,7 @@ class EosCameraSimulator(PtpCameraSimulator):
         self._values[Property.EXPOSURE_TIME] = max(1, round(exposure_s / EXPOSURE_UNIT_S))
         self._values[Property.EXPOSURE_INDEX] = round(iso(self._codes[EosProperty.ISO]) or 100)
 
-    def _tell(self, code: int, transaction: int, *parameters: int) -> None:
+    def _queue_event(self, code: int, transaction: int, *parameters: int) -> None:
         """Keep a new object for GetEvent; no other event of the standard comes."""
         if code != EventCode.OBJECT_ADDED or not self._telling:
             return

@@ -88,14 +88,14 @@ class SonyCameraSimulator(PtpCameraSimulator):
         """Keep the newest picture in memory; there are no folders."""
         if kind == Format.FOLDER:
             return 0
-        info = ObjectInfo(0, kind, len(data), 0, name)
+        info = ObjectInfo(storage=0, format=kind, size=len(data), parent=0, name=name)
         self.objects[IN_MEMORY] = (info, data)
         return IN_MEMORY
 
-    def _tell(self, code: int, transaction: int, *parameters: int) -> None:
+    def _queue_event(self, code: int, transaction: int, *parameters: int) -> None:
         """Send Sony's own event of a new picture, and none of the standard."""
         if code == EventCode.OBJECT_ADDED and parameters != (0,):
-            super()._tell(OBJECT_ADDED, transaction, *parameters)
+            super()._queue_event(OBJECT_ADDED, transaction, *parameters)
 
     def _object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         """Hand the picture over: it leaves the memory."""

@@ -19,7 +19,7 @@ from drivers.stage import DEFAULT_SETTINGS, HostStage, StageSettings
 from drivers.transport import SerialTransport, Transport
 from drivers.zaber import ZaberStage
 from simulators.apt import AptController
-from simulators.clock import JumpingClock, ManualClock
+from simulators.clock import ManualClock
 from simulators.firmware import Occasion, SimulatedController
 from simulators.grbl import GrblController
 from simulators.wire import PtyServer, TcpServer
@@ -35,6 +35,22 @@ WIRE_POLL_S = 0.1
 Z825_MOTOR = ACTUATORS["z825"]
 QUICK_HOMING = {codec.HOMING_SEEK: 6000, codec.HOMING_FEED: 600}
 """mm/min; Grbl is silent while it homes, and on a real wire silence really takes time."""
+
+
+class JumpingClock(ManualClock):
+    """As `ManualClock`, but real time passes too: for wires on which bytes really travel.
+
+    `pace` seconds pass in a real one.
+    """
+
+    def __init__(self, pace: float = 1.0) -> None:
+        super().__init__()
+        self.pace = pace
+        self._made_s = time.monotonic()
+
+    def now_s(self) -> float:
+        """Return the time in seconds since the clock was made."""
+        return super().now_s() + self.pace * (time.monotonic() - self._made_s)
 
 
 class StageRig(ABC):

@@ -159,6 +159,18 @@ def test_a_zaber_move_goes_at_the_speed_given_with_it(homed_zaber):
     assert int(homed_zaber.data("1 1 2 get pos")) == pytest.approx(9_987.5, abs=2)
 
 
+def test_a_stopped_zaber_brakes_at_its_acceleration(homed_zaber):
+    # From 10 000 microsteps/s at 6103.5 microsteps/s^2: v t - a t^2 / 2, at rest after 1.64 s.
+    homed_zaber.ask("1 1 1 set maxspeed 16384")
+    homed_zaber.ask("1 1 2 move abs 100000", after_s=2.0)
+    homed_zaber.ask("1 1 3 set accel 1")
+    start = int(homed_zaber.data("1 1 4 get pos"))
+    homed_zaber.ask("1 1 5 stop", after_s=0.8)
+    assert int(homed_zaber.data("1 1 6 get pos")) - start == pytest.approx(6_046.9, abs=2)
+    homed_zaber.clock.sleep(1.0)
+    assert int(homed_zaber.data("1 1 7 get pos")) - start == pytest.approx(8_192.0, abs=2)
+
+
 def test_zaber_outputs_are_set_by_command_and_by_a_trigger_at_its_place(homed_zaber):
     assert homed_zaber.data("1 0 1 io set do 4 1") == "0"
     assert homed_zaber.data("1 0 2 io get do") == "0 0 0 1"
@@ -294,6 +306,14 @@ def homed_apt(apt):
     return apt
 
 
+def test_an_apt_message_may_come_in_pieces(homed_apt):
+    message = long(0x0453, struct.pack("<Hi", 1, 34_304))
+    for byte in message[:-1]:
+        assert homed_apt(bytes([byte]), after_s=0.1) == b""
+    homed_apt(message[-1:] + short(0x0490, 1), after_s=30.0)
+    assert homed_apt.status()[0] == 34_304
+
+
 def test_each_apt_bay_of_a_rack_answers_at_its_own_address():
     rack = Wire(AptController, {0x21: APT_AXIS, 0x22: APT_AXIS})
     assert rack(short(0x0490, 1, destination=0x22))[4:6] == bytes([HOST | 0x80, 0x22])
@@ -375,6 +395,15 @@ def test_an_apt_jog_steps_up_or_down_or_goes_on(homed_apt, mode, direction, coun
         assert position == pytest.approx(30_000 + 4.5 * 34_304, rel=2e-3)
     else:
         assert (position, bits & 0x30) == (counts, 0)
+
+
+@pytest.mark.parametrize(("direction", "way"), [(2, 34_304), (1, -34_304)])
+def test_an_apt_move_at_a_velocity_goes_the_way_of_its_direction(homed_apt, direction, way):
+    # At 1 mm/s, with its ramps of 1 mm/s^2: a second at speed and half a second's way in the ramp.
+    homed_apt(long(0x0453, struct.pack("<Hi", 1, 60_000)), after_s=30.0)
+    homed_apt(long(0x0413, struct.pack("<HIII", 1, 0, 262, 767_367)))
+    homed_apt(short(0x0457, 1, direction), after_s=1.5)
+    assert homed_apt.status()[0] == pytest.approx(60_000 + way, abs=100)
 
 
 def test_apt_says_who_it_is_as_the_document_lays_it_out(apt):
@@ -517,6 +546,10 @@ def test_a_grbl_diagonal_is_straight_and_its_feed_is_along_it(grbl):
         (["G10 L20 P1 X3", "G90 G1 F600 X-20"], -24.0),
         (["G10 L2 P1 X-5", "G90 G1 F600 X-20"], -25.0),
         (["G92 X0", "G92.1", "G90 G1 F600 X-20"], -20.0),
+        (["G92 X0", "$J=G90 G21 X-20 F600"], -21.0),
+        (["G92 X0", "$J=G90 G53 X-20 F600"], -20.0),
+        (["$J=G91 G20 X-1 F20"], -26.4),
+        (["G20 G91", "$J=X-1 F20"], -26.4),
     ],
 )
 def test_grbl_words_move_where_the_document_says(grbl, lines, place):
@@ -575,6 +608,9 @@ def test_grbl_reports_its_accessories_by_the_documents_letters(word, letters):
 def test_grbl_in_inches_reports_inches(grbl):
     grbl.say("$13=1")
     assert grbl.report().startswith("<Idle|MPos:-0.0394,-0.0394,-0.0394|")
+    # config.h: a rate has no decimals in millimetres and one in inches, 600 / 25.4.
+    assert grbl.say("$J=G91 G21 X-50 F600", after_s=2.0) == ["ok"]
+    assert "|FS:23.6,0" in grbl.report()
 
 
 def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
@@ -588,7 +624,7 @@ def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
 
 def test_a_hold_of_grbl_ends_in_hold_0_and_is_taken_up_by_a_tilde(grbl):
     grbl.say("G91 G1 F300 X-50", after_s=1.0)
-    assert grbl.report().startswith("<Run|")
+    assert re.match(r"<Run\|.*\|FS:300,0", grbl.report())
     assert grbl(b"!?").decode().startswith("<Hold:1|")
     grbl.clock.sleep(5.0)
     assert grbl.report().startswith("<Hold:0|")

@@ -215,7 +215,7 @@ def test_pictures_stay_on_the_card_unless_they_are_to_go():
     ],
 )
 def test_raw_files_are_recognised_by_format_or_name(name, kind, format_, raw):
-    assert is_raw(ObjectInfo(1, format_, 100, 0, name)) is raw
+    assert is_raw(ObjectInfo(storage=1, format=format_, size=100, parent=0, name=name)) is raw
 
 
 CURED = {
@@ -374,7 +374,9 @@ def test_a_card_that_fills_up_is_an_error_and_emptying_it_helps():
 def test_a_picture_deleted_on_the_camera_is_refused_with_advice(bench):
     session = bench.open().session
     with pytest.raises(CameraRefusedError, match="invalid handle: the picture is gone"):
-        session.download(99, ObjectInfo(1, Format.DNG, 100, 0, "X.DNG"))
+        session.download(
+            99, ObjectInfo(storage=1, format=Format.DNG, size=100, parent=0, name="X.DNG")
+        )
 
 
 def test_a_camera_that_cannot_be_released_says_so():

@@ -40,9 +40,32 @@ DECODERS = (
     codec.ObjectInfo.decode,
 )
 SAMPLES = (
-    codec.ObjectInfo(1, codec.Format.DNG, 100, 1, "A.DNG", "20240101T000000").encode(),
-    codec.StorageInfo(1 << 40, 1 << 39, 1000, "card", "label").encode(),
-    codec.DeviceInfo((0x1001,) * 9, (0x4002,), (0x500D,), (), (), "M", "D", "1", "2").encode(),
+    codec.ObjectInfo(
+        storage=1,
+        format=codec.Format.DNG,
+        size=100,
+        parent=1,
+        name="A.DNG",
+        captured="20240101T000000",
+    ).encode(),
+    codec.StorageInfo(
+        capacity_bytes=1 << 40,
+        free_bytes=1 << 39,
+        free_images=1000,
+        description="card",
+        label="label",
+    ).encode(),
+    codec.DeviceInfo(
+        operations=(0x1001,) * 9,
+        events=(0x4002,),
+        properties=(0x500D,),
+        capture_formats=(),
+        image_formats=(),
+        maker="M",
+        model="D",
+        version="1",
+        serial="2",
+    ).encode(),
     codec.encode_description(
         codec.PropertyDescription(0x500D, 6, True, 100, 100, choices=(1, 2, 3))
     ),

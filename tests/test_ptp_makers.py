@@ -116,7 +116,7 @@ def test_a_new_eos_that_finds_no_focus_is_an_error_that_says_so():
 
 
 def test_an_event_that_never_comes_is_made_up_for_by_the_card(eos):
-    eos.body._tell = lambda *event: None
+    eos.body._queue_event = lambda *event: None
     with eos.open() as camera:
         np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
 
@@ -233,7 +233,7 @@ def test_the_exposure_of_a_sony_is_set_on_the_camera_and_read_from_the_file(sony
 
 
 def test_a_sony_whose_picture_never_comes_is_an_error_in_time(sony):
-    sony.body._tell = lambda *event: None
+    sony.body._queue_event = lambda *event: None
     with sony.open() as camera:
         start_s = sony.clock.now_s()
         with pytest.raises(CaptureError, match="check focus"):

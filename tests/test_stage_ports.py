@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 import serial
 from serial.tools import list_ports
+from stage_rigs import JumpingClock
 
 from drivers import ports
 from drivers.clock import SYSTEM_CLOCK
@@ -28,7 +29,7 @@ from drivers.ports import find_port, holder_of, list_serial_ports, udev_rule_pat
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
-from simulators.clock import JumpingClock, ManualClock
+from simulators.clock import ManualClock
 from simulators.faults import Faults
 from simulators.firmware import Occasion
 from simulators.wire import PtyServer, TcpServer

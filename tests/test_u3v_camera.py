@@ -33,9 +33,10 @@ from drivers.errors import (
     UsbTimeoutError,
     UsbTransferError,
 )
+from drivers.transport import QUERY_ATTEMPTS
 from drivers.u3v import UNZIPPED_LIMIT, decode_frame, open_u3v
 from drivers.u3v_codec import CONTROL
-from drivers.u3v_control import BUSY_LIMIT_S, READ_ATTEMPTS
+from drivers.u3v_control import BUSY_LIMIT_S
 from drivers.u3v_stream import plan_sizes
 from drivers.usb import TRANSFER_BYTES, list_devices
 from emmc_rig.bench.hardware import open_camera
@@ -370,7 +371,7 @@ def test_a_camera_that_stays_silent_is_given_up_in_bounded_time(bench, faults):
     before_s = bench.clock.now_s()
     with pytest.raises(UsbTimeoutError, match="was silent"):
         camera.features.number("Width")
-    assert bench.clock.now_s() - before_s < READ_ATTEMPTS * 1.0
+    assert bench.clock.now_s() - before_s < QUERY_ATTEMPTS * 1.0
 
 
 def test_a_pending_acknowledge_gives_the_camera_more_time(bench, faults):

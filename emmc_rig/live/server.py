@@ -315,7 +315,7 @@ def application(
             raise _RefusedError(400, f"{name}: these are not its values ({fault})") from fault
         return JSONResponse({"done": name, **done})
 
-    async def stranger(request: Request) -> Response:
+    async def wrong_token(request: Request) -> Response:
         raise _RefusedError(403, "wrong token")
 
     made = Starlette(
@@ -325,7 +325,7 @@ def application(
             Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
             Route("/{token}/", guarded(shown), methods=["GET"]),
             Route("/{token}/{name}", guarded(shown), methods=["GET"]),
-            Route("/{rest:path}", guarded(stranger), methods=["GET", "POST"]),
+            Route("/{rest:path}", guarded(wrong_token), methods=["GET", "POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
     )

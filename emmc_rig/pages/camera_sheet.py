@@ -32,7 +32,6 @@ from emmc_rig.model.sensing import ImagingMatrix
 SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
 WEIGHTS_SHOWN = 20
-MASK_STATES_SHOWN = 6
 HALF_CELLS_SHOWN = 8
 SMALLEST_EIGENVALUE = 1e-10
 INK, FAINT, BLOCKED, RAY, WARNING = "#1b1f27", "#8a919e", "#2b2f38", "#c2410c", "#b45309"
@@ -147,8 +146,8 @@ def draw_camera(camera: Camera, path: Path) -> None:
     """
     size = _square(camera, SHEET_SAMPLES)
     psi = build_imaging_matrix(camera, size)
-    states = _mask_states(camera, draw_plates(camera, size))
-    heights = [0.6, 2.8, *([3.6] if states else []), 3.5]
+    masked = bool(camera.shot_masks(0))
+    heights = [0.6, 2.8, *([3.6] if masked else []), 3.5]
     figure = Figure(figsize=(14, sum(heights)), dpi=100, layout="constrained")
     bands = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     bands[0].text(0.01, 0.62, camera.title, fontsize=17, weight="bold", color=INK, va="center")
@@ -156,8 +155,8 @@ def draw_camera(camera: Camera, path: Path) -> None:
     optics, text = bands[1].subplots(1, 2)
     _draw_axis(optics, camera)
     _write_figures(text, camera, psi)
-    if states:
-        _draw_masks(bands[2], camera, states)
+    if masked:
+        _draw_masks(bands[2], camera, draw_plates(camera, size))
     _draw_weights(bands[-1], camera, psi)
     try:
         with whole_file(path) as partial:
@@ -216,43 +215,16 @@ def _write_figures(axes: Axes, camera: Camera, psi: ImagingMatrix) -> None:
         level -= 0.09 * (1 + value.count("\n"))
 
 
-@dataclass(frozen=True)
-class _MaskState:
-    """A mask as it stands during some shots."""
-
-    name: str
-    plate: Plate
-    frame: int
-    offset_um: tuple[float, float]
-    shots: list[int]
-
-
-def _mask_states(camera: Camera, plates: dict[str, Plate]) -> list[_MaskState]:
-    """Return the different states of every mask over the shots, in the order of their shots."""
-    states: dict[tuple[str, int, tuple[float, float]], _MaskState] = {}
-    for shot, settings in enumerate(camera.shots):
-        for name in camera.shot_masks(shot):
-            frame = shot % len(plates[name].cells)
-            offset = settings.offset_um.get(name, (0.0, 0.0))
-            state = _MaskState(name, plates[name], frame, offset, [])
-            states.setdefault((name, frame, offset), state).shots.append(shot)
-    return list(states.values())
-
-
-def _draw_masks(band: SubFigure, camera: Camera, states: list[_MaskState]) -> None:
-    """Draw masks as the beam meets them, one panel for each of the first states."""
-    shown = states[:MASK_STATES_SHOWN]
-    more = f", the first {len(shown)} of {len(states)} states" if len(states) > len(shown) else ""
-    _band_title(band, f"masks around the optical axis{more}; dots: one pixel's rays to the views")
-    panels = band.subplots(1, max(len(shown), 5), squeeze=False)[0]
-    for axes, state in zip(panels, shown, strict=False):
-        _draw_plate(axes, camera, state.plate, state.frame, state.offset_um)
-        x, y = state.offset_um
-        moved = f"\nat ({x:g}, {y:g}) um" if x or y else ""
-        every = len(state.shots) == len(camera.shots)
-        shots = "all shots" if every else f"shot {', '.join(map(str, state.shots))}"
-        axes.set_title(f"{state.name}, {shots}{moved}", fontsize=9)
-    for axes in panels[len(shown) :]:
+def _draw_masks(band: SubFigure, camera: Camera, plates: dict[str, Plate]) -> None:
+    """Draw the masks of shot 0 as the beam meets them."""
+    _band_title(band, "masks of shot 0, around the optical axis; dots: one pixel's rays to views")
+    names = camera.shot_masks(0)
+    panels = band.subplots(1, max(len(names), 5), squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=False):
+        x, y = offset = camera.shots[0].offset_um.get(name, (0.0, 0.0))
+        _draw_plate(axes, camera, plates[name], offset)
+        axes.set_title(f"{name}, at ({x:g}, {y:g}) um" if x or y else name, fontsize=9)
+    for axes in panels[len(names) :]:
         axes.set_axis_off()
 
 
@@ -260,9 +232,7 @@ def _band_title(band: SubFigure, title: str) -> None:
     band.suptitle(title, fontsize=10.5, x=0.01, ha="left", color=INK)
 
 
-def _draw_plate(
-    axes: Axes, camera: Camera, plate: Plate, frame: int, offset_um: tuple[float, float]
-) -> None:
+def _draw_plate(axes: Axes, camera: Camera, plate: Plate, offset_um: tuple[float, float]) -> None:
     """Draw a plate's cells near the axis, and where one sample's rays to the views meet them."""
     _, rows, columns, _ = plate.cells.shape
     far = plate.distance_mm > 0.5 * camera.lens.distance_mm
@@ -271,7 +241,7 @@ def _draw_plate(
     half_x, half_y = columns * plate.cell_um / 2, rows * plate.cell_um / 2
     left, right, below, above = x - half_x, x + half_x, y + half_y, y - half_y
     axes.imshow(
-        plate.cells[frame],
+        plate.cells[0],
         extent=(left * unit, right * unit, below * unit, above * unit),
         interpolation="nearest",
     )

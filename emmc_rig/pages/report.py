@@ -127,7 +127,7 @@ def _frames(frames: Array) -> dict[str, Any]:
 
 
 def _error(estimate: Array, truth: Array) -> dict[str, object]:
-    """Return the error averaged over views as a picture, the PSNR of each view, and its spread."""
+    """Return the error averaged over views as a picture, and the PSNR of each view."""
     difference = finite(estimate) - finite(truth)
     absolute, squared = np.abs(difference).mean(axis=-1), np.square(difference).mean(axis=-1)
     mean = reduced(absolute.mean(axis=(0, 1))[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
@@ -136,7 +136,6 @@ def _error(estimate: Array, truth: Array) -> dict[str, object]:
         "scale": scale,
         "picture": png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean))),
         "views": _view_psnr(squared),
-        "spread": _spread(absolute, squared),
     }
 
 
@@ -258,25 +257,6 @@ def _view_psnr(squared: Array) -> list[list[dict[str, str]]]:
         return {"words": words, "lightness": f"{96 - 26 * share:.0f}"}
 
     return [[cell(value) for value in row] for row in psnr_db]
-
-
-def _spread(absolute: Array, squared: Array) -> dict[str, str]:
-    """Return how the error is spread over all views."""
-    flat = squared.reshape(-1)
-    worst = max(1, flat.size // 20)
-    worst_sum = float(np.partition(flat, -worst)[-worst:].sum(dtype=np.float64))
-    total = float(flat.sum(dtype=np.float64))
-    mean = float(absolute.mean(dtype=np.float64))
-    median, high, highest = np.percentile(absolute, [50, 95, 99])
-    return {
-        "Mean": f"{mean:.4f}",
-        "Median": f"{median:.4f}",
-        "95 % of pixels below": f"{high:.4f}",
-        "99 % of pixels below": f"{highest:.4f}",
-        "Squared error in the worst 5 % of pixels": (
-            f"{100 * worst_sum / total:.0f} %" if total > 0 else "no error"
-        ),
-    }
 
 
 def _convergence(objective: Sequence[float]) -> dict[str, str] | None:

@@ -59,6 +59,19 @@ HEADINGS = {
     "turned": "The white board turned by 90 degrees",
     "shot": "Shots of the scene",
 }
+AGAIN = "{id} taken again: shifted by ({x_px:+.3f}, {y_px:+.3f}) px, likeness {likeness:.3f}"
+EVENTS = {
+    "run": "{wall}: {command}",
+    "retry": "{id}, try {attempt}: {fault}",
+    "discarded": "{id}: {reason}",
+    "registered": AGAIN,
+    "refused": AGAIN,
+    "stopped": "{wall}: {reason}",
+    "until": "{wall}: shots are taken until {target_db:g} dB are stated",
+    "paused": "{wall}: {reason}",
+    "complete": "{wall}: every frame verified",
+}
+"""By kind, what an entry of the journal says of an event."""
 
 
 def write_sheet(session: Session, out: Path, pictures: int = MOST_PICTURES) -> None:
@@ -262,23 +275,6 @@ def events(session: Session) -> Iterator[tuple[str, str]]:
 def _event_text(entry: Entry) -> str:
     """Return what an entry that is no frame says, "" for a frame."""
     kind = entry["kind"]
-    if kind == "run":
-        return f"{entry['wall']}: {entry['command']}"
-    if kind == "retry":
-        return f"{entry['id']}, try {entry['attempt']}: {entry['fault']}"
-    if kind == "discarded":
-        return f"{entry['id']}: {entry['reason']}"
-    if kind in ("registered", "refused"):
-        return (
-            f"{entry['id']} taken again: shifted by ({entry['x_px']:+.3f}, {entry['y_px']:+.3f}) "
-            f"px, likeness {entry['likeness']:.3f}"
-        )
-    if kind == "stopped":
-        return f"{entry['wall']}: {entry['reason']}"
-    if kind == "until":
-        return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
-    if kind == "paused":
-        return f"{entry['wall']}: {entry['reason']}"
     if kind == "resumed":
         return f"{entry['wall']}: after {shown_seconds(entry['seconds'])}"
     if kind == "decided":
@@ -287,4 +283,4 @@ def _event_text(entry: Entry) -> str:
         return metered_words(entry)
     if kind == "amended":
         return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
-    return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
+    return EVENTS.get(kind, "").format_map(entry)
