@@ -28,8 +28,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Fits, Mean, Patches, averaged, fitted_models
-from reconstruction.adaptive.given import checked, checked_disparity
 from reconstruction.adaptive.models import MODELS, model_map, texture_map
+from reconstruction.adaptive.readings import checked, checked_disparity
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey, surveyed
 from reconstruction.result import Progress, Reconstruction, Status
