@@ -15,8 +15,7 @@ from reconstruction.adaptive import assembly, fits, method
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.models import MODELS
+from reconstruction.adaptive.method import MODELS, reconstruct_adaptive
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import slopes
