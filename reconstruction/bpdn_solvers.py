@@ -136,7 +136,7 @@ def proximal_gradient(
         gain = atoms @ residual
         best_dual = max(best_dual, _dual(data, residual, eta, float(np.abs(gain).max())))
         ahead = code + momentum * (code - older)
-        new = _soft(ahead + gain / curvature, eta / curvature)
+        new = _soft(ahead + gain / curvature, eta / float(curvature))
         restart = (ahead - new) @ (new - code) > 0
         older, code = code, new
         before, fitted = fitted, code @ atoms
@@ -282,5 +282,5 @@ def sl0(
             pull = inverse @ missed if np.linalg.norm(missed) > tolerance else nothing
             passes += 1
         width = width * np.float32(shrink)
-    code = code + atoms @ pull
+    code = (code + atoms @ pull).astype(np.float32)
     return code, passes, float(np.linalg.norm(data - code @ atoms))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,7 @@ def kept_readings(usable: NDArray[np.bool_], seed: int = SEED) -> NDArray[np.boo
 
 def compare_held_out(
     frames: Array, residual: Array, noise_sigma: float, kept: NDArray[np.bool_], found: Relief
-) -> dict[str, float | None]:
+) -> dict[str, Any]:
     """Return figures of `Evidence`: how well a light field predicts readings kept from its fit.
 
     frames, residual (frames less what it predicts), kept: (shot, pixel_y, pixel_x). None with too
