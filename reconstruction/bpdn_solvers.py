@@ -128,7 +128,7 @@ def proximal_gradient(
     Beck and Teboulle 2009; the restart is that of O'Donoghue and Candes 2015. The step is 1 over
     the largest eigenvalue of A A^T.
     """
-    curvature = np.float32(np.linalg.eigvalsh((atoms.T @ atoms).astype(np.float64))[-1])
+    curvature = float(np.linalg.eigvalsh((atoms.T @ atoms).astype(np.float64))[-1])
     older = code = np.zeros(len(atoms), np.float32)
     fitted, residual = np.zeros_like(data), data
     t, momentum, gap, best_dual = 1.0, np.float32(0), 1.0, -np.inf
@@ -136,7 +136,7 @@ def proximal_gradient(
         gain = atoms @ residual
         best_dual = max(best_dual, _dual(data, residual, eta, float(np.abs(gain).max())))
         ahead = code + momentum * (code - older)
-        new = _soft(ahead + gain / curvature, eta / float(curvature))
+        new = _soft(ahead + gain / curvature, eta / curvature)
         restart = (ahead - new) @ (new - code) > 0
         older, code = code, new
         before, fitted = fitted, code @ atoms
@@ -282,5 +282,6 @@ def sl0(
             pull = inverse @ missed if np.linalg.norm(missed) > tolerance else nothing
             passes += 1
         width = width * np.float32(shrink)
-    code = (code + atoms @ pull).astype(np.float32)
-    return code, passes, float(np.linalg.norm(data - code @ atoms))
+    code = code + atoms @ pull
+    missed = float(np.linalg.norm(data - code @ atoms))
+    return np.asarray(code, np.float32), passes, missed
