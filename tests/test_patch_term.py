@@ -61,7 +61,8 @@ def test_the_term_is_that_of_the_extracted_patches_but_for_a_constant(places, we
     np.testing.assert_allclose(np.broadcast_to(term.weight[..., None], SHAPE), covers, rtol=1e-6)
     pulled = (extract.T @ estimates).reshape(SHAPE)
     np.testing.assert_allclose(term.weight[..., None] * term.target, pulled, atol=1e-5)
-    assert term.weight.max() == pytest.approx(sparse.linalg.norm(extract.T @ extract, np.inf), rel=1e-6)
+    largest = sparse.linalg.norm(extract.T @ extract, np.inf)
+    assert term.weight.max() == pytest.approx(largest, rel=1e-6)
 
 
 def test_patches_may_be_weighted_sample_by_sample():
