@@ -19,13 +19,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from batch_omp import NO_ATOM, Array, batch_omp
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.sparse import csr_array
 
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.settings import Settings
-from reconstruction.batch_omp import NO_ATOM, Array, batch_omp
 from reconstruction.errors import DictionaryError
 
 _ROWS_AT_ONCE = 2048

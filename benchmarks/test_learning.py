@@ -3,6 +3,7 @@
 import learning
 import numpy as np
 import pytest
+from batch_omp import NO_ATOM, batch_omp
 from learning import (
     LearningSettings,
     LearningState,
@@ -19,7 +20,6 @@ from training_patches import (
 )
 
 from emmc_rig.model.settings import validated
-from reconstruction.batch_omp import NO_ATOM, batch_omp
 from reconstruction.errors import DictionaryError
 
 SHAPE = (2, 2, 3, 4, 1)
@@ -98,7 +98,7 @@ def test_pursuits_agree_with_scikit_learn():
 def test_codes_do_not_depend_on_the_batches(monkeypatch):
     truth, patches = planted(50)
     whole = batch_omp(truth, patches, 4)
-    monkeypatch.setattr("reconstruction.batch_omp._BATCH_BYTES", 4 * 60 * 7)
+    monkeypatch.setattr("batch_omp._BATCH_BYTES", 4 * 60 * 7)
     parts = batch_omp(truth, patches, 4)
     np.testing.assert_array_equal(whole[0], parts[0])
     np.testing.assert_allclose(whole[1], parts[1], atol=1e-5)

@@ -18,7 +18,6 @@ from pydantic import Field
 from emmc_rig.model.settings import Settings
 from reconstruction import bpdn_solvers as solvers
 from reconstruction.errors import ReconstructionError
-from reconstruction.patches import padded
 
 Array32 = NDArray[np.float32]
 Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
@@ -158,31 +157,3 @@ def prepared(
         return Code(weights, eta, gap, np.nan, steps, gap <= settings.rtol)
 
     return minimise
-
-
-def solve_bpdn(
-    atoms: NDArray[np.floating],
-    data: NDArray[np.floating],
-    noise_sigma: float = 0.0,
-    settings: BPDNSettings | None = None,
-) -> Code:
-    """Return the sparse code of data (measurement,) in atoms (atom, measurement).
-
-    Raises ReconstructionError for shapes that do not fit, values that are not finite, and a noise
-    level that is negative.
-    """
-    settings = settings or BPDNSettings()
-    if atoms.ndim != 2 or not atoms.size or data.shape != atoms.shape[1:]:
-        raise ReconstructionError(
-            f"atoms of shape {atoms.shape} and data of shape {data.shape}: needed are "
-            "(atom, measurement) and (measurement,)"
-        )
-    if not (np.isfinite(atoms).all() and np.isfinite(data).all()):
-        raise ReconstructionError("atoms or data hold values that are not finite")
-    if not 0 <= noise_sigma < np.inf:
-        raise ReconstructionError(f"a noise level of {noise_sigma:g}: it must be at least 0")
-    wide = np.zeros((len(atoms), padded(data.size)), dtype=np.float32)
-    wide[:, : data.size] = atoms
-    one = np.zeros((1, wide.shape[1]), dtype=np.float32)
-    one[0, : data.size] = data
-    return prepared(wide, one, noise_sigma, settings)(one[0], data.size)

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigvals_banded
 
-from emmc_rig.model.sensing import rows_of_colours
 from reconstruction import kernels
 from reconstruction.errors import ReconstructionError
 
@@ -98,13 +97,6 @@ def norm_squared(order: int, shape: tuple[int | None, ...]) -> float:
         float(np.prod([_difference_norm_squared(n, s) for n, s in zip(index, sizes, strict=True)]))
         for index in multi_indices(order)
     )
-
-
-def variation(light_field: Array, order: int, metric: Array | None = None) -> float:
-    """Return DV_K of a light field (v, u, y, x, c), its colours first multiplied by a metric."""
-    metric = np.eye(3) if metric is None else metric
-    planar = np.ascontiguousarray(rows_of_colours(light_field))
-    return planar_variation(planar, order, metric.astype(planar.dtype))
 
 
 def planar_variation(planar: Array, order: int, metric: Array) -> float:

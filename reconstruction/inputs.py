@@ -14,6 +14,15 @@ WHITER = 2.0
 """Times the readings of a white scene, on average, that no light field in [0, 1] makes."""
 
 
+def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
+    """Raise ReconstructionError for frames of another shape than Psi's (shot, row, column)."""
+    if frames.shape != shape:
+        raise ReconstructionError(
+            f"frames of shape {frames.shape} given, Psi needs {shape} "
+            "(shot, row, column): use the Psi measured with these shots"
+        )
+
+
 def checked_inputs(
     psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_] | None
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -27,11 +36,7 @@ def checked_inputs(
         raise ReconstructionError(
             f"a noise level of {noise_sigma:g}: it must be finite, at least 0"
         )
-    if frames.shape != psi.frames_shape:
-        raise ReconstructionError(
-            f"frames of shape {frames.shape} given, Psi needs {psi.frames_shape} "
-            "(shot, row, column): use the Psi measured with these shots"
-        )
+    check_frames(psi.frames_shape, frames)
     if usable is None:
         usable = np.ones(psi.frames_shape, dtype=bool)
     if usable.shape != psi.frames_shape:

@@ -48,11 +48,6 @@ class PatchTerm:
                 "the patch target has values that are not finite: give those samples weight 0"
             )
 
-    @property
-    def norm(self) -> float:
-        """|P* P|: the largest weight."""
-        return float(self.weight.max())
-
     def value(self, light_field: Array) -> float:
         """Return 1/2 sum W |L - M|^2 of a light field (v, u, y, x, c), without rho."""
         total = 0.0
@@ -60,7 +55,3 @@ class PatchTerm:
             square = np.square(light_field[view] - self.target[view], dtype=np.float64)
             total += float(np.sum(self.weight * square.sum(axis=-1)))
         return total / 2
-
-    def window(self, rows: slice, columns: slice) -> PatchTerm:
-        """Return the term of a part of the light field, a copy."""
-        return PatchTerm(self.target[:, :, rows, columns].copy(), self.weight[rows, columns].copy())

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
 from reconstruction.flat import FlatPsi, flat_psi
-from reconstruction.neighbour_kernels import neighbour_range
 
 Array = NDArray[np.floating]
 DARK_SHARE = 0.02
@@ -174,6 +174,36 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
     if np.abs(gains[kept] - 1).max() < max(LEAST_FLICKER, SURE * error):
         return even
     return gains
+
+
+@row_kernel("values", 0)
+def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low, high):
+    """Set low and high (y, x) to quantiles `tail` and 1 - `tail` of each pixel's neighbours.
+
+    values (y, x), colours (y, x) uint8, good (y, x) bool: neighbours are the good pixels of the
+    same colour up to `radius` rows and columns away, without the pixel itself. With fewer than
+    `fewest` of them the range is endless.
+    """
+    rows, columns = values.shape
+    for y in range(begin, end):
+        sorted_ = np.empty((2 * radius + 1) ** 2, values.dtype)
+        for x in range(columns):
+            count = 0
+            for j in range(max(0, y - radius), min(rows, y + radius + 1)):
+                for i in range(max(0, x - radius), min(columns, x + radius + 1)):
+                    if (j == y and i == x) or not good[j, i] or colours[j, i] != colours[y, x]:
+                        continue
+                    value, place = values[j, i], count
+                    while place > 0 and sorted_[place - 1] > value:
+                        sorted_[place] = sorted_[place - 1]
+                        place -= 1
+                    sorted_[place] = value
+                    count += 1
+            if count < fewest:
+                low[y, x], high[y, x] = -np.inf, np.inf
+            else:
+                step = int(tail * (count - 1) + 0.5)
+                low[y, x], high[y, x] = sorted_[step], sorted_[count - 1 - step]
 
 
 def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:

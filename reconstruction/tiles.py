@@ -488,15 +488,6 @@ def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
     return JudgedBlock(verdict, row, column, samples // binning**2)
 
 
-def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
-    """Raise ReconstructionError for frames of another shape than Psi's (shot, row, column)."""
-    if frames.shape != shape:
-        raise ReconstructionError(
-            f"frames of shape {frames.shape} given, Psi needs {shape} "
-            "(shot, row, column): use the Psi measured with these shots"
-        )
-
-
 def reconstruct_in_blocks(
     name: str,
     psi: PsiSource,

@@ -25,7 +25,7 @@ from reconstruction.choices import (
     first_light_field,
     smooth_guess,
 )
-from reconstruction.differences import fitting_indices, norm_squared
+from reconstruction.differences import fitting_indices, norm_squared, planar_variation
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_light_fields, checked_inputs
 from reconstruction.patch_term import PatchTerm
@@ -71,6 +71,13 @@ def difference_matrix(shape, order):
             parts[axis] = inside
         blocks.append(reduce(sparse.kron, parts))
     return sparse.vstack(blocks).tocsr()
+
+
+def variation(light_field, order, metric=None):
+    """DV_K of a light field (v, u, y, x, c), its colours first multiplied by a metric."""
+    planar = np.ascontiguousarray(np.swapaxes(light_field, -1, -2))
+    metric = np.eye(3) if metric is None else metric
+    return planar_variation(planar, order, metric.astype(planar.dtype))
 
 
 def gradient(light_field, order):
@@ -168,7 +175,8 @@ def reconstruct_full_splitting(
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, order, metric, patch_term, rho)
     spread = float(np.linalg.norm(metric, 2)) ** 2
-    smooth = (psi.norm**2 + (rho * patch_term.norm if patch_term is not None else 0.0)) / 2
+    heaviest = 0.0 if patch_term is None else float(patch_term.weight.max())
+    smooth = (psi.norm**2 + rho * heaviest) / 2
     differences = spread * norm_squared(order, psi.light_field_shape)
     guess = smooth_guess(psi, data, usable)
     wanted = choose_primal_step(contrast(guess), max(mu, 1e-12), settings.chroma_weight, order)

@@ -15,13 +15,14 @@ from reconstruction.adaptive import assembly, method
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.models import MODELS
+from reconstruction.adaptive.method import MODELS, reconstruct_adaptive
 from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
+from reconstruction.adaptive.readings import checked
 from reconstruction.adaptive.refine import slopes
 from reconstruction.adaptive.search import Volume, per_pixel, variance_per_pixel
 from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import surveyed
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.uncertainty import held_out
@@ -357,6 +358,17 @@ def test_the_disparity_of_every_pixel_is_sharpened_towards_the_planted_one(bayer
     before, after = (one[6:-6, 26:-6] - 0.7 for one in (begun, found.centre))
     assert abs(np.median(after)) < 0.02
     assert np.abs(after).mean() < 0.5 * np.abs(before).mean()
+
+
+def test_a_scene_of_little_contrast_is_fitted_as_if_it_had_more(bayer, planted):
+    _, frames, sigma, _ = planted
+    scales = []
+    for share in (0.1, 0.2, 3.0):
+        given = checked(bayer, (share * frames).astype(np.float32), share * sigma, None)
+        scales.append(surveyed(given, quick(), None, lambda _: None).scale)
+    assert scales[0] < 0.5
+    assert scales[1] == pytest.approx(2 * scales[0], rel=1e-3)
+    assert scales[2] == 1
 
 
 def test_every_reading_counts_by_its_own_noise(bayer):

@@ -6,7 +6,7 @@ from math import comb, factorial
 import numba
 import numpy as np
 import pytest
-from full_splitting import AXIS, adjoint, gradient
+from full_splitting import AXIS, adjoint, gradient, variation
 
 from reconstruction import kernels
 from reconstruction.differences import (
@@ -14,7 +14,6 @@ from reconstruction.differences import (
     multi_indices,
     norm_squared,
     stencils,
-    variation,
 )
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import colour_metric

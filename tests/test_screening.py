@@ -11,8 +11,7 @@ from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture
 from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
-from reconstruction.neighbour_kernels import neighbour_range
-from reconstruction.screening import bad_pixels, screened
+from reconstruction.screening import bad_pixels, neighbour_range, screened
 
 SIZE = (48, 64)
 CAMERA = find_camera("rgbw-bayer-3shots")

@@ -217,7 +217,7 @@ def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
     assert together.level == "trust"
     one, two = verdict.evidence, together.evidence
     assert two.kept == 2 * one.kept
-    assert two.missed == pytest.approx(one.missed)
+    assert two.explained == pytest.approx(one.explained)
     assert two.strengths == pytest.approx(one.strengths)
     assert two.strength_errors == pytest.approx(np.array(one.strength_errors) / 2**0.5)
     json.dumps(together.as_dict(), allow_nan=False)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from full_splitting import from_patches, gradient
+from full_splitting import from_patches, gradient, variation
 
 from emmc_rig.model import kernels
-from reconstruction.differences import norm_squared, variation
+from reconstruction.differences import norm_squared
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 

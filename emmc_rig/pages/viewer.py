@@ -49,7 +49,7 @@ DEPTH = (
 )
 """Colours of disparity, far to near."""
 KINDS = ((120, 130, 145), (86, 160, 211), (86, 180, 100), (232, 160, 50), (204, 70, 90))
-"""Colours of the models of `reconstruction.adaptive.models`."""
+"""Colours of the models of `reconstruction.adaptive.method`."""
 MODEL_NAMES = ("flat", "plane", "slanted", "two layers", "free")
 
 

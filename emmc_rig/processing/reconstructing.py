@@ -34,9 +34,10 @@ from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
 from emmc_rig.session.session import Session
 from reconstruction.dictionary import Dictionary
+from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
-from reconstruction.tiles import check_frames, reconstruct_in_blocks
+from reconstruction.tiles import reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]

@@ -1,16 +1,18 @@
-"""Psi of textured surfaces, laid out once for many products: where its rays meet the texture.
+"""Psi of textured surfaces, laid out for many products: where its rays meet the texture.
 
 Where the rays of a reading meet the texture close together, which small disparities make them do,
 their taps are summed to a box of the texture, 4 bytes a sample; else each ray that is not dark is
 kept, 16 bytes. Operations of a product: a sample of a box 1, a ray 32; of laying out: about 40 a
-ray.
+ray. Where all cells together are too many, they are laid out anew, a band of rows at a time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from math import floor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +24,24 @@ from emmc_rig.model.sensing import ImagingMatrix
 Array = NDArray[np.floating]
 TAPS = 4
 MOST_CELLS = 240_000_000
-"""Beyond which rays are followed instead: 4 bytes each."""
+"""That are held at a time: 4 bytes each."""
 RAY = 4
 """Cells of a ray: its first tap, as an integer, the fractions along y and x, and its weight."""
+
+
+class Cells(NamedTuple):
+    """boxes: (reading, 4), first row and column, height and width; height 0: rays. starts:
+    (reading + 1,), where each reading's cells begin. values: the cells; taps: the same as integers.
+    colour: Psi's map; binning: k; size: rows and columns of a texture; stored: colours of Psi."""
+
+    colour: Any
+    binning: Any
+    size: Any
+    stored: Any
+    boxes: Any
+    starts: Any
+    values: Any
+    taps: Any
 
 
 @njit(inline="always")
@@ -135,22 +152,10 @@ def _measure(weights, disparity, margin, binning, size, first_row, last_row, box
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _lay(
-    weights,
-    colour,
-    disparity,
-    margin,
-    binning,
-    size,
-    first_row,
-    last_row,
-    boxes,
-    starts,
-    cells,
-    taps_of,
-):
-    """Set the cells of readings: boxes of taps, or rays. taps_of: the same cells as integers."""
-    shots, views_v, views_u, _, stored, columns = weights.shape
+def _lay(weights, disparity, margin, laid, first_row, last_row):
+    """Set the cells of readings: boxes of taps, or rays."""
+    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
+    shots, views_v, views_u, _, _, columns = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
     taps = np.empty((binning, 2, views_v * views_u, columns), np.int32)
     fractions = np.empty((binning, 2, views_v * views_u, columns), np.float32)
@@ -197,21 +202,9 @@ def _lay(
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _read(
-    colour,
-    binning,
-    size,
-    stored,
-    first_row,
-    last_row,
-    boxes,
-    starts,
-    cells,
-    taps_of,
-    texture,
-    frames,
-):
+def _read(laid, first_row, last_row, texture, frames):
     """Set pixel rows of frames (shot, pixel_y, pixel_x) to what they see of a flat texture."""
+    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
     shots, pixels_y, pixels_x = frames.shape
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for pixel_y in range(first_row, last_row):
@@ -247,21 +240,9 @@ def _read(
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _return(
-    colour,
-    binning,
-    size,
-    stored,
-    first_row,
-    last_row,
-    boxes,
-    starts,
-    cells,
-    taps_of,
-    frames,
-    texture,
-):
+def _return(laid, first_row, last_row, frames, texture):
     """Add to a flat texture what `_read` would see of it, times pixel rows of frames."""
+    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
     shots, pixels_y, pixels_x = frames.shape
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     for pixel_y in range(first_row, last_row):
@@ -297,59 +278,32 @@ def _return(
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the readings of Psi see a texture (c, y, x) of `shape`.
+    """Where the readings of a band of pixel rows see a texture. reach_rows: see `reach_rows`."""
 
-    boxes: (reading, 4), first row and column, height and width; height 0: rays. starts:
-    (reading + 1,), where each reading's cells begin. reach_rows: see `reach_rows`.
-    """
-
-    psi: ImagingMatrix
-    shape: tuple[int, int, int]
-    boxes: NDArray[np.int32]
-    starts: NDArray[np.int64]
-    cells: NDArray[np.float32]
+    rows: range
+    cells: Cells
     reach_rows: float
 
-    def _rows(self, first: int, last: int) -> tuple[Any, ...]:
-        psi = self.psi
-        return (
-            psi.colour_map,
-            psi.binning,
-            self.shape[1:],
-            psi.weights.shape[4],
-            first,
-            last,
-            self.boxes,
-            self.starts,
-            self.cells,
-            self.cells.view(np.int32),
-        )
-
-    def read(self, texture: Array) -> Array:
-        """Return what the frames (shot, pixel_y, pixel_x) see of a texture (c, y, x)."""
-        frames = np.empty(self.psi.frames_shape, dtype=np.float32)
-        texture = np.ascontiguousarray(texture, dtype=np.float32).reshape(-1)
+    def read(self, texture: Array, frames: Array) -> None:
+        """Set the rows of frames (shot, pixel_y, pixel_x) to what they see of (c, y, x)."""
+        start, texture = self.rows.start, np.ascontiguousarray(texture, dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
-            _read(*[*self._rows(first, last), texture, frames])
+            _read(self.cells, start + first, start + last, texture.reshape(-1), frames)
 
-        in_bands(work, frames.shape[1])
-        return frames
+        in_bands(work, len(self.rows))
 
-    def returned(self, frames: Array) -> Array:
-        """Return the adjoint of `read`, (c, y, x)."""
-        frames = np.ascontiguousarray(frames, dtype=np.float32)
-        sums = np.zeros((2, int(np.prod(self.shape))), dtype=np.float32)
+    def add_adjoint(self, frames: Array, sums: Array) -> None:
+        """Add the adjoint of `read` of float32 frames to sums (2, flat texture), by two threads."""
+        start = self.rows.start
 
         def work(which: int, first: int, last: int) -> None:
-            _return(*[*self._rows(first, last), frames, sums[which]])
+            _return(self.cells, start + first, start + last, frames, sums[which])
 
-        summed_in_bands(work, frames.shape[1], self.reach_rows)
-        sums[0] += sums[1]
-        return sums[0].reshape(self.shape)
+        summed_in_bands(work, len(self.rows), self.reach_rows)
 
 
-def reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
+def _reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
     """Return how many rows of pixels away from its own a pixel's taps lie, at most.
 
     disparity: (v, u, y, x).
@@ -360,44 +314,35 @@ def reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
 
 
 def laid_out(
-    psi: ImagingMatrix,
-    disparity: Array,
-    margin: int,
-    shape: tuple[int, int, int],
-) -> Layout | None:
-    """Return where Psi sees textures (c, y, x) of a shape; None where that is too much.
+    psi: ImagingMatrix, disparity: Array, margin: int, shape: tuple[int, int, int]
+) -> Iterator[Layout]:
+    """Yield where bands of pixel rows see textures (c, y, x) of a shape, MOST_CELLS at a time.
 
     disparity: (v, u, y, x).
     """
-    readings = int(np.prod(psi.frames_shape))
+    readings, rows = int(np.prod(psi.frames_shape)), psi.frames_shape[1]
     counts = np.zeros(readings, dtype=np.int64)
     boxes = np.zeros((readings, 4), dtype=np.int32)
-    size = shape[1:]
+    size, stored = shape[1:], psi.weights.shape[4]
 
     def measure(_: int, first: int, last: int) -> None:
         _measure(psi.weights, disparity, margin, psi.binning, size, first, last, boxes, counts)
 
-    in_bands(measure, psi.frames_shape[1])
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    if starts[-1] > MOST_CELLS:
-        return None
-    cells = np.empty(starts[-1], dtype=np.float32)
-
-    def lay(_: int, first: int, last: int) -> None:
-        _lay(
-            psi.weights,
-            psi.colour_map,
-            disparity,
-            margin,
-            psi.binning,
-            size,
-            first,
-            last,
-            boxes,
-            starts,
-            cells,
-            cells.view(np.int32),
+    in_bands(measure, rows)
+    by_row = counts.reshape(psi.frames_shape)
+    before = np.cumsum(by_row.sum(axis=(0, 2))) - 1
+    cuts = np.flatnonzero(np.diff(before // max(MOST_CELLS, 1))) + 1
+    for begin, end in pairwise([0, *cuts.tolist(), rows]):
+        within = np.zeros_like(by_row)
+        within[:, begin:end] = by_row[:, begin:end]
+        starts = np.concatenate([[0], np.cumsum(within)])
+        values = np.empty(starts[-1], dtype=np.float32)
+        cells = Cells(
+            psi.colour_map, psi.binning, size, stored, boxes, starts, values, values.view(np.int32)
         )
 
-    in_bands(lay, psi.frames_shape[1])
-    return Layout(psi, shape, boxes, starts, cells, reach_rows(psi, disparity))
+        def lay(_: int, first: int, last: int, begin: int = begin, cells: Cells = cells) -> None:
+            _lay(psi.weights, disparity, margin, cells, begin + first, begin + last)
+
+        in_bands(lay, end - begin)
+        yield Layout(range(begin, end), cells, _reach_rows(psi, disparity))

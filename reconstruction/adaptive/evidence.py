@@ -25,7 +25,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence_kernels import LANES, TERMS, evidence
+from reconstruction.adaptive.evidence_kernels import LANES, TERMS, Hypotheses, evidence
 from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
@@ -181,32 +181,27 @@ def patch_evidence(
     probed = np.unique(np.linspace(0, len(disparities) - 1, PROBES + 2).round()[1:-1])
     out = np.empty((len(filled), evaluated), dtype=np.float32)
     chosen = np.zeros((len(filled), len(lengths)), dtype=np.int64)
-    noise, readings = np.asarray(variance, np.float32), np.asarray(data, np.float32)
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
-    index = offsets.reshape(len(places), len(places)).astype(np.int64)
+    given = Hypotheses(
+        psi.weights,
+        psi.colour_map,
+        usable,
+        np.asarray(data, np.float32),
+        np.asarray(variance, np.float32),
+        places,
+        psi.binning,
+        waves,
+        offsets.reshape(len(places), len(places)).astype(np.int64),
+        tables,
+        amplitudes,
+        chromas,
+        probed.astype(np.int64),
+        np.float32(prior.freedom),
+    )
 
     def evaluate(first: int) -> None:
         lanes = slice(first, first + LANES)
-        evidence(
-            psi.weights,
-            psi.colour_map,
-            usable,
-            noise,
-            readings,
-            filled[lanes],
-            places,
-            psi.binning,
-            waves,
-            index,
-            tables,
-            probed.astype(np.int64),
-            amplitudes,
-            chromas,
-            scales[lanes].astype(np.float32),
-            np.float32(prior.freedom),
-            out[lanes],
-            chosen[lanes],
-        )
+        evidence(given, filled[lanes], scales[lanes].astype(np.float32), out[lanes], chosen[lanes])
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
         list(pool.map(evaluate, range(0, len(filled), LANES)))

@@ -10,6 +10,7 @@ from vectors.
 from __future__ import annotations
 
 from math import log, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,17 +21,44 @@ TERMS = 4
 """Terms of a sum taken at a time: tables are padded with zeros to a multiple of it."""
 
 
+class Hypotheses(NamedTuple):
+    """The readings, and the textures that may explain them.
+
+    weights, colour: Psi's. usable, data, variance: (shot, pixel_y, pixel_x), data being the
+    readings less those of the mean. places: (reading, 3), shot, and row and column of the pixel
+    from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made.
+    offsets: (reading, reading), the index of how far two pixels lie apart. tables: (offset,
+    hypothesis, wave), the texture's correlation, padded with zeros to a multiple of TERMS
+    hypotheses. amplitudes, chromas: (kind,), variance of luminance, times a patch's scale, and of a
+    chrominance over that of luminance. probes: indices of the disparities at which every kind is
+    compared. freedom: of the Student t.
+    """
+
+    weights: Any
+    colour: Any
+    usable: Any
+    data: Any
+    variance: Any
+    places: Any
+    binning: Any
+    waves: Any
+    offsets: Any
+    tables: Any
+    amplitudes: Any
+    chromas: Any
+    probes: Any
+    freedom: Any
+
+
 @njit(cache=True, fastmath=True)
-def _gather(
-    weights, colour, usable, ridge, data, corners, places, binning, rays, known, seen, measured
-):
+def _gather(given, corners, rays, known, seen, measured):
     """Cut Psi, data, variances and colours into patches, one a lane; nothing where not usable.
 
-    places: (reading, 3), shot, and row and column of the pixel from the corner's. corners: (lane,
-    2) of pixels. rays: (part, reading, ray, lane), luminance and, where three colours are
-    stored, two chrominances. known: (2, reading, lane), data and
-    variance. seen: (reading, lane) colour. measured: (lane,), how many are usable.
+    corners: (lane, 2) of pixels. rays: (part, reading, ray, lane), luminance and, where three
+    colours are stored, two chrominances. known: (2, reading, lane), data and variance. seen:
+    (reading, lane) colour. measured: (lane,), how many are usable.
     """
+    weights, colour, usable, data, variance, places, binning = given[:7]
     _, views_v, views_u, _, stored, _ = weights.shape
     lanes = corners.shape[0]
     for i in range(places.shape[0]):
@@ -43,7 +71,7 @@ def _gather(
                 continue
             measured[lane] += 1
             known[0, i, lane] = data[s, y, x]
-            known[1, i, lane] = ridge[s, y, x]
+            known[1, i, lane] = variance[s, y, x]
             if stored == 1:
                 seen[i, lane] = colour[s, y * binning, x * binning]
             a = 0
@@ -235,37 +263,15 @@ def _fill(sums, known, seen, strength, chroma, tiles, data):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def evidence(
-    weights,
-    colour,
-    usable,
-    ridge,
-    data,
-    corners,
-    places,
-    binning,
-    waves,
-    offsets,
-    tables,
-    probes,
-    amplitudes,
-    chromas,
-    scales,
-    freedom,
-    out,
-    chosen,
-):
+def evidence(given, corners, scales, out, chosen):
     """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane, length).
 
-    A hypothesis is a length of the texture, and a disparity: all disparities of the first, ...
-    data, ridge: (shot, pixel_y, pixel_x), readings less those of the mean, their variances.
-    corners: (batch, lane, 2) pixels. places: see `_gather`. waves: (wave, ray), of which
-    the rays' spectra are made. offsets: (reading, reading), the index of how far two pixels lie
-    apart. tables: (offset, hypothesis, wave), the texture's correlation, padded with zeros to a
-    multiple of TERMS hypotheses. amplitudes, chromas: (kind,), variance of luminance,
-    times scales (lane,), and of a chrominance over that of luminance. probes: indices of
-    the disparities at which every kind is compared; out is that of the best of them, `chosen`.
+    given: `Hypotheses`. A hypothesis is a length of the texture, and a disparity: all disparities
+    of the first, ... corners: (lane, 2) pixels. scales: (lane,), of the amplitudes. out is that of
+    the best kind of texture, `chosen`.
     """
+    weights, _, _, _, _, places, _, waves, offsets, tables, amplitudes, chromas = given[:12]
+    probes, freedom = given[12:]
     stored = weights.shape[4]
     readings = places.shape[0]
     m = -(-readings // TERMS) * TERMS
@@ -278,20 +284,7 @@ def evidence(
     known[1] = 1
     seen = np.zeros((m, lanes), np.uint8)
     measured = np.zeros(lanes, np.float32)
-    _gather(
-        weights,
-        colour,
-        usable,
-        ridge,
-        data,
-        corners,
-        places,
-        binning,
-        rays,
-        known,
-        seen,
-        measured,
-    )
+    _gather(given, corners, rays, known, seen, measured)
     spectra = np.empty((parts, readings, spectrum * lanes), np.float32)
     for part in range(parts):
         for i in range(readings):

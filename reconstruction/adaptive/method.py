@@ -28,8 +28,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Fits, Mean, Patches, averaged, fitted_models
-from reconstruction.adaptive.given import checked, checked_disparity
-from reconstruction.adaptive.models import MODELS, model_map, texture_map
+from reconstruction.adaptive.joint import Scene
+from reconstruction.adaptive.readings import checked, checked_disparity
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey, surveyed
 from reconstruction.result import Progress, Reconstruction, Status
@@ -42,6 +42,12 @@ middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of 
 MISFIT_WINDOW_PX = 8.0
 """Deviation of the window in which the place of the largest residual is looked for. 2x 0.00, 0.5x
 0.00 dB."""
+MODELS = ("flat", "plane", "slanted", "two layers", "free")
+"""Even colour; texture at one disparity; at a changing one; partly hidden; no surface."""
+SLANTED_PX = 0.01
+"""Change of the disparity per pixel beyond which a surface counts as slanted."""
+NEAR_PX = 2
+"""Samples around a hidden ray that see two layers."""
 MOSTLY = 0.5
 """Share of a place's mean from which on its model counts as that of the place."""
 
@@ -118,8 +124,8 @@ def reconstruct_adaptive(
 def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) -> dict[str, NDArray]:
     """Return the maps of a result, see `Reconstruction.maps`."""
     size, k = survey.given.psi.size, survey.given.psi.binning
-    kinds = texture_map(survey.volume, size, k)
-    models = model_map(kinds, fits.scene)
+    kinds = _texture_map(survey.volume, size, k)
+    models = _model_map(kinds, fits.scene)
     free = mean.shares[-1] > MOSTLY
     models[free.repeat(k, axis=0).repeat(k, axis=1)] = MODELS.index("free")
     maps = {
@@ -132,6 +138,30 @@ def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) ->
     if mean.sure is None:
         return maps
     return {**maps, "sigma": mean.sure.sigma}
+
+
+def _texture_map(volume: search.Volume, size: tuple[int, int], binning: int) -> NDArray[np.uint8]:
+    """Return the kind of texture, as TexturePrior counts them, of the patch next to each sample."""
+    nearest = [
+        np.abs(((np.arange(length) + 0.5) / binning - 0.5)[:, None] - at[None]).argmin(axis=1)
+        for at, length in zip(volume.centres, size, strict=True)
+    ]
+    return volume.kind[np.ix_(*nearest)].astype(np.uint8)
+
+
+def _model_map(texture: NDArray[np.uint8], scene: Scene) -> NDArray[np.uint8]:
+    """Return the index in MODELS of every sample of the centre view, (y, x), of surfaces.
+
+    texture: see `_texture_map`.
+    """
+    textured = texture > 0
+    down, right = np.gradient(scene.centre)
+    slope = cv2.GaussianBlur(np.hypot(down, right).astype(np.float32), (0, 0), 3.0)
+    around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
+    layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0
+    chosen = np.where(textured, np.where(slope > SLANTED_PX, 2, 1), 0)
+    chosen[layered] = 3
+    return chosen.astype(np.uint8)
 
 
 def misfit(residual: Array, noise: Array, fitted: NDArray[np.bool_]) -> dict[str, float]:

@@ -3,78 +3,23 @@
 A ray is a sample (y, x) of a view (v, u); at disparity d it sees the texture at
 (y - d (v - V // 2), x - d (u - U // 2)), the place of that point in the centre view, by cubic
 interpolation (Catmull-Rom). Textures reach beyond the centre view by a margin on all sides, since
-other views see there. Where memory allows, the rays are laid out once (`assembly`); else each is
-followed anew: 2 x 16 operations for every weight that is not 0.
+other views see there. The rays are laid out (`assembly`), once where memory allows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property
-from typing import Any
+from collections.abc import Callable, Iterable
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands, summed_in_bands
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out, reach_rows
+from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out
 
 Array = NDArray[np.floating]
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _follow(
-    weights,
-    colour,
-    disparity,
-    margin,
-    binning,
-    first,
-    last,
-    back,
-    texture,
-    frames,
-):
-    """Project a texture to the pixel rows first to last - 1 of frames, or, back, frames to it.
-
-    texture: (c, y, x), padded. frames: (shot, pixel_y, pixel_x). What is projected to is added to.
-    """
-    shots, views_v, views_u, _, stored, columns = weights.shape
-    last_y, last_x = texture.shape[1] - TAPS, texture.shape[2] - TAPS
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    for y in range(first * binning, last * binning):
-        for v in range(views_v):
-            for u in range(views_u):
-                for x in range(columns):
-                    placed = False
-                    iy, ix = 0, 0
-                    for s in range(shots):
-                        total = np.float32(0)
-                        for k in range(stored):
-                            w = weights[s, v, u, y, k, x]
-                            if w == 0:
-                                continue
-                            if not placed:
-                                d = disparity[v, u, y, x]
-                                iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
-                                ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
-                                cubic(fy, wy)
-                                cubic(fx, wx)
-                                placed = True
-                            c = colour[s, y, x] if stored == 1 else k
-                            if back:
-                                w *= frames[s, y // binning, x // binning]
-                            for i in range(TAPS):
-                                share = w * wy[i]
-                                for j in range(TAPS):
-                                    if back:
-                                        texture[c, iy + i, ix + j] += share * wx[j]
-                                    else:
-                                        total += share * wx[j] * texture[c, iy + i, ix + j]
-                        if not back:
-                            frames[s, y // binning, x // binning] += total
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -160,46 +105,37 @@ class Surfaces:
         rows, columns = psi.size
         self.texture_shape = (colours, rows + 2 * margin, columns + 2 * margin)
 
-    @cached_property
-    def _layout(self) -> Layout | None:
-        return laid_out(self.psi, self.disparity, self.margin, self.texture_shape)
+        self._whole: Layout | None = None
 
     def release(self) -> None:
         """Give back the memory of the rays' layout; a later product lays them out again."""
-        self.__dict__.pop("_layout", None)
+        self._whole = None
 
-    def _rays(self, first: int, last: int) -> tuple[Any, ...]:
-        psi = self.psi
-        seen = psi.weights, psi.colour_map, self.disparity
-        return (*seen, self.margin, psi.binning, first, last)
-
-    def _project(self, texture: Array) -> Array:
-        frames = np.zeros(self.psi.frames_shape, dtype=np.float32)
-
-        def work(_: int, first: int, last: int) -> None:
-            _follow(*[*self._rays(first, last), False, texture, frames])
-
-        in_bands(work, frames.shape[1])
-        return frames
-
-    def _back(self, frames: Array) -> Array:
-        frames = np.ascontiguousarray(frames, dtype=np.float32)
-        sums = np.zeros((2, *self.texture_shape), dtype=np.float32)
-
-        def work(which: int, first: int, last: int) -> None:
-            _follow(*[*self._rays(first, last), True, sums[which], frames])
-
-        summed_in_bands(work, frames.shape[1], reach_rows(self.psi, self.disparity))
-        sums[0] += sums[1]
-        return sums[0]
+    def _bands(self) -> Iterable[Layout]:
+        """Return the layouts of bands of rows; one of all rows is kept."""
+        if self._whole is None:
+            bands = laid_out(self.psi, self.disparity, self.margin, self.texture_shape)
+            first = next(bands)
+            if len(first.rows) < self.psi.frames_shape[1]:
+                return chain([first], bands)
+            self._whole = first
+        return [self._whole]
 
     def forward(self, texture: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of a texture (c, y, x)."""
-        return self._project(texture) if self._layout is None else self._layout.read(texture)
+        frames = np.empty(self.psi.frames_shape, dtype=np.float32)
+        for band in self._bands():
+            band.read(texture, frames)
+        return frames
 
     def adjoint(self, frames: Array) -> Array:
         """Return the adjoint of `forward`, (c, y, x)."""
-        return self._back(frames) if self._layout is None else self._layout.returned(frames)
+        frames = np.ascontiguousarray(frames, dtype=np.float32)
+        sums = np.zeros((2, int(np.prod(self.texture_shape))), dtype=np.float32)
+        for band in self._bands():
+            band.add_adjoint(frames, sums)
+        sums[0] += sums[1]
+        return sums[0].reshape(self.texture_shape)
 
     def derivative(self, slopes: Array) -> tuple[Callable, Callable]:
         """Return how frames change with the centre view's disparity, and the adjoint of that.

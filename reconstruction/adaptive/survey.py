@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.lightfield import centre_view
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.given import Given
+from reconstruction.adaptive.readings import Readings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
@@ -42,9 +42,9 @@ class Survey:
     the scale, to begin with.
     """
 
-    given: Given
+    given: Readings
     scale: float
-    bright: Given
+    bright: Readings
     held: NDArray[np.bool_]
     unexplained: Array
     volume: search.Volume
@@ -55,7 +55,7 @@ class Survey:
 
 
 def surveyed(
-    given: Given,
+    given: Readings,
     settings: AdaptiveSettings,
     disparity: Array | None,
     on_searched: Callable[[int], None],

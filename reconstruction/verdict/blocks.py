@@ -49,8 +49,6 @@ def _largest(values: Sequence[float], weights: Sequence[float]) -> float:
 COMBINED: dict[str, Combine] = {
     "strength_errors": _error_of_mean,
     "colour_error": _root_mean_square,
-    "missed": _root_mean_square,
-    "plain": _root_mean_square,
     "misfit": _root_mean_square,
     "hole_px": _largest,
 }
@@ -74,15 +72,9 @@ def _combined(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
 
 
 def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
-    """Return figures of the worst block of each kind: masks, hole, motion, misfit."""
+    """Return figures of the worst block of each kind: hole and motion."""
     found: dict[str, Any] = {}
     e = [(block, block.verdict.evidence) for block in blocks]
-    weak = [
-        (one.lowest_strength, block, one) for block, one in e if one.lowest_strength is not None
-    ]
-    if weak:
-        strength, block, one = min(weak, key=lambda each: each[0])
-        found |= {"lowest_strength": strength, "lowest_at": _at(block, one.lowest_at)}
     block, one = max(e, key=lambda each: each[1].hole_px)
     found["hole_at"] = _at(block, one.hole_at)
     moved = [(one.motion_effect, block, one) for block, one in e if one.motion_effect is not None]
@@ -109,7 +101,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     figures = {
         key: _combined(key, [getattr(one, key) for one in evidence], weights)
         for key in Evidence.__dataclass_fields__
-        if key not in (*same, "left_out", "kept", "lowest_at", "hole_at", "moved_at")
+        if key not in (*same, "left_out", "kept", "hole_at", "moved_at")
     }
     kept = sum(one.kept for one in evidence)
     parameters = {**(figures["parameters"] or {})}
@@ -118,7 +110,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
         told = worst.verdict.evidence.parameters
         row, column = _at(worst, (told["misfit_row"], told["misfit_column"]))
         parameters |= {"misfit_row": float(row), "misfit_column": float(column)}
-    whole = {"lowest_at": (0, 0), "hole_at": (0, 0), "moved_at": None, **_places(blocks)}
+    whole = {"hole_at": (0, 0), "moved_at": None, **_places(blocks)}
     figures |= {"parameters": parameters, "changes": figures["changes"] or {}}
     return Evidence(**{**same, "left_out": left_out, "kept": kept, **figures, **whole})
 

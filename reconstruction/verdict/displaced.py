@@ -47,18 +47,14 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """shifts: (tile, 2), by which the shadow lies off Psi's (y, x), in pixels.
+    """By how much the masks' shadow lies off Psi's, in pixels.
 
-    errors: (tile, 2), their deviations. centres: (tile, 2), (y, x) in pixels. shift: their
-    weighted mean. size_px: their root mean square beyond what the deviations make, and beyond what
-    derivatives elsewhere make of the same readings (a placebo: what a wrong picture adds to both).
-    changes: of `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost
-    rays lose.
+    shift: (y, x), the weighted mean over tiles. size_px: their root mean square beyond what the
+    deviations make, and beyond what derivatives elsewhere make of the same readings (a placebo:
+    what a wrong picture adds to both). changes: of `distance`, relative; `blur`, variance in px^2;
+    `vignetting`, what the outermost rays lose.
     """
 
-    shifts: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    centres: NDArray[np.float64]
     shift: tuple[float, float]
     size_px: float
     changes: dict[str, Change]
@@ -141,9 +137,6 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
         for name, one in changes.items()
     }
     return Displaced(
-        tiled.shifts,
-        tiled.errors,
-        tiled.centres,
         tiled.mean,
         float(np.sqrt(max(beyond, 0))),
         {
@@ -156,12 +149,11 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
 
 @dataclass(frozen=True, eq=False)
 class _Tiled:
-    """shifts, errors, centres: see `Displaced`. beyond: mean square of the shifts, y and x added,
-    less what the deviations make."""
+    """shifts, errors: (tile, 2), by which the shadow lies off (y, x), and deviations. beyond: mean
+    square of the shifts, y and x added, less what the deviations make."""
 
     shifts: NDArray[np.float64]
     errors: NDArray[np.float64]
-    centres: NDArray[np.float64]
 
     @property
     def mean(self) -> tuple[float, float]:
@@ -176,18 +168,19 @@ class _Tiled:
 
 def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Tiled | None:
     """Return the shifts that each tile's readings ask for, None where no tile determines any."""
-    fits = {}
-    for y, x in tiles(found.good.shape[1:]):
-        base = [one[:, y, x] for one in (found.masks, shift_y, shift_x)]
-        fit = _regressed(base, found.seen[:, y, x], found.weight[:, y, x])
-        if fit is not None:
-            fits[(y.start + y.stop) / 2, (x.start + x.stop) / 2] = fit
-    if not fits:
+    fits = [
+        _regressed(
+            [one[:, y, x] for one in (found.masks, shift_y, shift_x)],
+            found.seen[:, y, x],
+            found.weight[:, y, x],
+        )
+        for y, x in tiles(found.good.shape[1:])
+    ]
+    known = [fit for fit in fits if fit is not None]
+    if not known:
         return None
     return _Tiled(
-        np.array([fit.values[1:] for fit in fits.values()]),
-        np.array([fit.deviations[1:] for fit in fits.values()]),
-        np.array(list(fits)),
+        np.array([fit.values[1:] for fit in known]), np.array([fit.deviations[1:] for fit in known])
     )
 
 

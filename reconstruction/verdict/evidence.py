@@ -14,8 +14,8 @@ from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.displaced import displaced
-from reconstruction.verdict.kept import foretold
-from reconstruction.verdict.pixels import judged_pixels
+from reconstruction.verdict.kept import compare_held_out
+from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.shadow import Relief, relief, shadow
 from reconstruction.verdict.shots import compared
 
@@ -32,7 +32,11 @@ class Evidence:
     method: its name; status: its status. left_out: shots that screening left out. bad: share of
     the pixels that screening left out. noise: the readings' deviation over their mean.
     motion_left: what the light field leaves unexplained where the picture moves most, over the mean
-    reading.
+    reading. off: share of readings that are far off all around, where neighbours agree; unusable,
+    saturated: shares of the readings. blind: share of the pixels that lie far from any that a shot
+    sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept: readings kept from
+    the fit; explained: share of the smooth picture's squared residual of these, less noise, that
+    the light field removes; noise_share: share of its own that is noise.
     colour_error: root mean square by colours that frames do not show, over the brightness. short:
     share of the readings that only say that there was at least so much light, and are needed.
     """
@@ -44,11 +48,8 @@ class Evidence:
     relief: float
     strengths: tuple[float | None, ...]
     strength_errors: tuple[float | None, ...]
-    lowest_strength: float | None
-    lowest_at: tuple[int, int]
     other_strengths: tuple[tuple[float | None, ...], ...]
     displaced_px: float | None
-    shift_px: tuple[float, float] | None
     changes: dict[str, tuple[float | None, ...]]
     brightness: tuple[float | None, ...]
     motion_px: float | None
@@ -62,11 +63,8 @@ class Evidence:
     hole_px: float
     hole_at: tuple[int, int]
     kept: int
-    missed: float | None
-    plain: float | None
     explained: float | None
     noise_share: float | None
-    beyond: float | None
     parameters: dict[str, float]
     colour_error: float | None = None
     motion_left: float | None = None
@@ -78,8 +76,9 @@ class Evidence:
 
     @classmethod
     def from_dict(cls, figures: Mapping[str, Any]) -> Evidence:
-        """Return evidence from what `as_dict` gave, also after a way through JSON."""
-        return cls(**{key: _tupled(value) for key, value in figures.items()})
+        """Return evidence from what `as_dict` gave, also through JSON, or by an earlier version."""
+        known = cls.__dataclass_fields__
+        return cls(**{key: _tupled(value) for key, value in figures.items() if key in known})
 
 
 REPORTED_PARAMETERS = (
@@ -123,9 +122,7 @@ def gathered(
     off = displaced(psi, found)
     shots = compared(psi, found)
     moved = shots.motion
-    pixels = judged_pixels(psi, read.excluded, found, noise_sigma, usable)
     residual = frames - psi.forward(result.light_field)
-    fits = foretold(frames, residual, noise_sigma, read.kept & usable, found)
     left = None if moved is None else moved.unexplained(residual, noise_sigma**2, usable)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     return Evidence(
@@ -136,30 +133,17 @@ def gathered(
         relief=masks.relief,
         strengths=_plain(masks.strength),
         strength_errors=_plain(masks.error),
-        lowest_strength=_plain([masks.lowest])[0],
-        lowest_at=masks.where,
         other_strengths=tuple(_plain(row) for row in shots.masks),
         displaced_px=None if off is None else off.size_px,
-        shift_px=None if off is None else off.shift,
         changes={} if off is None else {k: _plain(astuple(one)) for k, one in off.changes.items()},
         brightness=_plain(shots.brightness),
         motion_px=None if moved is None else moved.size_px,
         motion_effect=None if moved is None else moved.effect,
         motion_left=None if left is None else left / mean,
         moved_at=None if moved is None else (moved.shot, *moved.place),
-        off=pixels.off,
         bad=read.bad,
-        unusable=pixels.unusable,
-        saturated=pixels.saturated,
-        blind=pixels.blind,
-        hole_px=pixels.hole_px,
-        hole_at=pixels.hole,
-        kept=0 if fits is None else fits.readings,
-        missed=None if fits is None else fits.missed,
-        plain=None if fits is None else fits.plain,
-        explained=None if fits is None else fits.explained,
-        noise_share=None if fits is None else fits.noise,
-        beyond=None if fits is None else fits.beyond,
+        **pixel_figures(psi, read.excluded, found, noise_sigma, usable),
+        **compare_held_out(frames, residual, noise_sigma, read.kept & usable, found),
         colour_error=_colour_error(psi, frames, usable, found),
         parameters={
             key: result.parameters[key] for key in REPORTED_PARAMETERS if key in result.parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 BLIND_PX = 1.9
+"""Distance from any pixel that a shot sees, from which on one is blind."""
 SMOOTH = 0.5
 """Largest spread of the neighbours with which a pixel is compared, over their typical value."""
 DIMMEST = 0.2
@@ -23,30 +24,14 @@ SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
 """Times the neighbours' spread, their typical value, and the noise, that a pixel is off by."""
 
 
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """off: share that are far off all around, of readings whose neighbours agree.
-
-    unusable, saturated: shares of the readings. blind: share of the pixels that lie BLIND_PX or
-    further from any that a shot sees. hole_px: radius of the largest hole; hole: its centre (y, x).
-    """
-
-    off: float
-    unusable: float
-    saturated: float
-    blind: float
-    hole_px: float
-    hole: tuple[int, int]
-
-
-def judged_pixels(
+def pixel_figures(
     psi: ImagingMatrix,
     excluded: Array,
     found: Relief,
     noise_sigma: float,
     usable: NDArray[np.bool_],
-) -> Pixels:
-    """Return what is wrong with single pixels. excluded: what unusable pixels read."""
+) -> dict[str, Any]:
+    """Return figures of `Evidence` on single pixels. excluded: what unusable pixels read."""
     step = 1 if psi.colour is None else 2
     off, compared = 0, 0
     for shot in range(psi.shots):
@@ -67,14 +52,14 @@ def judged_pixels(
     unseen = np.asarray(~seen, dtype=np.uint8)
     radius = cv2.distanceTransform(unseen, cv2.DIST_L2, 3)
     hole = np.unravel_index(int(radius.argmax()), radius.shape)
-    return Pixels(
-        off / max(compared, 1),
-        float(1 - usable.mean()),
-        _saturated(excluded, found, usable),
-        float((radius >= BLIND_PX).mean()),
-        float(radius.max()),
-        (int(hole[0]), int(hole[1])),
-    )
+    return {
+        "off": off / max(compared, 1),
+        "unusable": float(1 - usable.mean()),
+        "saturated": _saturated(excluded, found, usable),
+        "blind": float((radius >= BLIND_PX).mean()),
+        "hole_px": float(radius.max()),
+        "hole_at": (int(hole[0]), int(hole[1])),
+    }
 
 
 def _saturated(excluded: Array, found: Relief, usable: NDArray[np.bool_]) -> float:

@@ -142,15 +142,12 @@ def tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:
 class Shadow:
     """How strongly the masks are seen: 1 where Psi is right.
 
-    strength, error: of every shot, and its standard deviation. lowest: in the weakest of the
-    picture's tiles, by two of its deviations above; where: its centre (y, x) in pixels.
-    relief: root mean square of what the masks add.
+    strength, error: of every shot, and its standard deviation. relief: root mean square of what
+    the masks add.
     """
 
     strength: NDArray[np.float64]
     error: NDArray[np.float64]
-    lowest: float
-    where: tuple[int, int]
     relief: float
 
 
@@ -160,18 +157,10 @@ def shadow(found: Relief) -> Shadow:
         *(_slope(found.masks[s], found.seen[s], found.weight[s]) for s in range(len(found.masks))),
         strict=True,
     )
-    lowest, where = np.inf, (0, 0)
-    for y, x in tiles(found.masks.shape[1:]):
-        slope, deviation = _slope(found.masks[:, y, x], found.seen[:, y, x], found.weight[:, y, x])
-        if slope + 2 * deviation < lowest:
-            lowest = slope + 2 * deviation
-            where = ((y.start + y.stop) // 2, (x.start + x.stop) // 2)
     added = found.masks[found.good]
     return Shadow(
         np.array(strength),
         np.array(error),
-        float(lowest),
-        where,
         float(np.sqrt(np.mean(np.square(added)))) if added.size else 0.0,
     )
 

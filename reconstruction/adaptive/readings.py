@@ -1,4 +1,4 @@
-"""What the adaptive method works on: Psi and frames, checked, at the scale of its settings."""
+"""The readings that the adaptive method fits: checked, and at the scale of its settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PASSED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class Readings:
     """Psi, the frames, their typical deviation, the variance `noise` of each reading, and which are
     usable, all but Psi (shot, pixel_y, pixel_x)."""
 
@@ -27,7 +27,7 @@ class Given:
     noise: Array
     usable: NDArray[np.bool_]
 
-    def over(self, scale: float, of_psi: bool = False) -> Given:
+    def over(self, scale: float, of_psi: bool = False) -> Readings:
         """Return the same with readings divided by a scale: of a scene, or of Psi, so much dimmer.
 
         Psi, frames and noise so many times larger are the same problem.
@@ -37,7 +37,7 @@ class Given:
         part = self.frames.dtype.type(scale)
         psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
         noise = (self.noise / scale**2).astype(np.float32)
-        return Given(psi, self.frames / part, self.typical / scale, noise, self.usable)
+        return Readings(psi, self.frames / part, self.typical / scale, noise, self.usable)
 
     def variance(self, misfit: float) -> Array:
         """Return the variance of the readings, with that of what no model explains."""
@@ -53,7 +53,7 @@ def checked(
     frames: Array,
     noise_sigma: float | Array,
     usable: NDArray[np.bool_] | None,
-) -> Given:
+) -> Readings:
     """Return the inputs of a method, as if the masks passed half the light.
 
     Raises ReconstructionError for inputs that do not fit each other.
@@ -61,7 +61,7 @@ def checked(
     typical, noise = checked_noise(psi, noise_sigma, usable)
     frames, usable = checked_inputs(psi, frames, typical, usable)
     passed = max(psi.light_efficiency(), 1e-12)
-    return Given(psi, frames, typical, noise, usable).over(passed / PASSED, of_psi=True)
+    return Readings(psi, frames, typical, noise, usable).over(passed / PASSED, of_psi=True)
 
 
 def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
