@@ -85,7 +85,7 @@ COVERED, COVERED_TWICE, MARGIN = 0.683, 0.954, 0.03
 STATED_TRUE = 1.25
 """Times the stated error: what Psi may be off by."""
 TRUE_ERROR, LARGEST_COST_DB, LARGEST_GIB, LEAST_RECOVERED = 0.01, 0.05, 4.0, 0.85
-COMPARED_ROWS, FRAME_S, SEED = 32, 0.5, 0
+COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
@@ -326,7 +326,7 @@ def check_drift(size: Size, seed: int) -> Iterator[Row]:
             )
             yield Row(f"{name}, {Path(spec).name}: lost, dB", oracle - mismatched)
             lost, gained = lost + oracle - mismatched, gained + blind - mismatched
-        if lost > 0.05:
+        if lost > LEAST_LOST_DB:
             yield Row(f"{name}: share recovered", gained / lost, at_least=LEAST_RECOVERED)
 
 
