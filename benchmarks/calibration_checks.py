@@ -61,8 +61,9 @@ from emmc_rig.processing.simulated import (
 )
 from emmc_rig.progress import Silent
 from emmc_rig.session.frame_file import frame_file
+from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import decoded, session_readings, shot_frames
+from emmc_rig.session.readings import session_readings, shot_frames
 from emmc_rig.session.session import Frozen, Session
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.tv import TVSettings, reconstruct_tv

@@ -34,14 +34,9 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.processing.simulated import place_rig, simulated_session
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.session.readings import (
-    Scale,
-    decoded,
-    scaled_readings,
-    session_darks,
-    shot_frames,
-    whiteboards,
-)
+from emmc_rig.session.frame_means import decoded, session_darks, whiteboards
+from emmc_rig.session.measured_psi import Scale
+from emmc_rig.session.readings import scaled_readings, shot_frames
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction

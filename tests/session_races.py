@@ -22,7 +22,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.pages import session_sheet
 from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import export, prune
-from emmc_rig.session.readings import whiteboards
+from emmc_rig.session.frame_means import whiteboards
 
 LOADED_BEFORE = (session_sheet, export, prune)
 FAILED = 99

@@ -17,7 +17,7 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
+from emmc_rig.files.results import shown_bytes, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import AS_READ, Balance, preview, thinned, white_balance
 from emmc_rig.pages.page import (
@@ -39,10 +39,9 @@ from emmc_rig.pages.timeline import (
     session_metrics,
     timeline_svg,
 )
-from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import camera_of_first_run, decisions, ended, entry_text, kinds_of
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
@@ -134,7 +133,7 @@ def _head(session: Session) -> Head:
 
 
 def _about(session: Session) -> str:
-    camera = next((e["camera"] for e in session.journal.entries if e["kind"] == "run"), None)
+    camera = camera_of_first_run(session.journal.entries)
     by = (
         ""
         if camera is None
@@ -146,7 +145,7 @@ def _about(session: Session) -> str:
 def _cards(session: Session) -> list[Card]:
     stored, planned = len(session.stored), len(session.needed)
     size = sum(entry["bytes"] for entry in session.stored.values())
-    retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
+    retries = len(kinds_of(session.journal.entries, "retry"))
     state = Card("State", "not complete", "resume it", "watch")
     if session.is_complete:
         state = Card("State", "complete", "every frame verified", "good")
@@ -282,39 +281,10 @@ def _timeline(session: Session) -> str:
 def events(session: Session) -> Iterator[tuple[str, str]]:
     """Yield kind and text of what happened, besides frames that were taken."""
     for entry in session.journal.entries:
-        text = _event_text(entry)
+        text = entry_text(entry)
         if text:
             yield entry["kind"], text
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
 
 
-def _event_text(entry: Entry) -> str:
-    """Return what an entry that is no frame says, "" for a frame."""
-    kind = entry["kind"]
-    if kind == "run":
-        return f"{entry['wall']}: {entry['command']}"
-    if kind == "retry":
-        return f"{entry['id']}, try {entry['attempt']}: {entry['fault']}"
-    if kind == "discarded":
-        return f"{entry['id']}: {entry['reason']}"
-    if kind in ("registered", "refused"):
-        return (
-            f"{entry['id']} taken again: shifted by ({entry['x_px']:+.3f}, {entry['y_px']:+.3f}) "
-            f"px, likeness {entry['likeness']:.3f}"
-        )
-    if kind == "stopped":
-        return f"{entry['wall']}: {entry['reason']}"
-    if kind == "until":
-        return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
-    if kind == "paused":
-        return f"{entry['wall']}: {entry['reason']}"
-    if kind == "resumed":
-        return f"{entry['wall']}: after {shown_seconds(entry['seconds'])}"
-    if kind == "decided":
-        return decided_words(entry)
-    if kind == "metered":
-        return metered_words(entry)
-    if kind == "amended":
-        return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
-    return f"{entry['wall']}: every frame verified" if kind == "complete" else ""

@@ -26,7 +26,9 @@ from calibration.errors import CalibrationError
 from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file
-from emmc_rig.session.readings import decoded, fused_shot, session_darks, shot_frames, whiteboards
+from emmc_rig.session.frame_means import decoded, session_darks, whiteboards
+from emmc_rig.session.journal import camera_of_first_run
+from emmc_rig.session.readings import fused_shot, shot_frames
 from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
@@ -127,7 +129,7 @@ def _detector(
     detector["saturation_value"] = lines[0]["white_level_dn"]
     detector["saturation_value"].attrs["units"] = "DN"
     detector["bayer_pattern"] = lines[0]["cfa"]
-    camera = next((e["camera"] for e in session.journal.entries if e["kind"] == "run"), {})
+    camera = camera_of_first_run(session.journal.entries) or {}
     for name, key in (("vendor", "maker"), ("model", "model"), ("serial_number", "serial")):
         detector[name] = camera.get(key, "")
 

@@ -31,7 +31,8 @@ from emmc_rig.processing.board_plan import capture_plan, parametric_plan, plan_l
 from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.progress import Watcher
 from emmc_rig.session.lock import held
-from emmc_rig.session.readings import Scale, scaled_readings, session_scale
+from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.readings import scaled_readings
 from emmc_rig.session.session import Session
 from emmc_rig.study.benchmarks.running import Asked, Show
 from emmc_rig.study.benchmarks.timing import Figures
