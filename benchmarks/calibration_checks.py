@@ -227,7 +227,7 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
     yield Row("session: cost in PSNR, dB", of_exact - of_known, LARGEST_COST_DB)
 
 
-def scenes(count: int) -> list[str]:
+def scenes(count: int) -> Sequence[str]:
     """Return scenes: real ones where EMMC_LIGHTFIELDS has them, else built-in ones."""
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     real = [str(Path(folder) / name) for name in REAL_SCENES] if folder else []
@@ -292,7 +292,7 @@ def check_cost(size: Size, seed: int) -> Iterator[Row]:
         yield Row(f"cost of the fitted mask, {Path(spec).name}, dB", cost_db, 0.3)
 
 
-def moved(flaws: Flaws, drift: Sequence[float]) -> Flaws:
+def moved(flaws: Flaws, drift: Array) -> Flaws:
     """Return a bench after a drift."""
     at = flaws.mounting
     (x, y), turn_deg = at.offset_um, float(np.degrees(drift[2]))
@@ -465,7 +465,7 @@ def draw(table: pandas.DataFrame, path: Path) -> None:
 def main() -> None:
     """Run the checks named, and write table and picture."""
     known = ", ".join(CHECKS)
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="Check the calibration on simulated benches.")
     parser.add_argument("checks", nargs="*", metavar="CHECK", help=f"some of {known}; default: all")
     parser.add_argument("--size", help="ROWSxCOLUMNS of all checks in place of their own")
     parser.add_argument("--rays", type=int, help="per view and pixel, in place of their own")
