@@ -213,7 +213,6 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
     true, known, good = true_psi(camera, rig, bench), found.calibration, found.outcome.good
     error, stated = true_error(known.psi, true, good), stated_error(known, good)
     yield Row("session: true error of Psi", error, min(STATED_TRUE * stated, TRUE_ERROR))
-    yield Row("session: stated error of Psi", stated)
     exact = replace(known.psi, weights=true, colour=None)
     of_exact, of_known = (
         psnr_db(
