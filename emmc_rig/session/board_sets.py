@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import MeanFrame
 from calibration.levels import Check, check_of
 from calibration.sensor import Pair
 from emmc_rig.errors import AppError
@@ -46,31 +45,14 @@ class SessionBoards:
 
 def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     """Return a session's whiteboards; channels: (y, x), the colour each pixel sees (3: all)."""
-    groups: dict[tuple[str, str], list[PlannedFrame]] = defaultdict(list)
+    every = _without_boards(session)
+    found = {kind: _board_frames(session, kind) for kind in ("open", "whiteboard", "held-out")}
+    turned: dict[float, dict[bool, list[PlannedFrame]]] = defaultdict(lambda: defaultdict(list))
     for frame in session.frames:
-        if frame.kind in ("open", "held-out", "whiteboard", "turned"):
-            groups[frame.kind, frame.id.rpartition("-r")[0]].append(frame)
-    if not groups:
+        if frame.kind == "turned":
+            turned[frame.bench.board_turn_deg][frame.bench.masks_in].append(frame)
+    if not turned and not any(found.values()):
         raise AppError(f"{session.folder}: its plan has no whiteboards")
-    found: dict[str, list[BoardFrame]] = defaultdict(list)
-    turned: dict[float, dict[bool, MeanFrame]] = defaultdict(dict)
-    for (kind, _), frames in groups.items():
-        bench = frames[0].bench
-        if kind == "turned":
-            turned[bench.board_turn_deg][bench.masks_in] = mean_of(session, frames)
-            continue
-        alike = alike_frames(session, frames)
-        stage_um = stage_um_of(frames[0])
-        view, window = frames[0].view, frames[0].window
-        read = partial(mean_of, session, alike)
-        found[kind].append(
-            BoardFrame(read, len(alike), stage_um, bench.shot, view, bench.lamp, window)
-        )
-    references = {key: mean_of(session, frames) for key, frames in references_of(session).items()}
-    # The white lamp's first: the sensor's gain follows from it.
-    references = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
-    darks = session_darks(session, of_shots=False)
-    every = BoardSet(darks, references, ())
     checks = tuple(_checks(session, every, channels))
     few = [*found["open"], *(found["whiteboard"] if found["open"] else ())]
     fit, free, held_out = (
@@ -79,10 +61,46 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     )
     own_um = next((one.stage_um for one in found["open"]), (0.0, 0.0))
     boards = {
-        turn_deg: BoardSet(darks, {(0, "white"): by[False]}, (BoardFrame.held(by[True], own_um),))
+        turn_deg: BoardSet(
+            every.darks,
+            {(0, "white"): mean_of(session, by[False])},
+            (BoardFrame.held(mean_of(session, by[True]), own_um),),
+        )
         for turn_deg, by in turned.items()
     }
     return SessionBoards(fit, free, held_out, boards)
+
+
+def whiteboards(session: Session) -> BoardSet:
+    """Return the whiteboards through the pinhole, which `measure_psi` takes.
+
+    Raises AppError where the plan has no whiteboards, no darks, or they were not all captured.
+    """
+    if not references_of(session):
+        raise AppError(f"{session.folder}: its plan has no whiteboards")
+    return _without_boards(session).with_frames(_board_frames(session, "whiteboard"))
+
+
+def _without_boards(session: Session) -> BoardSet:
+    """Return darks and references; the white lamp's first: the sensor's gain follows from it."""
+    by_lamp = sorted(references_of(session).items(), key=lambda item: item[0][1] != "white")
+    references = {key: mean_of(session, frames) for key, frames in by_lamp}
+    return BoardSet(session_darks(session, of_shots=False), references, ())
+
+
+def _board_frames(session: Session, kind: str) -> list[BoardFrame]:
+    """Return the whiteboards of a kind, each of all its repeats that are alike."""
+    groups: dict[str, list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        if frame.kind == kind:
+            groups[frame.id.rpartition("-r")[0]].append(frame)
+    found = []
+    for frames in groups.values():
+        alike, first = alike_frames(session, frames), frames[0]
+        read, bench = partial(mean_of, session, alike), first.bench
+        how = stage_um_of(first), bench.shot, first.view, bench.lamp, first.window
+        found.append(BoardFrame(read, len(alike), *how))
+    return found
 
 
 def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> Iterator[Check]:

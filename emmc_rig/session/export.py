@@ -22,11 +22,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from calibration.boards import gain_of
 from calibration.errors import CalibrationError
-from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file
-from emmc_rig.session.frame_means import decoded, session_darks, whiteboards
+from emmc_rig.session.board_sets import whiteboards
+from emmc_rig.session.frame_means import decoded, session_darks
 from emmc_rig.session.journal import camera_of_first_run
 from emmc_rig.session.readings import fused_shot, shot_frames
 from emmc_rig.session.session import CAMERA, RIG, Session
@@ -154,8 +155,7 @@ def _fused(session: Session, entry: Group) -> None:
     darks = session_darks(session)
     gain = None
     with suppress(AppError, CalibrationError):
-        boards = whiteboards(session)
-        gain = photon_transfer(boards.dark, next(iter(boards.references.values())))
+        gain = gain_of(whiteboards(session))
     if gain is None:
         return
     group = _group(entry, "fused", "NXdata", signal="data", axes=["shot", ".", "."])

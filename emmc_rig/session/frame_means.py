@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from calibration.frames import MeanFrame, average, before_and_after
-from calibration.whiteboard import Whiteboards
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
@@ -31,26 +30,6 @@ def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[tuple[
         data = session.read(frame.id)
         assert entry is not None
         yield decode_frame(data, entry), float(entry["exposure_s"])
-
-
-def whiteboards(session: Session) -> Whiteboards:
-    """Return the averages that `calibration.whiteboard.measure_psi` takes.
-
-    Raises AppError where the plan has no whiteboards, no darks, or they were not all captured.
-    """
-    references = references_of(session)
-    pinholes: dict[tuple[int, int, int, str], list[PlannedFrame]] = defaultdict(list)
-    for frame in session.frames:
-        shot, lamp = frame.bench.shot, frame.bench.lamp
-        if frame.kind == "whiteboard" and frame.view is not None:
-            pinholes[shot, *frame.view, lamp].append(frame)
-    if not references:
-        raise AppError(f"{session.folder}: its plan has no whiteboards")
-    return Whiteboards(
-        mean_dark(session),
-        {key: mean_of(session, frames) for key, frames in references.items()},
-        {key: mean_of(session, frames) for key, frames in pinholes.items()},
-    )
 
 
 def stage_um_of(frame: PlannedFrame) -> tuple[float, float]:

@@ -15,13 +15,12 @@ from calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.board_sets import board_sets
+from emmc_rig.session.board_sets import board_sets, whiteboards
 from emmc_rig.session.frame_means import (
     camera_of,
     frame_shape,
     mean_dark,
     session_darks,
-    whiteboards,
 )
 from emmc_rig.session.session import Session
 
