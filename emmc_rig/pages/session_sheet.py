@@ -286,5 +286,3 @@ def events(session: Session) -> Iterator[tuple[str, str]]:
             yield entry["kind"], text
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
-
-
