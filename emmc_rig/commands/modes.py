@@ -22,18 +22,6 @@ MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
         "session": {"route", "sensor", "stage", "out"},
-        "check": {
-            "camera",
-            "size",
-            "target",
-            "rays",
-            "seed",
-            "leave_out",
-            "few",
-            "stage",
-            "psnr",
-            "out",
-        },
         "plan": {"camera", "size", "target", "rays", "seed", "leave_out", "few", "frames", "out"},
     },
     "capture": {"schema": set(), "new": {"out"}},
@@ -65,7 +53,7 @@ MODES: dict[str, dict[str, set[str]]] = {
 }
 """By command and mode, as its function names them: what else may be given."""
 NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
-    "calibrate": {"known": "drift", "frames": "plan", "psnr": "check", "sensor": "session"},
+    "calibrate": {"known": "drift", "frames": "plan", "sensor": "session"},
     "cameras": {"out": "name"},
     "chart": {"until": "next_shot"},
     "export": {"truth": "result"},
