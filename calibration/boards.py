@@ -13,10 +13,11 @@ from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
 from calibration.levels import Check, Levels
 from calibration.openings import CENTRED, Window, views_open
-from calibration.whiteboard import DARKEST_REFERENCE_DN, LAMP_COLOURS, Whiteboards
 from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]
+LAMP_COLOURS = ("red", "green", "blue")
+DARKEST_REFERENCE_DN = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,26 +58,6 @@ class BoardFrame:
         return f"shot {self.shot}, {through}, {self.lamp} lamp, mask at ({x:g}, {y:g}) um"
 
 
-class _Lazily(Mapping[tuple[int, int, int, str], MeanFrame]):
-    """Frames read and changed as they are asked for, so that one is in memory."""
-
-    def __init__(
-        self,
-        frames: Mapping[tuple[int, int, int, str], BoardFrame],
-        change: Callable[[MeanFrame], MeanFrame],
-    ) -> None:
-        self._frames, self._change = frames, change
-
-    def __getitem__(self, key: tuple[int, int, int, str]) -> MeanFrame:
-        return self._change(self._frames[key].frame)
-
-    def __iter__(self) -> Iterator[tuple[int, int, int, str]]:
-        return iter(self._frames)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-
 @dataclass(frozen=True, eq=False)
 class BoardSet:
     """All that was captured at the whiteboard, whatever wrote it: a rig, a session, a simulation.
@@ -110,33 +91,6 @@ class BoardSet:
         # One reference may serve several shots.
         references = {id(frame): frame for frame in self.references.values()}.values()
         return sum(one.count for one in (*self.darks, *references, *self.frames))
-
-    def pinholes(self) -> Whiteboards:
-        """Return what the free route takes: the frames through the pinhole."""
-        dark = self.dark
-
-        def as_if_dark(frame: MeanFrame) -> MeanFrame:
-            own = self.dark_at(frame.exposure_s)
-            extra = _dark_variance(own) - dark.variance_dn2 / dark.count
-            extra += (own.variance_dn2 - dark.variance_dn2) / frame.count
-            return replace(
-                frame,
-                mean_dn=frame.mean_dn - (own.mean_dn - dark.mean_dn),
-                extra_variance_dn2=frame.extra_variance_dn2 + extra,
-            )
-
-        return Whiteboards(
-            dark,
-            {key: as_if_dark(frame) for key, frame in self.references.items()},
-            _Lazily(
-                {
-                    (one.shot, *one.pinhole, one.lamp): one
-                    for one in self.frames
-                    if one.pinhole is not None
-                },
-                as_if_dark,
-            ),
-        )
 
     def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:
         """Return the same dark and reference frames with other whiteboards."""
@@ -244,8 +198,8 @@ def _board(
     reading, variance = (np.empty(good.shape, dtype=np.float32) for _ in range(2))
     bright = 0
     for rows in bands(reading):
-        signal, signal_variance = _signal(frame, dark, gain, rows)
-        white, white_variance = _signal(reference, dark_of_white, gain, rows)
+        signal, signal_variance = signal_of(frame, dark, gain, rows)
+        white, white_variance = signal_of(reference, dark_of_white, gain, rows)
         enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
         bright += int(enough.sum())
         safe = np.where(enough, white, 1)
@@ -280,7 +234,7 @@ def _board(
     )
 
 
-def _signal(
+def signal_of(
     frame: MeanFrame, dark: MeanFrame, gain: SensorGain, rows: slice
 ) -> tuple[Array, Array]:
     """Return DN per second above the dark of some rows, and its variance."""

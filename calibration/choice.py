@@ -143,7 +143,7 @@ def neighbour_correlation(residual: Array, usable: NDArray[np.bool_]) -> float:
     return product / max(squares, 1e-12)
 
 
-def choose(judged: Sequence[HeldOut], limit: float = AT_THE_NOISE) -> tuple[HeldOut, str]:
+def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
     """Return the description to use, and why in words.
 
     Raises CalibrationError with none to choose from.
@@ -152,16 +152,16 @@ def choose(judged: Sequence[HeldOut], limit: float = AT_THE_NOISE) -> tuple[Held
         raise CalibrationError("no description of Psi to choose from")
     known = sorted(judged, key=lambda one: ROUTES.index(one.route))
     for one in known:
-        if one.chi2 <= limit:
+        if one.chi2 <= AT_THE_NOISE:
             return one, (
                 f"{one.route}: every kind of whiteboard lies at the noise (the worst, "
-                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {limit:g})"
+                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {AT_THE_NOISE:g})"
             )
     best = min(known, key=lambda one: one.chi2)
     return best, (
         f"{best.route}: none reaches the noise on every kind of whiteboard; this one comes nearest "
-        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {limit:g}), and its deviations "
-        "count what is missed"
+        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {AT_THE_NOISE:g}), and its "
+        "deviations count what is missed"
     )
 
 

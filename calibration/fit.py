@@ -320,7 +320,7 @@ def fit_placement(
             f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use the free route"
         )
-    shares = _shares_of_prior(placement, covariance, tolerances)
+    shares = shares_of_prior(placement, covariance, tolerances)
     undecided = tuple(
         name for name, share in zip(labels(camera.views), shares, strict=True) if share > DECIDED
     )
@@ -347,7 +347,7 @@ def fit_placement(
     )
 
 
-def _shares_of_prior(
+def shares_of_prior(
     placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
 ) -> NDArray[np.float64]:
     """Return every parameter's deviation over that of the prior, by their labels.

@@ -189,7 +189,7 @@ def calibrate(
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")
         on_stage("Psi, free")
-        free = replace(measure_psi(pinholes.pinholes(), design, empty, on_plane), good=good)
+        free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
         calibrations["free"] = free
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:

@@ -135,7 +135,7 @@ def stage_map(commanded_um: Sequence[tuple[float, float]], places: Sequence[Plac
     covariances = [np.linalg.inv(rows.T @ rows) * one for one in variance]
     spread_x, spread_y = (float(one) for one in np.sqrt(variance))
     return StageMap(
-        found[:2].T,
+        np.asarray(found[:2].T, np.float64),
         (float(found[2, 0]), float(found[2, 1])),
         (spread_x, spread_y),
         _deviations(covariances, (spread_x, spread_y), len(commanded)),

@@ -20,14 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.boards import (
+    DARKEST_REFERENCE_DN,
+    LAMP_COLOURS,
+    BoardFrame,
+    BoardSet,
+    signal_of,
+)
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
 Frames = NDArray[np.floating] | NDArray[np.integer]
-LAMP_COLOURS = ("red", "green", "blue")
-DARKEST_REFERENCE_DN = 50.0
 LARGEST_DARK_SHARE = 0.01
 IDEAL_DN = 1e6
 NewArray = Callable[[str, tuple[int, ...]], Any]
@@ -37,19 +42,6 @@ Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32
 def lamps_needed(design: ImagingMatrix | PsiLayout) -> tuple[str, ...]:
     """Return the lamp colours to measure under: white alone where a pixel sees one colour only."""
     return LAMP_COLOURS if design.colour is None else ("white",)
-
-
-@dataclass(frozen=True)
-class Whiteboards:
-    """Everything measured at the whiteboard.
-
-    dark: lamp off. references[shot, lamp]: aperture open, masks out. pinholes[shot, v, u, lamp]:
-    masks in, pinhole before that view.
-    """
-
-    dark: MeanFrame
-    references: Mapping[tuple[int, str], MeanFrame]
-    pinholes: Mapping[tuple[int, int, int, str], MeanFrame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +92,7 @@ def in_memory(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def measure_psi(
-    boards: Whiteboards,
+    boards: BoardSet,
     design: ImagingMatrix | PsiLayout,
     empty: NewArray = in_memory,
     on_plane: Callable[[str], None] = lambda what: None,
@@ -131,12 +123,12 @@ def measure_psi(
 
 
 def measured_planes(
-    boards: Whiteboards, layout: PsiLayout, designed: Array | None = None
+    boards: BoardSet, layout: PsiLayout, designed: Array | None = None
 ) -> Iterator[Plane]:
     """Yield ((shot, v, u, stored colour), coefficients, their deviation), both (y, x).
 
-    One plane is held at a time, and one whiteboard is asked for: `boards.pinholes` may read its
-    frames as it is asked. What is computed is computed by bands of rows. designed: Psi's weights as
+    One plane is held at a time, and one whiteboard is read. What is computed is computed by bands
+    of rows. designed: Psi's weights as
     designed, which say how a pixel's coefficient is shared among its samples (default: evenly).
     Raises as `measure_psi`.
     """
@@ -144,15 +136,18 @@ def measured_planes(
     gain = _gain(boards, layout)
     views_v, views_u = layout.views
     k = layout.binning
+    pinholes = {(one.shot, one.pinhole, one.lamp): one for one in boards.frames}
     for shot in range(layout.shape[0]):
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):
                 name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
-                pinhole = _checked(boards, boards.pinholes.get((shot, v, u, lamp)), name)
+                taken = pinholes.get((shot, (v, u), lamp))
+                pinhole = _checked(boards, None if taken is None else taken.frame, name)
+                dark = boards.dark_at(pinhole.exposure_s)
                 values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
                 for rows in bands(pinhole.mean_dn):
-                    signal, variance = _signal(boards, gain, pinhole, rows)
+                    signal, variance = signal_of(pinhole, dark, gain, rows)
                     reference, reference_variance = _bright(boards, gain, references[stored], rows)
                     ratio = signal / reference
                     relative = reference_variance / reference**2
@@ -166,7 +161,7 @@ def measured_planes(
                 yield (shot, v, u, stored), values, deviation
 
 
-def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
+def _gain(boards: BoardSet, layout: PsiLayout) -> SensorGain:
     first = boards.references.get((0, lamps_needed(layout)[0]))
     if first is None:
         raise CalibrationError("no reference whiteboard: open the aperture, take the masks out")
@@ -174,7 +169,7 @@ def _gain(boards: Whiteboards, layout: PsiLayout) -> SensorGain:
 
 
 def _references(
-    boards: Whiteboards, gain: SensorGain, layout: PsiLayout, shot: int
+    boards: BoardSet, gain: SensorGain, layout: PsiLayout, shot: int
 ) -> list[MeanFrame]:
     """Return the references of a shot, lamp by lamp; refuses those too dark to divide by."""
     found = []
@@ -199,7 +194,7 @@ def ideal_boards(
     readings: Mapping[tuple[int, int, int, str], Array],
     lamps: tuple[str, ...],
     design: ImagingMatrix,
-) -> Whiteboards:
+) -> BoardSet:
     """Return the whiteboards of a noise-free sensor from what a simulated bench really reads.
 
     readings: (pixel_y, pixel_x) through the pinhole, by (shot, v, u, lamp); 1 is a white board
@@ -210,13 +205,16 @@ def ideal_boards(
         return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
 
     size = design.frames_shape[1:]
-    white = np.full(size, 1 / len(lamps))
-    references = {(shot, lamp): frame(white) for shot in range(design.shots) for lamp in lamps}
-    pinholes = {key: frame(reading) for key, reading in readings.items()}
-    return Whiteboards(frame(np.zeros(size)), references, pinholes)
+    white = frame(np.full(size, 1 / len(lamps)))
+    references = {(shot, lamp): white for shot in range(design.shots) for lamp in lamps}
+    pinholes = tuple(
+        BoardFrame.held(frame(reading), (0.0, 0.0), shot, (v, u), lamp)
+        for (shot, v, u, lamp), reading in readings.items()
+    )
+    return BoardSet((frame(np.zeros(size)),), references, pinholes)
 
 
-def _checked(boards: Whiteboards, frame: MeanFrame | None, what: str) -> MeanFrame:
+def _checked(boards: BoardSet, frame: MeanFrame | None, what: str) -> MeanFrame:
     """Return a frame that is there, and of the size of the others."""
     if frame is None:
         raise CalibrationError(f"whiteboard missing: {what}; capture it before measuring Psi")
@@ -225,25 +223,14 @@ def _checked(boards: Whiteboards, frame: MeanFrame | None, what: str) -> MeanFra
     return frame
 
 
-def _signal(
-    boards: Whiteboards, gain: SensorGain, frame: MeanFrame, rows: slice
-) -> tuple[Array, Array]:
-    """Return DN per second above the dark of some rows and its variance, (y, x)."""
-    dark = boards.dark
-    signal = (frame.mean_dn[rows] - dark.mean_dn[rows]).astype(np.float64)
-    variance = gain.variance_dn2(signal) / frame.count + dark.variance_dn2 / dark.count
-    variance = variance + frame.extra_variance_dn2
-    return signal / frame.exposure_s, variance / frame.exposure_s**2
-
-
 def _bright(
-    boards: Whiteboards, gain: SensorGain, frame: MeanFrame, rows: slice
+    boards: BoardSet, gain: SensorGain, frame: MeanFrame, rows: slice
 ) -> tuple[Array, Array]:
-    """Return `_signal` of a reference whiteboard.
+    """Return `signal_of` a reference whiteboard.
 
     A few hot or dead pixels, which no route uses, are taken as just bright enough.
     """
-    signal, variance = _signal(boards, gain, frame, rows)
+    signal, variance = signal_of(frame, boards.dark_at(frame.exposure_s), gain, rows)
     return np.maximum(signal, DARKEST_REFERENCE_DN / frame.exposure_s), variance
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.frames import MeanFrame
 from calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
 from emmc_rig.acquisition.command import CaptureRequest, planned_frames
 from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
@@ -33,14 +32,10 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.processing.simulated import place_rig, simulated_session
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.session.readings import (
-    Scale,
-    decoded,
-    scaled_readings,
-    session_darks,
-    shot_frames,
-    whiteboards,
-)
+from emmc_rig.session.board_sets import whiteboards
+from emmc_rig.session.frame_means import decoded, session_darks
+from emmc_rig.session.measured_psi import Scale
+from emmc_rig.session.readings import scaled_readings, shot_frames
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
@@ -128,6 +123,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     with shown, stages("psi"):
         boards = whiteboards(session)
         calibration = measure_psi(boards, design)
+        chosen = (boards.frames[i] for i in (0, len(boards.frames) // 2, -1))
+        pictures = [(one.name, one.frame.mean_dn - calibration.dark_dn) for one in chosen]
         lamps = lamps_needed(design)
         exact = measure_psi(ideal_boards(_noise_free(session, rig, bench), lamps, design), design)
         psi_error = calibration.psi.relative_difference(exact.psi)
@@ -217,7 +214,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 result,
                 readings,
                 calibration,
-                boards.pinholes,
+                pictures,
                 maps,
             ),
         )
@@ -262,23 +259,14 @@ def _report(
     result: Reconstruction,
     readings: Array,
     calibration: Calibration,
-    pinholes: Mapping[tuple[int, int, int, str], MeanFrame],
+    pictures: list[tuple[str, Array]],
     maps: Mapping[str, NDArray],
 ) -> ReportContent:
     camera = settings.camera
     weights, deviation = (
         array[0].sum(axis=3) for array in (calibration.psi.weights, calibration.deviation)
     )
-    keys = list(pinholes)
-    chosen = [keys[0], keys[len(keys) // 2], keys[-1]]
-    boards = [
-        (
-            f"shot {shot + 1}, view ({v}, {u}), {lamp} lamp",
-            pinholes[shot, v, u, lamp].mean_dn - calibration.dark_dn,
-        )
-        for shot, v, u, lamp in chosen
-    ]
-    peak = max(float(np.percentile(board, 99.9)) for _, board in boards)
+    peak = max(float(np.percentile(board, 99.9)) for _, board in pictures)
     return ReportContent(
         title=f"{settings.scene} through {settings.camera_name}",
         scene=settings.scene,
@@ -289,7 +277,7 @@ def _report(
         truth=truth,
         frames=readings,
         cfa=camera.sensor.cfa_name,
-        whiteboards=[(label, board / peak) for label, board in boards],
+        whiteboards=[(label, board / peak) for label, board in pictures],
         psi=weights,
         psi_std=deviation,
         metrics=metrics,

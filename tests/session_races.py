@@ -22,7 +22,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.pages import session_sheet
 from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import export, prune
-from emmc_rig.session.readings import whiteboards
+from emmc_rig.session.board_sets import whiteboards
 
 LOADED_BEFORE = (session_sheet, export, prune)
 FAILED = 99
@@ -36,7 +36,7 @@ def quick_rig(description, camera, ask):
 
 def read_whiteboards(session, *rest):
     """Stand in for `session_outcome`: read all that it reads, and stop before the fit."""
-    count = len(whiteboards(session).pinholes)
+    count = len([one.frame for one in whiteboards(session).frames])
     raise AppError(f"{count} pinholes read")
 
 

@@ -15,7 +15,8 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.calibration_settings import CalibrateSettings
 from emmc_rig.processing.simulated import rig_to_calibrate, true_psi
-from emmc_rig.session.readings import camera_of, session_readings
+from emmc_rig.session.frame_means import camera_of
+from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session
 from simulators.bench import MountingErrors
 from simulators.effects import flawed

@@ -32,8 +32,8 @@ from emmc_rig.acquisition.checks import SaturatedError
 from emmc_rig.acquisition.retries import HOPELESS
 from emmc_rig.bench.rig_config import AskingAttendant, opened_rig
 from emmc_rig.session import session as session_module
+from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.lock import held
-from emmc_rig.session.readings import whiteboards
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SystemDisk
 from emmc_rig.session.verify import verify

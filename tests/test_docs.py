@@ -16,7 +16,7 @@ from programs import program
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.processing import session_calibration as calibrate_session
-from emmc_rig.session import readings
+from emmc_rig.session import measured_psi
 
 ROOT = Path(__file__).parents[1]
 REASONS = ("hardware", "real files", "minutes")
@@ -87,7 +87,7 @@ def small(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def _fitted_once():
     """The simulated rig's whiteboards are the same in every page: they are fitted but once."""
-    fit, known = readings.session_outcome, {}
+    fit, known = measured_psi.session_outcome, {}
 
     def remembered(session, routes=None, *more):
         key = routes, *sorted((name, one["sha256"]) for name, one in session.stored.items())
@@ -96,7 +96,7 @@ def _fitted_once():
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (readings, calibrate_session):
+        for module in (measured_psi, calibrate_session):
             patch.setattr(module, "session_outcome", remembered)
         yield
 

@@ -7,6 +7,7 @@ from calibration.board_angle import board_over_angle
 from calibration.boards import Board, BoardSet
 from calibration.colours import crosstalk
 from calibration.combine import combined
+from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain
 from calibration.levels import Check, fit_levels
 from calibration.whiteboard import Calibration
@@ -175,3 +176,11 @@ def test_crosstalk_is_what_a_filter_sees_of_other_lamps():
     np.testing.assert_allclose(found.seen, through, atol=1e-5)
     assert found.largest == pytest.approx(0.05)
     assert crosstalk(set_of(np.eye(3)), channels, good) is None
+    # One filter that sees less than half of its own colour is enough.
+    swapped = np.array([[0.9, 0.1, 0.0], [0.6, 0.4, 0.0], [0.0, 0.02, 0.98]])
+    with pytest.raises(CalibrationError, match="behind the green filter see 40% green"):
+        crosstalk(set_of(swapped), channels, good)
+    leaking = np.array([[0.999, 0.001, 0.0], [0.0, 1.0, 0.0], [0.0, 0.04, 0.96]])
+    found = crosstalk(set_of(leaking), channels, good)
+    assert found is not None
+    assert found.largest == pytest.approx(0.04)

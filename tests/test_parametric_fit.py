@@ -16,10 +16,10 @@ from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
 from calibration.defects import View, find_defects, loss_variance, mask_with_losses
 from calibration.errors import CalibrationError
-from calibration.fit import FitSettings, fit_placement
+from calibration.fit import FitSettings, fit_placement, shares_of_prior
 from calibration.openings import CENTRED, parts, views_open
 from calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
-from calibration.placement import SCALARS, designed_placement, labels
+from calibration.placement import SCALARS, Placement, Tolerances, designed_placement, labels
 from calibration.registration import register
 from calibration.routes import calibrate, fit_advice
 from calibration.shadow import Shadow, shadow_mask
@@ -241,6 +241,21 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert "second" in advice
     assert "in brightness against the others" in advice
     assert "third: the mask stands" in advice
+
+
+def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
+    views, tolerances = (2, 2), Tolerances()
+    weights = ((0.5, 1.5), (1.0, 1.0))
+    covariance = np.zeros((len(SCALARS) + 4, len(SCALARS) + 4))
+    spread = tolerances.aperture * np.ravel(weights)
+    covariance[-4:, -4:] = np.diag(spread**2)
+    found = shares_of_prior(Placement(aperture=weights), covariance, tolerances)
+    # Of four independent logarithms each less their mean: (1 - 1/4) of the variance is left.
+    np.testing.assert_allclose(found[-4:], np.sqrt(3 / 4))
+    assert found[: len(SCALARS)].max() == 0
+    half = shares_of_prior(Placement(aperture=weights), covariance / 4, tolerances)
+    np.testing.assert_allclose(half[-4:], np.sqrt(3 / 4) / 2)
+    assert len(tolerances.deviations(views)) == len(found)
 
 
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):

@@ -105,6 +105,19 @@ def test_rows_and_columns_are_separated_from_pixels_and_a_pattern_stands_in_the_
     assert sheet.dsnu.figure("row", 1.0)[0] < 0.3
 
 
+def test_pixels_that_differ_behind_one_filter_in_four_count_a_quarter_in_the_variance():
+    rng = np.random.default_rng(3)
+    offsets = np.zeros(SIZE)
+    offsets[::2, ::2] = rng.normal(0, 40, (SIZE[0] // 2, SIZE[1] // 2))
+    darks = [
+        Pair(t, *(np.rint(1000 + offsets + rng.normal(0, 2, SIZE)).astype(np.uint16) for _ in "ab"))
+        for t in DARKS_S
+    ]
+    found = characterise(darks, frames(), WHITE_DN).dsnu
+    assert found.figure("total", 1.0)[0] == pytest.approx(40 / np.sqrt(4), rel=0.05)
+    assert found.figure("pixel", 1.0)[0] == pytest.approx(40 / np.sqrt(4), rel=0.05)
+
+
 def test_read_noise_below_the_steps_of_the_converter_is_an_upper_bound():
     noise = SensorNoise(
         black_level_dn=64, gain_dn_per_electron=0.05, read_noise_electrons=2.5, white_level_dn=4095

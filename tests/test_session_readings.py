@@ -25,9 +25,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame, frame_file
-from emmc_rig.session.readings import session_readings, whiteboards
+from emmc_rig.session.readings import session_readings
 from simulators.clock import ManualClock
 from simulators.effects import Flaws
 from simulators.flaws import SensorFlaws

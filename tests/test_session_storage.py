@@ -22,10 +22,10 @@ from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
+from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.lock import held
 from emmc_rig.session.prune import prune
-from emmc_rig.session.readings import decoded
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify

@@ -21,7 +21,7 @@ from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
-from emmc_rig.session.decisions import decisions
+from emmc_rig.session.journal import decisions
 from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify

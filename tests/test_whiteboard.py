@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from calibration.boards import BoardFrame, BoardSet
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, average, photon_transfer
-from calibration.whiteboard import Whiteboards, ideal_boards, lamps_needed, measure_psi
+from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 
 SIZE = (12, 16)
@@ -55,14 +56,14 @@ def noisy_boards(camera, design, seed, repeats, exposure_s=0.2):
         return average(taken, time_s, WHITE_DN, "test")
 
     white = np.full(design.frames_shape[1:], 1 / len(lamps))
-    return Whiteboards(
-        mean(0 * white, exposure_s, 8),
-        {(s, lamp): mean(white, exposure_s, 8) for s in range(design.shots) for lamp in lamps},
-        {
-            key: mean(reading, exposure_s * count, repeats)
-            for key, reading in pinhole_readings(design).items()
-        },
-    )
+    pinholes = [
+        BoardFrame.held(mean(reading, exposure_s * count, repeats), (0.0, 0.0), shot, (v, u), lamp)
+        for (shot, v, u, lamp), reading in pinhole_readings(design).items()
+    ]
+    references = {
+        (s, lamp): mean(white, exposure_s, 8) for s in range(design.shots) for lamp in lamps
+    }
+    return BoardSet((mean(0 * white, exposure_s, 8),), references, tuple(pinholes))
 
 
 @pytest.mark.parametrize(("cfa", "binning"), [("rggb", 1), ("mono", 1), ("rggb", 2), ("mono", 2)])
@@ -96,10 +97,13 @@ def test_the_lamp_level_and_the_pixel_sensitivity_cancel():
     def dimmed(frame):
         return MeanFrame((frame.mean_dn * falloff).astype(np.float32), 0.0, frame.count, 1.0)
 
-    seen = Whiteboards(
-        boards.dark,
+    seen = BoardSet(
+        boards.darks,
         {key: dimmed(frame) for key, frame in boards.references.items()},
-        {key: dimmed(frame) for key, frame in boards.pinholes.items()},
+        tuple(
+            BoardFrame.held(dimmed(one.frame), one.stage_um, one.shot, one.pinhole)
+            for one in boards.frames
+        ),
     )
     assert measure_psi(seen, design).psi.relative_difference(design) < 1e-5
 
@@ -146,8 +150,7 @@ def test_a_lamp_that_flickers_between_repeats_is_refused():
 def test_a_missing_whiteboard_is_named():
     _, design = design_of()
     boards = ideal_boards(pinhole_readings(design), ("white",), design)
-    pinholes = {key: frame for key, frame in boards.pinholes.items() if key[1:3] != (1, 2)}
-    boards = Whiteboards(boards.dark, boards.references, pinholes)
+    boards = boards.with_frames([one for one in boards.frames if one.pinhole != (1, 2)])
     with pytest.raises(CalibrationError, match=r"missing: shot 0, view \(1, 2\), white lamp"):
         measure_psi(boards, design)
 
@@ -156,7 +159,7 @@ def test_no_reference_is_refused():
     _, design = design_of()
     boards = ideal_boards(pinhole_readings(design), ("white",), design)
     with pytest.raises(CalibrationError, match="no reference whiteboard"):
-        measure_psi(Whiteboards(boards.dark, {}, boards.pinholes), design)
+        measure_psi(BoardSet(boards.darks, {}, boards.frames), design)
 
 
 def test_a_dark_reference_is_refused():
@@ -164,7 +167,7 @@ def test_a_dark_reference_is_refused():
     boards = ideal_boards(pinhole_readings(design), ("white",), design)
     dim = MeanFrame(np.full(SIZE, 20.0, np.float32), 0.0, 2, 1.0)
     with pytest.raises(CalibrationError, match="raise the lamp or the exposure"):
-        measure_psi(Whiteboards(boards.dark, {(0, "white"): dim}, boards.pinholes), design)
+        measure_psi(BoardSet(boards.darks, {(0, "white"): dim}, boards.frames), design)
 
 
 def test_frames_of_two_sizes_and_no_frames_are_refused():

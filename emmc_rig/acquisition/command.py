@@ -46,6 +46,7 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
+from emmc_rig.session.journal import camera_of_first_run
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -215,10 +216,9 @@ def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -
 
 def refuse_other_camera(session: Session, rig: Rig) -> None:
     """Raise AppError when the session was begun with another camera body or frame size."""
-    run = next((entry for entry in session.journal.entries if entry["kind"] == "run"), None)
-    if run is None or not session.stored:
+    then, now = camera_of_first_run(session.journal.entries), rig.camera.identity
+    if then is None or not session.stored:
         return
-    then, now = run["camera"], rig.camera.identity
     if then["serial"] != now.serial or then["shape"] != list(rig.camera.shape):
         raise AppError(
             f"session {session.folder.name} was begun with camera {then['model']} "

@@ -20,8 +20,7 @@ from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
-from emmc_rig.session.decisions import metered
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import Entry, metered
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import JOURNAL, Session
 

@@ -17,7 +17,7 @@ from drivers.errors import CameraSettingError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.plan import Metering
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import Entry, kinds_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -70,8 +70,8 @@ def first_meterings(session: Session) -> dict[str, Entry]:
     """
     ids = {frame.id for frame in session.frames if frame.kind == "metering"}
     found: dict[str, Entry] = {}
-    for entry in session.journal.entries:
-        if entry["kind"] == "frame" and entry["id"] in ids:
+    for entry in kinds_of(session.journal.entries, "frame"):
+        if entry["id"] in ids:
             found.setdefault(entry["id"], entry)
     return found
 

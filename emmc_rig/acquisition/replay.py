@@ -24,15 +24,34 @@ from emmc_rig.session.session import Session
 
 def matched(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
     """Return by frame's id the file that is it; files: in the order in which they were taken."""
-    named = {re.sub(r"^\d{5}-", "", Path(file.name).stem): file for file in files}
-    found = {frame.id: named[frame.id] for frame in frames if frame.id in named}
+    found = _by_name(frames, files)
     taken = {file.name for file in found.values()}
     left = [file for file in files if file.name not in taken]
     wanted = [frame for frame in frames if frame.id not in found and not frame.is_optional]
-    if len(wanted) == len(left) and all(map(_agree, wanted, left)):
-        return found | {frame.id: file for frame, file in zip(wanted, left, strict=True)}
+    return found | (_in_order(wanted, left) or _by_exposure(wanted, left))
+
+
+def _by_name(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
+    """Return the files that are named as frames, or as sessions name theirs."""
+    named = {re.sub(r"^\d{5}-", "", Path(file.name).stem): file for file in files}
+    return {frame.id: named[frame.id] for frame in frames if frame.id in named}
+
+
+def _in_order(wanted: Sequence[PlannedFrame], left: Sequence[Recorded]) -> dict[str, Recorded]:
+    """Return file after file as frame after frame, where number and all exposures agree."""
+    if len(wanted) != len(left) or not all(map(_agree, wanted, left)):
+        return {}
+    return {frame.id: file for frame, file in zip(wanted, left, strict=True)}
+
+
+def _by_exposure(wanted: Sequence[PlannedFrame], left: Sequence[Recorded]) -> dict[str, Recorded]:
+    """Return the files of those exposures of which there are as many files as frames.
+
+    None where some frame may have any exposure: then no group is known to be whole.
+    """
     if any(frame.exposure_s is None for frame in wanted):
-        return found  # of any exposure, so that no group is known to be whole
+        return {}
+    found: dict[str, Recorded] = {}
     for exposure_s in {frame.exposure_s for frame in wanted}:
         alike = [frame for frame in wanted if frame.exposure_s == exposure_s]
         there = [file for file in left if file.exposure_s and _agree(alike[0], file)]

@@ -16,9 +16,10 @@ from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.session.decisions import decided_words, decisions, ended
+from emmc_rig.session.journal import decided_words, decisions, ended
+from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import Scale, scaled_readings, session_scale
+from emmc_rig.session.readings import scaled_readings
 from emmc_rig.session.session import Session, wall_time
 from reconstruction.methods import reconstruct
 from reconstruction.result import Progress, Reconstruction

@@ -128,8 +128,8 @@ def _run(
     from emmc_rig.acquisition.events import EventWatcher
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.files.results import shown_bytes, shown_seconds
-    from emmc_rig.session.decisions import decided_words, ended
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+    from emmc_rig.session.journal import decided_words, ended
     from emmc_rig.session.session import REPORT
 
     control = Control(stays=page == "steers")

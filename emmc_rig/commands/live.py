@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
     from emmc_rig.model.camera import Camera
-    from emmc_rig.session.readings import Scale
+    from emmc_rig.session.measured_psi import Scale
 
 DESIGN = "design"
 EVERYWHERE = ("0.0.0.0", "::")

@@ -26,7 +26,7 @@ from emmc_rig.live.field_pictures import Pictures, disparity_of, export_of
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.readings import Scale
+from emmc_rig.session.measured_psi import Scale
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.preview import Preview

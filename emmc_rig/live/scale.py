@@ -13,7 +13,7 @@ from emmc_rig.files.frames import PSI
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.readings import Scale, session_scale
+from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.session import Session
 
 CALIBRATION = "calibration.h5"

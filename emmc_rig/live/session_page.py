@@ -23,8 +23,8 @@ from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.pages.session_sheet import small_jpeg, stored_jpeg
+from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import Scale, session_scale
 from emmc_rig.session.session import Session
 from reconstruction.errors import ReconstructionError
 from reconstruction.result import Progress, Reconstruction

@@ -17,7 +17,7 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.results import shown_bytes, shown_seconds, write_metrics
+from emmc_rig.files.results import shown_bytes, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import AS_READ, Balance, preview, thinned, white_balance
 from emmc_rig.pages.page import (
@@ -31,10 +31,9 @@ from emmc_rig.pages.page import (
     typed,
 )
 from emmc_rig.pages.timeline import overlap, run_entries, session_metrics
-from emmc_rig.session.decisions import decided_words, decisions, ended, metered_words
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import camera_of_first_run, decisions, ended, entry_text, kinds_of
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
@@ -59,19 +58,6 @@ HEADINGS = {
     "turned": "The white board turned by 90 degrees",
     "shot": "Shots of the scene",
 }
-AGAIN = "{id} taken again: shifted by ({x_px:+.3f}, {y_px:+.3f}) px, likeness {likeness:.3f}"
-EVENTS = {
-    "run": "{wall}: {command}",
-    "retry": "{id}, try {attempt}: {fault}",
-    "discarded": "{id}: {reason}",
-    "registered": AGAIN,
-    "refused": AGAIN,
-    "stopped": "{wall}: {reason}",
-    "until": "{wall}: shots are taken until {target_db:g} dB are stated",
-    "paused": "{wall}: {reason}",
-    "complete": "{wall}: every frame verified",
-}
-"""By kind, what an entry of the journal says of an event."""
 
 
 def write_sheet(session: Session, out: Path, pictures: int = MOST_PICTURES) -> None:
@@ -139,7 +125,7 @@ def _head(session: Session) -> Head:
 
 
 def _about(session: Session) -> str:
-    camera = next((e["camera"] for e in session.journal.entries if e["kind"] == "run"), None)
+    camera = camera_of_first_run(session.journal.entries)
     by = (
         ""
         if camera is None
@@ -151,7 +137,7 @@ def _about(session: Session) -> str:
 def _cards(session: Session) -> list[Card]:
     stored, planned = len(session.stored), len(session.needed)
     size = sum(entry["bytes"] for entry in session.stored.values())
-    retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
+    retries = len(kinds_of(session.journal.entries, "retry"))
     state = Card("State", "not complete", "resume it", "watch")
     if session.is_complete:
         state = Card("State", "complete", "every frame verified", "good")
@@ -265,22 +251,8 @@ def small_jpeg(frame: RawFrame, balance: Balance = AS_READ) -> bytes:
 def events(session: Session) -> Iterator[tuple[str, str]]:
     """Yield kind and text of what happened, besides frames that were taken."""
     for entry in session.journal.entries:
-        text = _event_text(entry)
+        text = entry_text(entry)
         if text:
             yield entry["kind"], text
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
-
-
-def _event_text(entry: Entry) -> str:
-    """Return what an entry that is no frame says, "" for a frame."""
-    kind = entry["kind"]
-    if kind == "resumed":
-        return f"{entry['wall']}: after {shown_seconds(entry['seconds'])}"
-    if kind == "decided":
-        return decided_words(entry)
-    if kind == "metered":
-        return metered_words(entry)
-    if kind == "amended":
-        return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
-    return EVENTS.get(kind, "").format_map(entry)

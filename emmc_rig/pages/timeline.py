@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
-from emmc_rig.session.decisions import decisions
 from emmc_rig.session.exposure import shot_exposures
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import Entry, decisions, kinds_of
 from emmc_rig.session.session import Session
 
 BENCH = ("attend", "move", "settle", "expose", "read back", "check")
@@ -33,8 +32,8 @@ class Overlap:
 def run_entries(entries: Iterable[Entry]) -> list[list[Entry]]:
     """Return the frames' journal lines, run by run, those without any left out."""
     runs: dict[int, list[Entry]] = {}
-    for entry in entries:
-        if entry["kind"] == "frame" and "spans_s" in entry:
+    for entry in kinds_of(entries, "frame"):
+        if "spans_s" in entry:
             runs.setdefault(entry["run"], []).append(entry)
     return list(runs.values())
 
@@ -76,7 +75,7 @@ def session_metrics(session: Session) -> dict[str, object]:
         "complete": session.is_complete,
         "bytes": sum(entry["bytes"] for entry in session.stored.values()),
         "exposures": [asdict(one) for one in shot_exposures(session)],
-        "retries": sum(entry["kind"] == "retry" for entry in entries),
+        "retries": len(kinds_of(entries, "retry")),
         "runs": [
             {"frames": len(run), **asdict(one), "hidden_share": one.hidden_share}
             for run in run_entries(entries)

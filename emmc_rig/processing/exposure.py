@@ -63,4 +63,6 @@ def expected_gain_db(result: Result, factor: float) -> float | None:
     except ReconstructionError:
         return None
     stated = float(np.mean(np.square(solved.maps["sigma"], dtype=np.float64)))
-    return float(10 * np.log10(stated / max(stated - (now - then), then)))
+    # The expectation may lie above what is stated; more light makes nothing worse.
+    remaining = max(stated - (now - then), min(then, stated))
+    return float(10 * np.log10(stated / remaining))

@@ -23,15 +23,11 @@ from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.processing.calibration_settings import ROUTES
 from emmc_rig.processing.stored import REPORT, arrays_in, outcome_figures, save_outcome
 from emmc_rig.progress import Silent, Watcher
+from emmc_rig.session.board_sets import sensor_pairs, stage_frames
+from emmc_rig.session.frame_means import camera_of
+from emmc_rig.session.measured_psi import session_outcome
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import (
-    camera_json_of,
-    camera_of,
-    sensor_pairs,
-    session_outcome,
-    stage_frames,
-    taken_shots,
-)
+from emmc_rig.session.readings import camera_json_of, taken_shots
 from emmc_rig.session.session import CALIBRATION, Session
 
 SENSOR, STAGE = "sensor.json", "stage.json"

@@ -199,7 +199,8 @@ def simulated_plan(settings: CalibrateSettings) -> Plan:
     planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
     plan = capture_plan(settings, planned)
     assert plan.whiteboards is not None
-    changes: dict[str, Any] = {}
+    # As bright as planned for: a metering frame shows hot pixels, too.
+    changes: dict[str, Any] = {"exposure_s": light.exposure_s}
     if not settings.few:
         repeats = max(plan.whiteboards.repeats, PINHOLE_REPEATS)
         changes |= {"shots": "all", "repeats": repeats}

@@ -22,11 +22,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from calibration.boards import gain_of
 from calibration.errors import CalibrationError
-from calibration.frames import photon_transfer
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file
-from emmc_rig.session.readings import decoded, fused_shot, session_darks, shot_frames, whiteboards
+from emmc_rig.session.board_sets import whiteboards
+from emmc_rig.session.frame_means import decoded, session_darks
+from emmc_rig.session.journal import camera_of_first_run
+from emmc_rig.session.readings import fused_shot, shot_frames
 from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
@@ -127,7 +130,7 @@ def _detector(
     detector["saturation_value"] = lines[0]["white_level_dn"]
     detector["saturation_value"].attrs["units"] = "DN"
     detector["bayer_pattern"] = lines[0]["cfa"]
-    camera = next((e["camera"] for e in session.journal.entries if e["kind"] == "run"), {})
+    camera = camera_of_first_run(session.journal.entries) or {}
     for name, key in (("vendor", "maker"), ("model", "model"), ("serial_number", "serial")):
         detector[name] = camera.get(key, "")
 
@@ -152,8 +155,7 @@ def _fused(session: Session, entry: Group) -> None:
     darks = session_darks(session)
     gain = None
     with suppress(AppError, CalibrationError):
-        boards = whiteboards(session)
-        gain = photon_transfer(boards.dark, next(iter(boards.references.values())))
+        gain = gain_of(whiteboards(session))
     if gain is None:
         return
     group = _group(entry, "fused", "NXdata", signal="data", axes=["shot", ".", "."])

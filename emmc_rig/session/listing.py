@@ -16,9 +16,8 @@ from emmc_rig.files.folders import is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.session.decisions import ended, metered
 from emmc_rig.session.exposure import shot_exposures
-from emmc_rig.session.journal import heads
+from emmc_rig.session.journal import count_stored, ended, found_complete, heads, kinds_of, metered
 from emmc_rig.session.session import (
     HEADER,
     JOURNAL,
@@ -26,8 +25,6 @@ from emmc_rig.session.session import (
     PLAN,
     RECONSTRUCTION,
     Session,
-    count_stored,
-    found_complete,
 )
 
 
@@ -182,7 +179,7 @@ def _described(session: Session) -> dict[str, str]:
             if frame.kind == "shot" and frame.id in session.stored
         }
     )
-    retries = sum(entry["kind"] == "retry" for entry in session.journal.entries)
+    retries = len(kinds_of(session.journal.entries, "retry"))
     return {
         "begun": listed.created,
         "state": listed.state,

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 Kind = Literal[
     "dark", "metering", "reference", "whiteboard", "open", "held-out", "check", "turned", "shot"
 ]
-KINDS: tuple[Kind, ...] = (
-    "dark",
-    "metering",
-    "reference",
-    "whiteboard",
-    "open",
-    "held-out",
-    "check",
-    "turned",
-    "shot",
-)
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 SHOT_DARK = "dark-shot"
 """How ids of darks begin that are exposed as the shots are."""

@@ -15,7 +15,7 @@
         calibration/, reconstruction/   what `calibrate` and `reconstruct` made of it
 
 Where a capture ends when the scene needs no more shots, the journal says which are spared: these
-count as not planned (see `decisions`).
+count as not planned (see `journal`).
 
 The first journal line holds the SHA-256 of the frozen files, an `amended` line that of the files
 of an amendment: a frame that is taken stays what it was planned to be, and its line says by which
@@ -53,8 +53,18 @@ from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import parse_yaml
-from emmc_rig.session.decisions import metered, spared_shots, wanted_db
-from emmc_rig.session.journal import Entry, Journal, encode_line
+from emmc_rig.session.journal import (
+    Entry,
+    Journal,
+    count_entry,
+    count_stored,
+    encode_line,
+    found_complete,
+    kinds_of,
+    metered,
+    spared_shots,
+    wanted_db,
+)
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.storage import (
     SYSTEM_DISK,
@@ -163,8 +173,7 @@ class Session:
 
     def forget(self) -> None:
         """Remove a session in which no frame was ever stored, unless it holds other files."""
-        taken = any(entry["kind"] == "frame" for entry in self.journal.entries)
-        if taken or self.unexpected_files()[1]:
+        if kinds_of(self.journal.entries, "frame") or self.unexpected_files()[1]:
             return
         with suppress(OSError):
             # Whole or not at all: what a crash leaves of it is cleared like one never made.
@@ -176,7 +185,7 @@ class Session:
     @cached_property
     def created(self) -> Entry:
         """The first entry; raises AppError when it is damaged, or of a later program."""
-        first = next((e for e in self.journal.entries if e.get("kind") == "created"), None)
+        first, *_ = kinds_of(self.journal.entries, "created") or [None]
         if first is None:
             raise AppError(
                 f"{self.folder / JOURNAL}: its first line is damaged; restore it from a copy"
@@ -188,15 +197,14 @@ class Session:
     @property
     def amendments(self) -> int:
         """How often the plan was amended: the number of the plan that holds, from 0."""
-        return sum(entry["kind"] == "amended" for entry in self.journal.entries)
+        return len(kinds_of(self.journal.entries, "amended"))
 
     @property
     def digests(self) -> dict[str, str]:
         """The SHA-256 of every frozen file, those of amendments too; raises AppError."""
         found = dict(self.created["sha256"])
-        for entry in self.journal.entries:
-            if entry["kind"] == "amended":
-                found |= entry["sha256"]
+        for entry in kinds_of(self.journal.entries, "amended"):
+            found |= entry["sha256"]
         return found
 
     def frozen_file(self, name: str) -> bytes:
@@ -269,7 +277,7 @@ class Session:
     @property
     def runs(self) -> int:
         """How often a capture was started on it."""
-        return sum(entry["kind"] == "run" for entry in self.journal.entries)
+        return len(kinds_of(self.journal.entries, "run"))
 
     @property
     def target_db(self) -> float | None:
@@ -350,7 +358,7 @@ class Session:
         """Add a line to the journal; raises `OSError`."""
         entry = {"kind": kind, **facts}
         self.journal.append(entry)
-        _count(self.stored, entry)
+        count_entry(self.stored, entry)
 
     def make_ready(self) -> None:
         """Make the folders that a capture needs and that may be missing; raises `OSError`.
@@ -411,29 +419,6 @@ class Session:
         """The names of all frames ever planned."""
         earlier = [amended_name(ORDER, number) for number in range(self.amendments)]
         return {one["id"] for name in earlier for one in self._data(name)}.union(self._places)
-
-
-def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
-    """Return the journal line of every frame that counts, by its id, oldest first."""
-    found: dict[str, Entry] = {}
-    for entry in entries:
-        _count(found, entry)
-    return found
-
-
-def _count(found: dict[str, Entry], entry: Entry) -> None:
-    if entry["kind"] == "frame":
-        found[entry["id"]] = entry
-    elif entry["kind"] == "discarded":
-        found.pop(entry["id"], None)
-
-
-def found_complete(entries: Sequence[Entry]) -> bool:
-    """Return whether every frame was found good after the last one was stored."""
-    for entry in reversed(entries):
-        if entry["kind"] in ("complete", "frame", "discarded", "amended"):
-            return entry["kind"] == "complete"
-    return False
 
 
 def amended_name(name: str, number: int) -> str:

@@ -1,0 +1,251 @@
+"""A frame on the devices of a rig: the bench set up for it, exposed, and read back.
+
+What was sent last is remembered, so that nothing is sent twice; after a fault nothing is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+
+from drivers.errors import DriverError
+from drivers.raw import RawFrame
+from emmc_rig.acquisition.checks import Figures, FrameRefusedError, figures
+from emmc_rig.acquisition.metering import METERING_TRIES, better_metering_s
+from emmc_rig.acquisition.plan import Plan
+from emmc_rig.acquisition.retries import Mending
+from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hardware import Rig
+from emmc_rig.bench.trigger import EDGE_WAIT_S, signalling, triggered
+from emmc_rig.errors import AppError
+from emmc_rig.session.planned import PlannedFrame
+
+LARGEST_EXPOSURE_RATIO = 1.5
+"""A camera may take the nearest of full stops, which is off by at most half a stop."""
+
+
+@dataclass
+class Sent:
+    """What was last sent to the devices; empty: nothing is known."""
+
+    bench: tuple | None = None
+    lamp: str | None = None
+    offsets_um: dict[str, float] = field(default_factory=dict)
+    exposure_s: float | None = None
+    gain: float | None = None
+
+
+class Spans:
+    """The seconds from the start of a run in which each step of a frame began and ended."""
+
+    def __init__(self, now_s: Callable[[], float], watcher: CaptureWatcher) -> None:
+        self._now_s, self._watcher = now_s, watcher
+        self.seconds: dict[str, list[float]] = {}
+
+    @contextmanager
+    def __call__(self, step: str, planned: PlannedFrame) -> Iterator[None]:
+        """Time a step of a frame, and show it."""
+        self._watcher.step(step, planned)
+        began_s = self._now_s()
+        yield
+        self.seconds[step] = [began_s, self._now_s()]
+
+
+class Devices:
+    """Stage, camera and attendant of a rig, as a capture by a plan uses them."""
+
+    def __init__(self, rig: Rig, plan: Plan) -> None:
+        self._rig, self._plan = rig, plan
+        self.camera = rig.camera
+        self.sent = Sent()
+        self.triggered = False
+
+    def home(self) -> None:
+        """Home the stage, and bring the axes that no plan moves to their places."""
+        if self._rig.stage.axes:
+            self._rig.stage.home()
+        if self._rig.stands_um:
+            self._rig.stage.move_to_um(self._rig.stands_um)
+        self.sent = Sent()
+
+    def mend(self, what: Mending) -> None:
+        """Wait, and repair what a fault broke."""
+        self._rig.clock.sleep(what.wait_s)
+        self.sent = Sent()
+        if what.reopen_camera and self._rig.reopen_camera is not None:
+            with suppress(DriverError):
+                self.camera.close()
+            self.camera = self._rig.reopen_camera()
+        if what.reconnect_stage:
+            self._rig.stage.reconnect()
+        if what.home:
+            self.home()
+
+    def attend(self, planned: PlannedFrame) -> None:
+        """Let lamp, board and masks be as a frame needs them; nobody is asked for a dark."""
+        bench, sent, attendant = planned.bench, self.sent, self._rig.attendant
+        if bench.lamp != "off" and sent.bench != bench.set_by_hand:
+            sent.bench = None
+            attendant.place(bench.target, bench.board_turn_deg)
+            attendant.fit_masks(bench.fitting, bench.masks_in)
+            sent.bench = bench.set_by_hand
+        self.set_lamp(bench.lamp)
+
+    def set_lamp(self, lamp: str) -> None:
+        """Switch the lamp, unless it is so."""
+        if self.sent.lamp != lamp:
+            self.sent.lamp = None
+            self._rig.attendant.set_lamp(lamp)
+            self.sent.lamp = lamp
+
+    def move(self, planned: PlannedFrame) -> bool:
+        """Bring the stage to its place; returns whether it moved."""
+        wanted = self._wanted_um(planned)
+        if not wanted:
+            return False
+        for axis in wanted:
+            self.sent.offsets_um.pop(axis, None)
+        zero_um = self._rig.zero_um
+        self._rig.stage.move_to_um({axis: zero_um[axis] + um for axis, um in wanted.items()})
+        self.sent.offsets_um |= wanted
+        return True
+
+    def settle(self) -> None:
+        """Wait after a move, as the plan asks."""
+        self._rig.clock.sleep(self._plan.settle_s)
+
+    def move_and_expose(
+        self, planned: PlannedFrame, exposure_s: float, span: Spans
+    ) -> tuple[RawFrame, Figures]:
+        """Bring the stage to its place and expose there, by the program or by a trigger."""
+        axis = self._axis_that_triggers(planned)
+        self.triggered = axis is not None
+        if axis is not None:
+            frame = self._arrive_and_expose(planned, axis, exposure_s, span)
+            return frame, figures(frame)
+        with span("move", planned):
+            moved = self.move(planned)
+        if moved and self._plan.settle_s:
+            with span("settle", planned):
+                self.settle()
+        with span("expose", planned):
+            return self._expose(planned, exposure_s)
+
+    def read_back_um(self, planned: PlannedFrame) -> dict[str, float]:
+        """Return where the axes stand after the exposure; raises when they do not stand there."""
+        read_um = {}
+        for axis, offset_um in planned.bench.offsets_um.items():
+            at_um = self._rig.stage.position_um(axis) - self._rig.zero_um[axis]
+            if abs(at_um - offset_um) > self._plan.checks.stage_um:
+                raise FrameRefusedError(
+                    planned.id,
+                    f"was exposed while {axis} stood {at_um - offset_um:+.2f} um off its place",
+                    "check that nothing pushes the stage",
+                )
+            read_um[axis] = at_um
+        return read_um
+
+    def snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
+        """Expose one frame where everything stands."""
+        self._rig.about_to_expose(planned.id)
+        self._set_camera(planned, exposure_s)
+        frame = self.camera.snap()
+        return frame, figures(frame)
+
+    def make_safe(self) -> None:
+        """Switch the lamp off, and close a camera that was opened again; no fault is raised."""
+        with suppress(DriverError, AppError):
+            self.set_lamp("off")
+        if self.camera is not self._rig.camera:
+            with suppress(DriverError):
+                self.camera.close()
+
+    def facts(self) -> dict[str, object]:
+        """Return what the journal says of the devices of a run."""
+        stage, camera = self._rig.stage, self.camera
+        settings = {}
+        with suppress(DriverError):
+            # Other values, such as the battery's, a camera may not report.
+            settings = dict(getattr(camera, "details", dict)())
+        return {
+            "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
+            "camera_settings": settings,
+            "stage": {
+                axis: {
+                    "limits_um": list(stage.limits_um(axis)),
+                    "speed_um_s": stage.speed_um_s(axis),
+                    "zero_um": self._rig.zero_um.get(axis, 0.0),
+                }
+                for axis in stage.axes
+            },
+        }
+
+    def _wanted_um(self, planned: PlannedFrame) -> dict[str, float]:
+        """Return by axis where the stage does not stand yet, from each axis's zero."""
+        sent = self.sent.offsets_um
+        return {axis: um for axis, um in planned.bench.offsets_um.items() if sent.get(axis) != um}
+
+    def _axis_that_triggers(self, planned: PlannedFrame) -> str | None:
+        """Return the axis whose arrival begins the exposure; None: the program asks for it.
+
+        A controller raises its output when one axis arrives, so that it must be the only one that
+        moves. Metering looks at a frame before it takes the next.
+        """
+        wanted = list(self._wanted_um(planned))
+        trigger = self._rig.trigger
+        if trigger is None or planned.kind == "metering" or len(wanted) != 1:
+            return None
+        return wanted[0] if wanted[0] in trigger.outputs else None
+
+    def _arrive_and_expose(
+        self, planned: PlannedFrame, axis: str, exposure_s: float, span: Spans
+    ) -> RawFrame:
+        rig, sent = self._rig, self.sent.offsets_um
+        assert rig.trigger is not None
+        offset_um = planned.bench.offsets_um[axis]
+        rig.about_to_expose(planned.id)
+        self._set_camera(planned, exposure_s)
+        delay_s = rig.trigger.delay_s + self._plan.settle_s
+        with triggered(self.camera).armed(rig.trigger.line, delay_s) as receive:
+            with span("move", planned):
+                sent.pop(axis, None)
+                target_um = rig.zero_um[axis] + offset_um
+                output = rig.trigger.outputs[axis]
+                signalling(rig.stage).move_and_signal_um(axis, target_um, output)
+                sent[axis] = offset_um
+            with span("expose", planned):
+                return receive(EDGE_WAIT_S)
+
+    def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
+        """Expose one frame, or of a metering frame as many as it takes to find its exposure."""
+        if planned.kind != "metering" or planned.id in self._rig.recorded_s:
+            return self.snap(planned, exposure_s)
+        low_s, high_s = self.camera.exposure_limits_s
+        if planned.bench.target == "scene":
+            high_s = min(high_s, self._plan.metering.longest_s)
+        for _ in range(METERING_TRIES):
+            frame, found = self.snap(planned, exposure_s)
+            next_s = better_metering_s(frame, found, exposure_s, (low_s, high_s))
+            if next_s is None:
+                break
+            exposure_s = next_s
+        return frame, found
+
+    def _set_camera(self, planned: PlannedFrame, exposure_s: float) -> None:
+        camera, sent = self.camera, self.sent
+        if sent.gain != planned.gain:
+            sent.gain = None
+            camera.set_gain(planned.gain)
+            sent.gain = planned.gain
+        if sent.exposure_s != exposure_s:
+            sent.exposure_s = None
+            camera.set_exposure_s(exposure_s)
+            ratio = camera.exposure_s / exposure_s
+            if not 1 / LARGEST_EXPOSURE_RATIO < ratio < LARGEST_EXPOSURE_RATIO:
+                raise FrameRefusedError(
+                    planned.id,
+                    f"would be exposed for {camera.exposure_s:g} s instead of {exposure_s:g} s",
+                    "set the camera to manual exposure",
+                )
+            sent.exposure_s = exposure_s

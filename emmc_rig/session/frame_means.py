@@ -1,0 +1,131 @@
+"""Means of a session's frames: darks, references, whiteboards; one frame in memory at a time."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from calibration.frames import MeanFrame, average, before_and_after
+from drivers.raw import RawFrame
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.settings import validated
+from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.journal import Entry
+from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
+
+
+def camera_of(session: Session) -> Camera:
+    """Return the camera as planned."""
+    return validated(Camera, session.camera, str(session.folder), AppError)
+
+
+def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[tuple[RawFrame, float]]:
+    """Yield frames and their exposures in seconds; raises AppError for one that is not good."""
+    for frame in frames:
+        entry = session.stored.get(frame.id)
+        data = session.read(frame.id)
+        assert entry is not None
+        yield decode_frame(data, entry), float(entry["exposure_s"])
+
+
+def stage_um_of(frame: PlannedFrame) -> tuple[float, float]:
+    """Return where the mask stage was sent, from where it is centred, x and y."""
+    offsets = frame.bench.offsets_um
+    return offsets.get("mask_x", 0.0), offsets.get("mask_y", 0.0)
+
+
+def references_of(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]:
+    """Return the frames of the open aperture without masks, by shot and lamp."""
+    found: dict[tuple[int, str], list[PlannedFrame]] = defaultdict(list)
+    for frame in session.frames:
+        if frame.kind == "reference":
+            found[frame.bench.shot, frame.bench.lamp].append(frame)
+    return found
+
+
+def session_darks(session: Session, of_shots: bool = True) -> tuple[MeanFrame, ...]:
+    """Return the darks of each exposure; those taken before and after the whiteboards as one.
+
+    of_shots: those too that were taken for the shots of the scene.
+    """
+    groups: dict[tuple[float, int], list[PlannedFrame]] = defaultdict(list)
+    for frame in darks_of(session):
+        if frame.is_dark_of_shots and not of_shots:
+            continue
+        groups[exposure_of(session, frame), frame.part].append(frame)
+    found: dict[float, MeanFrame] = {}
+    for (exposure_s, _), frames in sorted(groups.items()):
+        mean = mean_of(session, frames)
+        earlier = found.get(exposure_s)
+        found[exposure_s] = mean if earlier is None else before_and_after(earlier, mean)
+    return tuple(found.values())
+
+
+def mean_dark(session: Session) -> MeanFrame:
+    """Return the average of the dark frames of the shortest exposure; raises AppError."""
+    return min(session_darks(session, of_shots=False), key=lambda frame: frame.exposure_s)
+
+
+def darks_of(session: Session) -> list[PlannedFrame]:
+    """Return the dark frames; raises AppError without any in the plan."""
+    darks = [frame for frame in session.frames if frame.kind == "dark"]
+    if not darks:
+        raise AppError(f"{session.folder}: its plan has no darks")
+    return darks
+
+
+def frame_shape(session: Session) -> tuple[int, int]:
+    """Return rows and columns of the frames captured; raises AppError where no dark was."""
+    first = darks_of(session)[0]
+    exposure_of(session, first)
+    rows, columns = session.stored[first.id]["shape"]
+    return rows, columns
+
+
+def exposure_of(session: Session, frame: PlannedFrame) -> float:
+    """Return how long a frame was exposed; raises AppError where it was not captured yet."""
+    entry = session.stored.get(frame.id)
+    if entry is None:
+        raise AppError(f"{session.folder}: frame {frame.id} was not captured yet; resume it")
+    return float(entry["exposure_s"])
+
+
+def _taken_s(session: Session, entry: Entry) -> float:
+    """Return when a frame was taken, in seconds of the session.
+
+    The clock of a run may begin anew with it: then the run follows the one before.
+    """
+    times: dict[int, list[float]] = defaultdict(list)
+    for one in session.stored.values():
+        times[one.get("run", 0)].append(one.get("host_time_s") or 0.0)
+    offset = latest = 0.0
+    for run in sorted(times):
+        offset = max(0.0, latest - min(times[run])) if run != min(times) else 0.0
+        latest = max(times[run]) + offset
+        if run == entry.get("run", 0):
+            break
+    return (entry.get("host_time_s") or 0.0) + offset
+
+
+def alike_frames(session: Session, frames: list[PlannedFrame]) -> list[PlannedFrame]:
+    """Return the most repeats that are alike in exposure: an amendment of the plan may change it.
+
+    Raises AppError where one was not captured yet.
+    """
+    exposures_s = [exposure_of(session, frame) for frame in frames]
+    (exposure_s, _), *_ = Counter(exposures_s).most_common()
+    return [one for one, own_s in zip(frames, exposures_s, strict=True) if own_s == exposure_s]
+
+
+def mean_of(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
+    """Return the mean of frames that differ in nothing; raises AppError or CalibrationError."""
+    alike = alike_frames(session, frames)
+    entries = [session.stored[frame.id] for frame in alike]
+    mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
+    taken_s = float(np.mean([_taken_s(session, entry) for entry in entries]))
+    first, what, lit = entries[0], alike[0].id, alike[0].kind != "dark"
+    return average(mosaics, first["exposure_s"], first["white_level_dn"], what, taken_s, lit)
