@@ -1,7 +1,7 @@
 """Files from outside as plain data: YAML, HDF5 and pictures, bounded in depth and memory.
 
 Whatever is wrong with a file raises the caller's error with one line that names the file. No other
-module calls these decoders, nor JSON's beside `json_text`: `tests/test_decoders.py` says so.
+module calls these decoders, nor JSON's beside `json_text`: `tests/files/test_decoders.py` says so.
 """
 
 from __future__ import annotations

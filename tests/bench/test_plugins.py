@@ -14,7 +14,7 @@ from drivers.errors import LimitExceededError
 from emmc_rig.bench.hardware import open_camera, open_stage
 from emmc_rig.errors import AppError
 
-EXAMPLE = Path(__file__).parents[1] / "docs/example_plugin"
+EXAMPLE = Path(__file__).parents[2] / "docs/example_plugin"
 PROGRAM = "from emmc_rig.cli import main; main()"
 BROKEN = """
 from emmc_rig_example.simulator import open_simulated

@@ -334,7 +334,7 @@ def test_a_link_does_not_replace_a_file(run, tmp_path):
 
 
 def test_every_test_that_the_page_about_devices_names_exists():
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     named = set(re.findall(r"`(test_\w+)`", (root / "docs/devices.md").read_text()))
     places = (root / "tests", root / "emmc_rig/conformance")
     written = "".join(path.read_text() for place in places for path in place.glob("*.py"))

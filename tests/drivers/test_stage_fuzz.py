@@ -1,7 +1,7 @@
 """Codecs and whole drivers against bytes that nobody meant to send.
 
 Never a hang, never an exception outside the drivers' own, never a position that was not read.
-`python -m pytest tests/test_stage_fuzz.py --fuzz-cases 100000` is the nightly size.
+`python -m pytest tests/drivers/test_stage_fuzz.py --fuzz-cases 100000` is the nightly size.
 """
 
 import random

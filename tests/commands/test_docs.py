@@ -18,7 +18,7 @@ from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 REASONS = ("hardware", "real files", "minutes")
 NOT_OURS = ("pip", "pytest")
 """Programs that brought the tests here, or are the tests."""

@@ -30,7 +30,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.sensing import ImagingMatrix
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 READING, CHILD, RAW = "emmc_rig/model/reading.py", "emmc_rig/files/child.py", "drivers/raw.py"
 GUARDED = {
     "yaml": (READING, "emmc_rig/files/yaml_edit.py"),  # whose text was parsed there before

@@ -12,7 +12,7 @@ import pytest
 
 from emmc_rig.model import compiling
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
 RENDER = """
 import numpy as np

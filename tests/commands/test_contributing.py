@@ -10,7 +10,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.study.trial import Capture
 from reconstruction.method import Given
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 

@@ -227,7 +227,7 @@ def test_the_mask_covers_every_place_that_the_stage_reaches(tmp_path):
 
 
 def test_the_bench_of_the_documentation_is_the_default():
-    text = (Path(__file__).parents[1] / "docs/design.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs/design.md").read_text(encoding="utf-8")
     (shown,) = re.findall(r"^```yaml\n(.*?)^```", text, re.M | re.S)
     assert DesignBench.model_validate(yaml.safe_load(shown)) == DesignBench()
 

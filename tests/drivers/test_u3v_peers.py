@@ -17,7 +17,7 @@ from drivers.pixel_formats import FORMATS
 
 pytestmark = pytest.mark.peers
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "tests" / "peers" / "u3v_over_libusb.py"
 WRAPPER = shutil.which("umockdev-wrapper")
 TIME_LIMIT_S = 60
