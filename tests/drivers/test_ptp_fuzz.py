@@ -1,6 +1,7 @@
 """Hostile cameras: whatever bytes come, however they are cut, the driver ends in its own errors.
 
-The number of cases is `--fuzz-cases`; nightly: `pytest tests/drivers/test_ptp_fuzz.py --fuzz-cases 100000`.
+The number of cases is `--fuzz-cases`; nightly:
+`pytest tests/drivers/test_ptp_fuzz.py --fuzz-cases 100000`.
 """
 
 import random
