@@ -37,9 +37,8 @@ class Reconstruction:
     """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when converged.
 
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
-    it found, by name: `disparity` (y, x) in pixels per view step, ... left_out: what of the model
-    the whole scene did not need, in words, with what that may cost. screening: what was done to
-    the frames before, in words.
+    it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was
+    done to the frames before, in words.
     """
 
     method: str
@@ -51,7 +50,6 @@ class Reconstruction:
     seconds: float
     parameters: dict[str, float]
     maps: Mapping[str, NDArray] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
     screening: tuple[str, ...] = ()
 
     def without_light_field(self) -> Reconstruction:

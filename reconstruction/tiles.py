@@ -396,14 +396,12 @@ def solve_block(
     noise_sigma: float,
     usable: NDArray[np.bool_],
     block: Block,
-    size: tuple[int, int],
     settings: MethodSettings,
     dictionary: Dictionary | None = None,
 ) -> SolvedBlock:
     """Return a block's part. psi, frames, usable: of its outer place, after the survey's steps.
 
-    size: of the whole light field. settings: as the survey settled them. A block without usable
-    pixels is black.
+    settings: as the survey settled them. A block without usable pixels is black.
     """
     if not usable.any():
         views = psi.light_field_shape[:2]
@@ -452,7 +450,6 @@ def summed_up(
         objective=(),
         seconds=seconds,
         parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},
-        left_out=tuple(in_few_words([one.left_out for one in solved], count)),
         screening=survey.words,
     )
 
@@ -515,7 +512,7 @@ def reconstruct_in_blocks(
         seen = pixels_of(block.outer, psi.binning)
         solved = solve_block(
             name, psi.window(*block.outer), frames[seen], noise_sigma, usable[seen], block,
-            psi.size, survey.settings, dictionary,
+            survey.settings, dictionary,
         )  # fmt: skip
         parts[block.name] = solved.arrays
         results.append(solved.result)

@@ -155,8 +155,6 @@ def _say_result(metrics: dict, request: Request) -> None:
 
     for line in metrics["screening"]:
         say("screening", line)
-    for line in metrics.get("left_out", ()):
-        say("not modelled", line, "cyan")
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]

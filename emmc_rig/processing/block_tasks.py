@@ -195,8 +195,7 @@ def block_task(task: BlockTask) -> None:
             "fingerprint": task.job.fingerprint,
             "sha256": _write_arrays(task.path("h5"), solved.arrays),
             "result": {
-                key: getattr(result, key)
-                for key in ("status", "advice", "steps", "parameters", "left_out")
+                key: getattr(result, key) for key in ("status", "advice", "steps", "parameters")
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
             "variance": _variance(task.block, solved.arrays),
@@ -219,7 +218,7 @@ def _solved(task: BlockTask) -> SolvedBlock:
     readings, usable = task.survey.applied(*job.frames(pixels_of(block.outer, job.psi.binning)))
     return solve_block(
         job.method, job.psi.window(*block.outer), readings, job.noise_sigma, usable, block,
-        job.psi.size, task.survey.settings, job.opened_dictionary(),
+        task.survey.settings, job.opened_dictionary(),
     )  # fmt: skip
 
 
@@ -238,7 +237,7 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     kept = _read_json(task.path("json"), task.job.fingerprint)
     if kept is None or kept["sha256"] != _sha256(task.path("h5")):
         return None
-    figures = {**kept["result"], "left_out": tuple(kept["result"]["left_out"])}
+    figures = kept["result"]
     figures["status"] = Status(figures["status"])
     result = Reconstruction(
         method=task.job.method,

@@ -69,14 +69,6 @@ def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
     return replace(designed_placement(camera), blur_um=0.1 * mask.cell_um)
 
 
-def parametric_plan(camera: Camera, mask: ShadowMask, light: Light, target: float) -> PlannedFrames:
-    """Return the whiteboards for the parametric route."""
-    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
-    kinds = [Kind(None, stage) for stage in stages]
-    kinds += [Kind((v, u)) for v, u in np.ndindex(camera.views)]
-    return plan_parametric(mask, soft_design(camera, mask), kinds, light, target)
-
-
 def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
     through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}

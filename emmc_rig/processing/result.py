@@ -52,7 +52,6 @@ def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[st
         "method": solved.method,
         "status": solved.status,
         "advice": solved.advice,
-        "left_out": list(solved.left_out),
         "screening": list(solved.screening),
         "verdict": verdict.as_dict(),
         "steps": solved.steps,
