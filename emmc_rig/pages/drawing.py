@@ -7,11 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -96,15 +93,6 @@ def save_publication(figure: Figure, path: Path, about: str) -> None:
     }
     with matplotlib.rc_context(FONTS):
         figure.savefig(path, metadata=metadata[path.suffix], dpi=PUBLICATION_DPI)
-
-
-def webp_of(figure: Figure) -> bytes:
-    """Return a figure with photographs as a picture for a page, a tenth of a PNG."""
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(PAGE_DPI)
-    canvas.draw()
-    codes = np.asarray(canvas.buffer_rgba())[..., 2::-1]
-    return cv2.imencode(".webp", codes, [cv2.IMWRITE_WEBP_QUALITY, 85])[1].tobytes()
 
 
 def save_svg(figure: Figure, path: Path) -> Path:
