@@ -531,6 +531,7 @@ def resident_bytes():
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
 
 
+@pytest.mark.slow
 def test_a_thousand_shots_with_faults_in_one_operation_in_twenty_complete():
     text = """
 camera: rgbw-bayer-1shot

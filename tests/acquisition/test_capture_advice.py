@@ -852,6 +852,7 @@ def test_every_text_has_a_walk_and_every_walk_its_text():
     assert set(known) - used == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", WALKS)
 def test_advice_carried_out_ends_in_a_complete_session(bench, text):
     steps = WALKS[text](bench)

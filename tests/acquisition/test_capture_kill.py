@@ -64,6 +64,7 @@ def check(killed, memory_folder, kind, numbers, expected):
         shutil.rmtree(folder)
 
 
+@pytest.mark.slow
 def test_a_capture_killed_at_any_step_is_made_whole(killed, memory_folder, undisturbed):
     code, steps = killed("step", 0, memory_folder / "all-steps")
     assert code == 0
@@ -71,6 +72,7 @@ def test_a_capture_killed_at_any_step_is_made_whole(killed, memory_folder, undis
     check(killed, memory_folder, "step", range(1, steps + 1), undisturbed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", range(CHUNKS))
 def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
     killed, memory_folder, undisturbed, chunk
@@ -82,6 +84,7 @@ def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
     check(killed, memory_folder, "line", chosen.tolist(), undisturbed)
 
 
+@pytest.mark.slow
 def test_a_capture_killed_again_and_again_is_made_whole(killed, memory_folder, undisturbed):
     rng = np.random.default_rng(5)
     folder = memory_folder / "again"

@@ -203,6 +203,7 @@ def test_less_light_than_metering_asks_for_is_reported_with_its_true_cost_in_noi
     assert f"{10 * np.log10(0.7 / level):.1f} dB" in reason.what
 
 
+@pytest.mark.slow
 def test_more_light_is_expected_to_gain_and_the_more_of_it_the_more():
     camera = emmc.camera("rgbw-bayer-2shots")
     scene = emmc.scene("near-planar", size=(32, 40))

@@ -222,6 +222,7 @@ def test_a_trigger_that_cannot_be_is_refused_in_one_line_when_the_rig_is_opened(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "camera", "said"),
     [

@@ -137,13 +137,13 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
 def test_its_page_shows_what_was_decided_and_when(every):
     page = sheet(Session(every))
     assert "Shots: what they gave" in page
-    assert "reconstruct, choose the next shot" in page
-    assert "decision: reconstruct" in page
+    assert "dB stated, " in page
     metrics = json.loads((every / "metrics.json").read_text())
     assert metrics["decided"][0]["shots"] == [0]
     assert metrics["spared"] == 0
 
 
+@pytest.mark.slow
 def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enough, tmp_path):
     code, _, err = program("calibrate", enough, "--out", tmp_path / "c")
     assert code == 0, err
@@ -174,6 +174,7 @@ def test_every_next_shot_is_the_one_expected_to_help_most(every):
         assert one["expected_db"][str(one["next"])] > one["stated_db"]
 
 
+@pytest.mark.slow
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(enough, copy)
@@ -191,6 +192,7 @@ def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, t
     assert any(kind == "until" and "70 dB" in line for kind, line in events(again))
 
 
+@pytest.mark.slow
 def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(every, tmp_path):
     """What a kill leaves: a journal up to a line, and perhaps a file that no line tells of."""
     whole = (every / JOURNAL).read_bytes().splitlines(keepends=True)

@@ -141,12 +141,14 @@ def conform(installed, *arguments, answer=""):
     )
 
 
+@pytest.mark.slow
 def test_a_plug_in_that_behaves_conforms(installed):
     done = conform(installed, "example-simulated:", answer="y\n")
     assert done.returncode == 0, done.stdout
     assert "11 passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_stage_that_reads_to_be_elsewhere_does_not_conform(installed):
     done = conform(installed, "liar:", "--yes")
     assert done.returncode == 1

@@ -90,6 +90,7 @@ def left_px(found, drift, size=SIZE):
     return displacement_px(shadow_mask(CAMERA, size), placed(), values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drift", "kind"),
     [
@@ -112,6 +113,7 @@ def test_a_drift_is_reported_with_its_kind_and_mended_from_one_shot(drift, kind)
         assert abs(found.values[name] - truth) < 6 * found.deviations[name] + 1e-4 * abs(truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["deep-occlusions", "non-lambertian"])
 def test_a_psi_that_fits_raises_no_alarm(scene):
     found = found_for((0.0,) * 5, scene=scene, seed=5)
@@ -120,12 +122,14 @@ def test_a_psi_that_fits_raises_no_alarm(scene):
     assert found.words.startswith("Psi still fits the captures (searched: shifts up to 8 pixels")
 
 
+@pytest.mark.slow
 def test_a_colour_filter_that_leaks_is_no_move_of_the_mask():
     found = found_for((0.0,) * 5, sensor=SensorFlaws(crosstalk=0.05))
     assert not found.drifted
     assert found.values["crosstalk"] == pytest.approx(0.05, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "size"), [((("cfa", "mono"),), SIZE), ((("binning", 2),), (128, 160))]
 )
@@ -137,6 +141,7 @@ def test_sensors_that_see_all_colours_or_bin_their_pixels_are_taken_as_well(kind
     assert left_px(found, drift, size) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drift", "words"),
     [
@@ -151,6 +156,7 @@ def test_a_mask_beyond_what_is_searched_is_refused_and_not_repaired(drift, words
     assert "shifts up to 8 pixels, turns up to 2 degrees, scales up to 3%" in found.words
 
 
+@pytest.mark.slow
 def test_a_darker_second_shot_is_reported_as_brightness_and_not_as_a_move():
     found = found_for((0.0,) * 5, shots=2, gains=(1.0, 0.93))
     assert found.values["brightness_2"] == pytest.approx(-0.07, abs=0.01)

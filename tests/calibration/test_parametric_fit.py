@@ -129,6 +129,7 @@ def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
     return boards
 
 
+@pytest.mark.slow
 def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
     mask = shadow_mask(CAMERA, SIZE)
     truth = replace(
@@ -152,6 +153,7 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
     assert np.all(stated[reported] < 2 * bound[reported])
 
 
+@pytest.mark.slow
 def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(design):
     mask = shadow_mask(CAMERA, SIZE)
     truth = replace(designed_placement(CAMERA), blur_um=3.0, leak=0.02)

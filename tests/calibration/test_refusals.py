@@ -200,6 +200,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 def test_whiteboards_that_give_no_psi_are_refused_for_what_they_are(name):
     changes, words = BAD[name]

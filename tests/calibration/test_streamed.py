@@ -25,6 +25,7 @@ def session(tmp_path_factory):
     return emmc.capture(folder / PLAN, rig, out=folder / "session")
 
 
+@pytest.mark.slow
 def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
     whole = emmc.calibrate(session, "free")
     whole.save(tmp_path / "whole")

@@ -64,6 +64,7 @@ def taken():
     return scene, psi, camera.expose(scene, seed=0, psi=psi)
 
 
+@pytest.mark.slow
 def test_the_snippet_of_the_documentation_runs_as_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The simulated rig's default, smaller: the snippet names no size.
@@ -84,6 +85,7 @@ def test_the_snippet_of_the_documentation_runs_as_it_is(tmp_path, monkeypatch):
     assert (session.folder / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
@@ -123,6 +125,7 @@ def test_an_array_for_a_psi_of_no_known_camera_needs_its_noise(taken):
         emmc.reconstruct(psi, frames.readings[:, :-2])
 
 
+@pytest.mark.slow
 def test_frames_are_arrays_to_numpy(taken):
     scene, psi, frames = taken
     np.testing.assert_array_equal(np.asarray(frames), frames.readings)
@@ -178,6 +181,7 @@ def test_public_names_are_functions_and_classes_and_no_folder_is_called_as_one()
         _ = emmc.recontruct
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "unwanted"),
     [

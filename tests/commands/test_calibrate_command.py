@@ -53,6 +53,7 @@ def camera_file(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_calibrate_writes_psi_its_uncertainty_and_a_page(run, camera_file, tmp_path):
     out = tmp_path / "result"
     code, said, _ = run("calibrate", "--camera", camera_file, *SIZE, "--out", out)
@@ -115,6 +116,7 @@ def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
     assert not out.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaws", [(ORDINARY,), (TOGETHER,)])
 def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_the_bench(
     camera_file, flaws
@@ -139,6 +141,7 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
             assert named in found
 
 
+@pytest.mark.slow
 def test_the_stage_is_mapped_and_shown(camera_file, tmp_path):
     settings = CalibrateSettings(
         "small", find_camera(str(camera_file)), (32, 40), rays=64, map_stage=True
@@ -213,6 +216,7 @@ def frames_of(folder, camera, truth):
     return folder
 
 
+@pytest.mark.slow
 def test_that_the_mask_has_moved_is_reported_and_psi_mended(calibrated, tmp_path):
     known, camera, truth = calibrated
     moved = moved_truth(truth, 9.0, -8.0)
@@ -231,6 +235,7 @@ def test_that_the_mask_has_moved_is_reported_and_psi_mended(calibrated, tmp_path
     assert true_error(after, true, good) < 0.3 * true_error(before, true, good)
 
 
+@pytest.mark.slow
 def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_written(
     run, calibrated, tmp_path
 ):

@@ -133,6 +133,7 @@ export_hdf5(Session(Path(sys.argv[1])), Path(sys.argv[2]),
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGKILL")
 def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, run, tmp_path):
     session, path = captured / "plan-session", tmp_path / "x.h5"
@@ -192,6 +193,7 @@ def test_the_report_opens_offline_and_shows_frames_and_times(captured):
     assert "{{" not in page
 
 
+@pytest.mark.slow
 def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
     settings = tmp_path / "s.yaml"
     settings.write_text("tv: {max_steps: 3}")
@@ -475,6 +477,7 @@ def started_capture(folder):
     return process
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent")
 @pytest.mark.parametrize(
     ("signals", "line"),

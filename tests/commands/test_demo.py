@@ -71,6 +71,7 @@ def test_the_metrics_are_those_of_the_light_field_written(demo):
     assert {"scene", "camera", "shots", "ssim", "seconds", "versions", "seed"} <= set(written)
 
 
+@pytest.mark.slow
 def test_another_command_compares_with_the_scene_as_the_demo_did(demo):
     folder, metrics, _ = demo
     opened = open_export(str(folder), metrics["scene"])
@@ -95,6 +96,7 @@ def test_the_watcher_sees_every_stage_and_exposure(demo):
     assert watcher.steps > metrics["whiteboard_frames"] + metrics["shots"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result_and_another_another(tmp_path):
     def run(seed, folder):
         folder.mkdir()
@@ -111,6 +113,7 @@ def test_the_same_seed_gives_the_same_result_and_another_another(tmp_path):
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["rgbw-mono", "scenario-i-rgb", "coded-aperture-sequential-random", "learned-aperture"]
 )
@@ -128,6 +131,7 @@ def test_every_kind_of_sensor_and_mask_runs_the_loop(tmp_path, name):
     assert (tmp_path / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_binned_pixels_run_the_loop(tmp_path):
     camera = find_camera("rgbw-bayer-3shots")
     binned = camera.model_copy(update={"sensor": camera.sensor.model_copy(update={"binning": 2})})
@@ -143,6 +147,7 @@ def test_binned_pixels_run_the_loop(tmp_path):
     assert metrics["psnr_db"] > 10
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 @pytest.mark.parametrize("scene", ["buttercup", "antinous"])
 def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path, scene):
@@ -152,6 +157,7 @@ def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path,
     assert metrics["psnr_db"] > metrics["replicate_psnr_db"] + 1
 
 
+@pytest.mark.slow
 def test_the_loop_reconstructs_with_a_dictionary(tmp_path):
     name = "rgbw-bayer-2shots"
     settings = DemoSettings(

@@ -79,6 +79,7 @@ def test_a_simulated_stage_is_shown_homed_and_jogged(run, rig):
     assert abs(float(out.split()[2]) - place) < 1.0
 
 
+@pytest.mark.slow
 def test_a_real_port_works_alike(run):
     with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK, (1, 2): QUICK})) as server:
         stage = f"zaber:{server.port},microstep_um=0.047625"
@@ -111,6 +112,7 @@ def test_names_are_wired_to_axes_in_a_file(run, tmp_path):
         assert (code, "choose 110 to 900 um" in one_line(err)) == (1, True)
 
 
+@pytest.mark.slow
 def test_apt_axes_may_be_on_ports_of_their_own(tmp_path):
     spec = replace(Z825, max_speed_um_s=50_000.0, acceleration_um_s2=1e6, start_um=150.0)
     first, second = (AptController(SYSTEM_CLOCK, {0x50: spec}) for _ in range(2))
@@ -139,6 +141,7 @@ def test_the_rigs_own_chain_gets_the_rigs_own_names():
         assert stage.axes == ("mask_x", "mask_y", "aperture_x", "aperture_y")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("protocol", "firmware", "reported"),
     [
@@ -260,6 +263,7 @@ def fresh_grbl(clock=SYSTEM_CLOCK):
     return device, lambda: travel_um - device.position_um("X"), distance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("protocol", "make", "number"),
     [
@@ -306,6 +310,7 @@ def test_a_stage_that_vanishes_in_a_move_is_an_error_that_says_it_could_not_be_s
     assert "could not be stopped" in one_line(err)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wire", [[], ["--tcp", "127.0.0.1:0"]])
 def test_a_simulated_stage_is_served_to_other_programs(wire, tmp_path):
     command = [*PROGRAM, "serve", "zaber", *wire]
@@ -337,11 +342,12 @@ def test_every_test_that_the_page_about_devices_names_exists():
     root = Path(__file__).parents[2]
     named = set(re.findall(r"`(test_\w+)`", (root / "docs/devices.md").read_text()))
     places = (root / "tests", root / "emmc_rig/conformance")
-    written = "".join(path.read_text() for place in places for path in place.glob("*.py"))
+    written = "".join(path.read_text() for place in places for path in place.rglob("*.py"))
     assert len(named) > 10
     assert [name for name in sorted(named) if f"def {name}(" not in written] == []
 
 
+@pytest.mark.slow
 def test_list_and_probe_know_the_simulated_rig(run):
     code, listed, _ = run("list", "--rig", "simulated")
     assert code == 0
@@ -362,6 +368,7 @@ def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
     assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320
 
 
+@pytest.mark.slow
 def test_a_request_to_end_serving_is_not_called_ctrl_c():
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
     command = [*PROGRAM, "serve", "zaber"]

@@ -58,6 +58,7 @@ ALL = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 DOCUMENTS = [document for document in ALL if any(found for _, found in blocks(document))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_command_of_the_documentation_is_one_of_the_program(document):
     for why, found in blocks(document):
@@ -101,6 +102,7 @@ def _fitted_once():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small", "_fitted_once")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_block_of_the_documentation_runs_and_loses_nothing(document):

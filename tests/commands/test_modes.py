@@ -45,6 +45,7 @@ def test_every_option_that_measures_something_instead_is_a_mode(command):
     assert instead <= set(MODES.get(command, {}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", MODES)
 def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

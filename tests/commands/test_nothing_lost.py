@@ -157,6 +157,7 @@ def called(typed, *more):
     return code, err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("typed", WRITERS)
 def test_nothing_is_lost_wherever_out_leads(world, monkeypatch, typed):
     monkeypatch.chdir(world)
@@ -217,6 +218,7 @@ AT_ONCE = {"capture --new", "devices scale", "devices serve"}
 """Done at once, shown by what they print; `devices scale` is given no stage here."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed not in AT_ONCE])
 def test_every_command_states_its_stage_before_its_work_begins(world, tmp_path, monkeypatch, typed):
     """The first event of --json is a stage; there the test stops it."""

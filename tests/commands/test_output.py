@@ -61,6 +61,7 @@ def test_every_command_takes_json():
         assert "--json" in [name for one in command.params for name in one.opts], command.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RESULTS)
 def test_with_json_every_line_is_an_event_and_the_last_one_the_result(folder, monkeypatch, name):
     monkeypatch.chdir(folder)

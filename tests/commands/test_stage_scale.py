@@ -254,6 +254,7 @@ def quick_port():
         yield server.port
 
 
+@pytest.mark.slow
 def test_the_command_asks_then_measures_and_writes_a_file_that_opens_the_stage(
     run, quick_port, monkeypatch, tmp_path
 ):

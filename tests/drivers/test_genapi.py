@@ -417,6 +417,7 @@ def _combine(inner):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.peers
 def test_formulas_have_the_value_that_emvas_library_gives_them():
     genapi = pytest.importorskip("genicam.genapi")
@@ -509,6 +510,7 @@ def compared(genapi, node, ours, name):
         yield "no value there", True
 
 
+@pytest.mark.slow
 @pytest.mark.peers
 def test_descriptions_of_real_cameras_read_as_in_emvas_library(peer_files):
     """Values, availability, access and limits of some nodes of every fourth one, on empty memory.
@@ -554,6 +556,7 @@ def damaged_xml(random):
     return bytes(raw)
 
 
+@pytest.mark.slow
 def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors(request):
     cases = request.config.getoption("--fuzz-cases")
     names = ("Width", "ExposureTime", "Gain", "PixelFormat", "AcquisitionStart", "BlackLevel")

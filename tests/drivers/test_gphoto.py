@@ -113,6 +113,7 @@ def test_a_frame_is_what_the_sensor_reads(camera):
     assert camera.identity.model == "EMMC simulated camera"
 
 
+@pytest.mark.slow
 def test_a_second_session_exposes_as_the_first_did(address):
     for _ in range(2):
         with closing(GphotoCamera(address)) as camera:
@@ -121,6 +122,7 @@ def test_a_second_session_exposes_as_the_first_did(address):
                 assert camera.snap().exposure_s == pytest.approx(exposure_s, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_gain_is_the_iso_over_the_lowest(camera):
     camera.set_gain(4.0)
     frame = camera.snap()
@@ -140,6 +142,7 @@ def test_settings_are_set_by_libgphoto2s_names_and_all_are_listed(address):
         GphotoCamera(address, settings={"no_such": 1})
 
 
+@pytest.mark.slow
 def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
     with served(eos="new", hidden=()) as (name, _), closing(GphotoCamera(name)) as camera:
         # It lists the shutter twice, first by the standard's property, whose value is no choice.
@@ -161,6 +164,7 @@ def test_a_camera_without_any_settings_is_refused_in_one_line():
             GphotoCamera(name, settings={"iso": 100})
 
 
+@pytest.mark.slow
 def test_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
     with served("raw+jpeg") as (name, known), closing(GphotoCamera(name, delete=True)) as camera:
         for _ in range(2):
@@ -175,6 +179,7 @@ EOS_CONTROLS = {*EosOperation} - {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("age", ["new", "old"])
 def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_makes(age):
     with served(eos=age) as (name, known):
@@ -199,6 +204,7 @@ def test_libgphoto2_sets_and_releases_our_eos_by_the_requests_that_our_driver_ma
     assert theirs == [one for one in ours if one[0] in EOS_CONTROLS]
 
 
+@pytest.mark.slow
 def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(tmp_path):
     program = (
         "import sys; from drivers.gphoto import GphotoCamera; camera = GphotoCamera(sys.argv[1]);"
@@ -221,6 +227,7 @@ def take(camera):
     assert camera.exposure_s == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_a_camera_set_to_jpeg_is_refused():
     with (
         served("jpeg") as (name, _),
@@ -230,6 +237,7 @@ def test_a_camera_set_to_jpeg_is_refused():
         camera.snap()
 
 
+@pytest.mark.slow
 def test_a_torn_file_is_no_frame_and_the_next_one_is():
     with served(faults=["torn_raw"]) as (name, known), closing(GphotoCamera(name)) as camera:
         with pytest.raises(RawFrameError, match="torn"):
@@ -253,6 +261,7 @@ def test_a_closed_camera_takes_no_setting(address):
         camera.set_exposure_s(0.008)
 
 
+@pytest.mark.slow
 def test_a_short_name_and_a_file_open_it(address, tmp_path):
     with closing(open_camera(f"gphoto2:{address}")) as camera:
         assert camera.shape == (40, 48)

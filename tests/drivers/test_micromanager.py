@@ -77,6 +77,7 @@ def camera():
         yield opened
 
 
+@pytest.mark.slow
 def test_the_suite_finds_that_the_demo_stage_only_says_that_it_was_homed(tmp_path):
     file = tmp_path / "stage.yaml"
     file.write_text(

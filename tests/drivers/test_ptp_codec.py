@@ -112,6 +112,7 @@ def test_a_property_without_a_form_can_be_what_it_is():
     assert codec.limits(described(), frozenset()) == (100, 100)
 
 
+@pytest.mark.slow
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=120))
 def test_any_text_comes_back(text):
     assert codec.decode_value(codec.TEXT, codec.encode_value(codec.TEXT, text)) == text

@@ -119,6 +119,7 @@ def damage(data, seed):
     return bytes(damaged)
 
 
+@pytest.mark.slow
 def test_decoders_read_any_bytes_or_refuse_them_in_one_line(fuzz):
     def check(data, sample, seed):
         for decode in DECODERS:
@@ -129,6 +130,7 @@ def test_decoders_read_any_bytes_or_refuse_them_in_one_line(fuzz):
     fuzz(check, st.binary(max_size=200), st.sampled_from(SAMPLES), st.integers(0, 2**32))
 
 
+@pytest.mark.slow
 def test_values_of_any_type_are_read_or_refused(fuzz):
     def check(data_type, data):
         with suppress(DriverError):
@@ -150,6 +152,7 @@ def check_raw(seed):
         assert (frame.white_level_dn, frame.cfa[:4]) == (white, phase[:4])
 
 
+@pytest.mark.slow
 def test_a_damaged_raw_file_is_refused_in_one_line_or_read_as_libraw_reads_it(fuzz):
     fuzz(check_raw, st.integers(0, 2**63))
 
@@ -237,6 +240,7 @@ class HostileFunction(PtpUsbFunction):
         return super().control(request_type, request, value, index, data)
 
 
+@pytest.mark.slow
 def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time(fuzz):
     outcomes = {"case": 0, "success": 0}
 
@@ -302,6 +306,7 @@ class SplittingFunction(PtpUsbFunction):
         return piece
 
 
+@pytest.mark.slow
 def test_however_an_honest_camera_cuts_its_answers_they_arrive(fuzz):
     def check(seed):
         clock = ManualClock()

@@ -215,6 +215,7 @@ def initiator(server, home, *shutters):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sessions",
     [

@@ -106,6 +106,7 @@ def test_events_of_a_session_that_left_are_not_given_to_the_next(server):
         events.read()
 
 
+@pytest.mark.slow
 def test_a_second_initiator_hears_that_the_camera_is_busy(server):
     command, number = connect(server)
     second = Connection(server, ptpip.INIT_COMMAND, bytes(16) + b"t\0\0\0")

@@ -235,6 +235,7 @@ def test_a_move_whose_bytes_were_lost_never_counts_as_arrived(simulated):
         assert simulated.true_um(axis) == pytest.approx(target_um, abs=TOLERANCE_UM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["drop_reply", "drop_command", "garble_reply"])
 def test_a_device_that_never_answers_well_is_an_error_within_its_time_limit(simulated, fault):
     stage = simulated.make_stage()

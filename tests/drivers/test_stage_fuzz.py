@@ -113,6 +113,7 @@ def edited(message, edits):
     return bytes(data)
 
 
+@pytest.mark.slow
 def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum(cases):
     accepted = []
 
@@ -132,6 +133,7 @@ def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum(cases):
     assert accepted
 
 
+@pytest.mark.slow
 def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
     accepted = []
 
@@ -151,6 +153,7 @@ def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
     assert any(isinstance(message, grbl_codec.Status) for message in accepted)
 
 
+@pytest.mark.slow
 def test_no_bytes_make_the_apt_codec_fail_and_what_it_reads_it_writes_again(cases):
     accepted = []
 
@@ -318,6 +321,7 @@ DRIVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", DRIVERS)
 def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_read(
     protocol, cases

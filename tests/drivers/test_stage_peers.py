@@ -54,6 +54,7 @@ def zaber_peer(wire):
         yield chain, connection.detect_devices(identify_devices=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wire", ["pty", "tcp"])
 def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
     with zaber_peer(wire) as (chain, devices):
@@ -93,6 +94,7 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
         assert "WR" in axis.warnings.get_flags()
 
 
+@pytest.mark.slow
 def test_zaber_motion_follows_moves_by_alerts():
     with zaber_peer("pty") as (chain, devices):
         devices[0].connection.enable_alerts()
@@ -104,6 +106,7 @@ def test_zaber_motion_follows_moves_by_alerts():
             assert chain.position_um(2, 1) == pytest.approx(target * QUICK.microstep_um, abs=3.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wire", [PtyServer, TcpServer])
 def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
@@ -128,6 +131,7 @@ def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
             before = float(target)
 
 
+@pytest.mark.slow
 def test_zaber_motion_lets_an_output_rise_when_the_axis_arrives():
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
     chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
@@ -154,6 +158,7 @@ def apt_controller():
     return AptController(SYSTEM_CLOCK, {apt_codec.USB_UNIT: spec})
 
 
+@pytest.mark.slow
 @EARLY_READER
 @pytest.mark.parametrize("model", ["kdc101.KDC101", "tdc001.TDC001"])
 def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
@@ -190,6 +195,7 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
             peer._thread.join()
 
 
+@pytest.mark.slow
 @EARLY_READER
 def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_controller):
     devices = pytest.importorskip("thorlabs_apt_device", reason="needs the extra `peers`")
@@ -280,6 +286,7 @@ def test_an_independent_apt_codec_reads_what_the_firmware_and_ours_write():
     assert third.msg == "mot_move_homed"
 
 
+@pytest.mark.slow
 def test_grbl_streamer_homes_streams_and_is_alarmed():
     streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
     quick = replace(
@@ -317,6 +324,7 @@ def test_grbl_streamer_homes_streams_and_is_alarmed():
             peer.disconnect()
 
 
+@pytest.mark.slow
 def test_grbl_streamer_streams_again_in_a_second_session():
     streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
     quick = replace(

@@ -698,6 +698,7 @@ class Noise(U3vCameraSimulator):
         return self._mangled(super().bulk_in(endpoint, length, timeout_s))
 
 
+@pytest.mark.slow
 def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(request, caplog):
     caplog.set_level("CRITICAL")
     cases = request.config.getoption("--fuzz-cases")
@@ -753,6 +754,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
     check()
 
 
+@pytest.mark.slow
 def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(request):
     cases = request.config.getoption("--fuzz-cases")
     original = Bench(MOSAIC[:4, :6].copy()).open().snap().original

@@ -54,6 +54,7 @@ def peer():
     return run
 
 
+@pytest.mark.slow
 def test_aravis_takes_exact_frames_from_the_simulated_camera_through_libusb(peer):
     seen = peer("aravis")
     assert seen["faults"] == []
@@ -75,6 +76,7 @@ def test_aravis_takes_exact_frames_from_the_simulated_camera_through_libusb(peer
         assert len({frame["block"] for frame in frames}) == len(frames)
 
 
+@pytest.mark.slow
 def test_our_driver_takes_exact_frames_through_libusb(peer):
     seen = peer("driver")
     assert seen["faults"] == []
@@ -84,6 +86,7 @@ def test_our_driver_takes_exact_frames_through_libusb(peer):
     assert not seen["streaming"]
 
 
+@pytest.mark.slow
 def test_aravis_fake_camera_reads_the_same_through_our_features(peer):
     seen = peer("fake")
     for name, ours, theirs in seen["read"] + seen["written"] + seen["limits"]:
@@ -93,6 +96,7 @@ def test_aravis_fake_camera_reads_the_same_through_our_features(peer):
     assert written["PixelFormat"] == "Mono16"
 
 
+@pytest.mark.slow
 def test_our_pixel_format_codes_are_those_of_aravis(peer):
     theirs = {
         name.removeprefix("PIXEL_FORMAT_").replace("_", "").lower(): code

@@ -553,6 +553,7 @@ def test_nothing_distinguishes_two_devices_with_one_address():
         find_devices(first.transport(), clock)
 
 
+@pytest.mark.slow
 def test_homing_is_given_time_for_its_own_slower_speed(make_bench):
     bench = make_bench({(1, 1): replace(SPEC, start_um=25_000.0)})
     bench.chain.feed(b"/1 1 set limit.approach.maxspeed 10000\n")

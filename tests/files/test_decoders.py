@@ -113,6 +113,7 @@ def decoder_calls(source):
     ]
 
 
+@pytest.mark.slow
 def test_no_module_but_the_guarded_ones_calls_a_decoder():
     found = []
     for package in ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators"):
@@ -249,6 +250,7 @@ def hdf5(path, shape, chunk, dtype, packed, filters):
 WHOLE = (3, 3, 1024, 2900, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "chunk", "dtype", "packed", "filters", "complaint"),
     [
@@ -309,6 +311,7 @@ def test_settings_that_are_no_settings_are_refused_at_once(tmp_path, text, compl
     assert (megabytes < 60, seconds < 2) == (True, True), (megabytes, seconds)
 
 
+@pytest.mark.slow
 def test_the_largest_file_of_settings_takes_moderate_memory(tmp_path):
     path = tmp_path / "mask.yaml"
     path.write_text("[" + "1," * 499_000 + "1]")
@@ -339,6 +342,7 @@ def mat(shape):
     return head + struct.pack("<II", 15, len(packed)) + packed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "make"),
     [
@@ -357,6 +361,7 @@ def test_decoders_without_a_limit_get_one(tmp_path, name, make):
     assert megabytes < 850, megabytes
 
 
+@pytest.mark.slow
 def test_a_zarr_group_without_its_shards_is_not_read_whole(tmp_path):
     zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
     group = zarr.create_group(tmp_path / "scene.zarr", zarr_format=3)
@@ -367,6 +372,7 @@ def test_a_zarr_group_without_its_shards_is_not_read_whole(tmp_path):
     assert megabytes < 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["png", "tif"])
 def test_a_view_whose_name_holds_another_number_is_named_at_once(tmp_path, ending):
     for name in ("view_0_0", "view_0_1", "view_99999_99999"):
@@ -379,6 +385,7 @@ def test_a_view_whose_name_holds_another_number_is_named_at_once(tmp_path, endin
     assert (megabytes < 300, seconds < 10) == (True, True), (megabytes, seconds)
 
 
+@pytest.mark.slow
 def test_a_folder_of_hci_that_claims_many_views_is_refused_at_once(tmp_path):
     (tmp_path / "input_Cam000.png").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
     (tmp_path / "parameters.cfg").write_text("[extrinsics]\nnum_cams_x=99999\nnum_cams_y=999\n")
@@ -396,6 +403,7 @@ SPECS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(SPECS),
     st.lists(

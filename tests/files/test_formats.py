@@ -64,6 +64,7 @@ def decoded_by_ffmpeg(path, form):
         return [frame.to_ndarray(format=form) for frame in stream.decode(video=0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KEPT)
 def test_what_is_written_comes_back_as_a_scene(written, export, name):
     folder = written(name)
@@ -133,6 +134,7 @@ def test_eslf_interleaves_the_views(written, export):
     )
 
 
+@pytest.mark.slow
 def test_ome_zarr_is_what_the_specification_says(written, export):
     folder = written("ome-zarr") / SCENES["ome-zarr"]
     attributes = json.loads((folder / ".zattrs").read_text())
@@ -207,6 +209,7 @@ DAMAGED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGED)
 @pytest.mark.parametrize("left", [0, 40])
 def test_a_damaged_file_is_one_clear_line(written, name, left):

@@ -156,6 +156,7 @@ def test_the_manifest_is_valid_and_names_functions_that_there_are():
     assert getattr(importlib.import_module(module), name) is get_reader
 
 
+@pytest.mark.slow
 def test_napari_opens_a_result_without_a_screen(result, scene):
     pytest.importorskip("napari", reason="extra `napari`")
     done = subprocess.run(
@@ -199,6 +200,7 @@ def pictured(canvas, size):
     return cv2.resize(cut.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA)
 
 
+@pytest.mark.slow
 def test_naparis_window_shows_views_refocus_psi_and_session_by_sliders(result, scene, tmp_path):
     pytest.importorskip("napari", reason="extra `napari`")
     pytest.importorskip("qtpy", reason="a window needs Qt: extra `napari`")

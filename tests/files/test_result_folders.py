@@ -215,6 +215,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [False, True], ids=["replacing", "first"])
 @pytest.mark.parametrize("kind", FAULTS)
 def test_whatever_ends_a_command_anywhere_the_folder_is_one_whole_result(

@@ -370,6 +370,7 @@ def test_the_truth_of_a_fine_built_in_scene_is_its_box_average():
     np.testing.assert_allclose(fine.scene.light_field, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "aperture_factor", "at_least_db"),
     [("near-planar", 2, 40), ("deep-occlusions", 1, 35)],

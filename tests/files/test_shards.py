@@ -44,6 +44,7 @@ def frames(tmp_path):
     return tmp_path / "frames"
 
 
+@pytest.mark.slow
 def test_shards_hold_what_the_file_holds_and_open_as_a_scene(frames, tmp_path, monkeypatch):
     zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
     monkeypatch.setattr(shards, "SHARD", 32)
@@ -64,6 +65,7 @@ def test_shards_hold_what_the_file_holds_and_open_as_a_scene(frames, tmp_path, m
     assert not (tmp_path / "sharded/light_field.h5").exists()
 
 
+@pytest.mark.slow
 def test_psi_in_shards_gives_the_bytes_of_psi_in_a_file(frames, tmp_path, monkeypatch):
     zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
     monkeypatch.setattr(psis, "SHARD", 32)

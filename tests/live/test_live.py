@@ -64,6 +64,7 @@ def test_a_red_scene_is_shown_red_whatever_the_colour_phase(cfa):
     assert max(blue, green) < 10
 
 
+@pytest.mark.slow
 def test_one_saturated_pixel_of_a_large_frame_is_seen():
     mosaic = np.full((1200, 1600), 1000)
     mosaic[601, 801] = WHITE
@@ -191,6 +192,7 @@ def test_a_camera_in_trouble_is_reported_and_asked_again(monkeypatch):
         until(watch, lambda state: not state["trouble"]["camera"])
 
 
+@pytest.mark.slow
 def test_no_frame_is_taken_when_nobody_looks(monkeypatch):
     monkeypatch.setattr(watch_module, "IDLE_S", 0.4)
     camera = FakeCamera()
@@ -532,6 +534,7 @@ def test_a_camera_that_cannot_break_off_says_how_long_it_takes(monkeypatch):
         until(watch, lambda state: state["settings"]["exposure_s"] == 0.01)
 
 
+@pytest.mark.slow
 def test_an_earlier_picture_is_not_judged_once_the_stage_has_moved():
     camera, stage = FakeCamera(), SlowStage()
     camera.light = 0.0
@@ -693,6 +696,7 @@ def program(*arguments):
     return [sys.executable, "-c", code, "live", *arguments]
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
     (tmp_path / "one").mkdir()
     command = program("--rig", "simulated", "--size", "32x48", "--scene", "near-planar")

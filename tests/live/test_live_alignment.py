@@ -65,6 +65,7 @@ def bench_frame(camera, target="whiteboard", exposure_s=0.05, lamp="white", **er
     return frame_of(bench.expose(exposure_s), camera.sensor.cfa_name, noise.white_level_dn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WITH_SHADOW)
 def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
     camera = CAMERAS[name]
@@ -104,6 +105,7 @@ def test_how_a_mask_repeats_follows_from_its_cells(cells, expected):
     np.testing.assert_allclose(sorted(found.steps_um), sorted(expected.steps_um), atol=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_um", [(11.0, -7.0), (60.0, -110.0), (170.0, 20.0)])
 def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
     camera = with_pattern(kind="tile", cells=RANDOM[:8, :8].tolist())
@@ -116,6 +118,7 @@ def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
     assert "repeats every" in place.ambiguity
 
 
+@pytest.mark.slow
 def test_where_stripes_stand_along_themselves_is_not_stated():
     camera = with_pattern(kind="tile", cells=STRIPES[:1, :8].tolist())
     place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=(11.0, -7.0)))
@@ -129,6 +132,7 @@ def test_cameras_whose_masks_throw_no_shadow_say_so(name):
         MaskGauge(CAMERAS[name], SIZE)
 
 
+@pytest.mark.slow
 def test_a_mask_turned_by_five_degrees_is_found_by_its_edges():
     camera = CAMERAS["rgbw-mono"]
     frame = bench_frame(camera, rotation_deg=-5.0)
@@ -136,6 +140,7 @@ def test_a_mask_turned_by_five_degrees_is_found_by_its_edges():
     assert place.rotation_deg == pytest.approx(5.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_mask_that_moved_on_is_followed_and_one_that_went_is_not_shown():
     camera = CAMERAS["rgbw-bayer-1shot"]
     frame = bench_frame(camera, rotation_deg=0.1)
@@ -148,6 +153,7 @@ def test_a_mask_that_moved_on_is_followed_and_one_that_went_is_not_shown():
         gauge.measure(frame_of(noise, "rggb"))
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters():
     camera = CAMERAS["rgbw-bayer-1shot"]
     gauge = MaskGauge(camera, SIZE)

@@ -47,6 +47,7 @@ def pictured(driver, name):
     driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
 
 
+@pytest.mark.slow
 def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
     plan = tmp_path / "plan.yaml"
     made = subprocess.run(

@@ -121,6 +121,7 @@ def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
     assert wanted.make()[:2] == b"\xff\xd8"
 
 
+@pytest.mark.slow
 def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     path = tmp_path / "plan.yaml"
     path.write_text(yaml.safe_dump({**PLAN, "whiteboards": {"repeats": 1, "references": 2}}))

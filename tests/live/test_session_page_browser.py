@@ -29,6 +29,7 @@ PLAN = {
 PATIENCE_S = 60
 
 
+@pytest.mark.slow
 def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text(yaml.safe_dump(PLAN))

@@ -52,6 +52,7 @@ def edit(file, old, new):
     file.write_text(text.replace(old, new))
 
 
+@pytest.mark.slow
 def test_a_helper_changed_in_another_file_changes_what_kernels_compute(copied, monkeypatch):
     before, kept, _ = run(copied)
     assert kept == 0
@@ -92,6 +93,7 @@ def test_a_constant_changed_in_a_file_imported_through_others_changes_the_state(
     assert Path(compiling.__file__).with_name("bands.py") in imported
 
 
+@pytest.mark.slow
 def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_code(copied):
     blocked = copied / "reconstruction/adaptive/__pycache__"
     blocked.mkdir(exist_ok=True)

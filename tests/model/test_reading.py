@@ -154,6 +154,7 @@ def settings_like(kind):
 KINDS = (Camera, Plan, MethodSettings, RealRig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_whatever_yaml_says_is_settings_or_one_line(kind):
     @fuzzed
@@ -253,6 +254,7 @@ def trees(draw):
     return bytes(content[: draw(st.integers(0, len(content)))] if draw(st.booleans()) else content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
 def test_whatever_tree_a_file_holds_it_is_read_or_refused_in_one_line(tmp_path, reader):
     read, error = READERS[reader]

@@ -349,6 +349,7 @@ def test_psi_is_shown_in_one_line(coded_psi, random_psi):
     assert "three colours a pixel" in repr(random_psi(stored=3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cfa", "binning", "shots"), [("rggb", 2, 2), ("mono", 1, 3)])
 def test_psi_in_double_precision_is_exact_to_double_precision(coded_camera, cfa, binning, shots):
     single = build_imaging_matrix(coded_camera("uniform_colour", cfa, binning, shots), SIZE)

@@ -34,6 +34,7 @@ def test_named_undoes_arranged(order: ViewOrder) -> None:
     assert not np.array_equal(order.arranged(array, axis=1), array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ViewOrder)
 @pytest.mark.parametrize("name", ["deep-occlusions", "non-lambertian", "dark", "wide-disparity"])
 def test_parallax_tells_the_order(name: str, order: ViewOrder) -> None:
@@ -91,6 +92,7 @@ def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.moveaxis(flow, -1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 @pytest.mark.filterwarnings("ignore::emmc_rig.model.errors.ViewOrderWarning")
 def test_real_views_move_along_their_rows_by_optical_flow() -> None:

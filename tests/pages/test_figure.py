@@ -114,6 +114,7 @@ def test_results_of_different_captures_are_refused(results):
         draw_results([results[0], other])
 
 
+@pytest.mark.slow
 def test_the_command_writes_vectors_with_their_fonts_and_the_caption_inside(tmp_path):
     out = tmp_path / "figure"
     typed = ["figure", "near-planar", "--at", "100,80", "--side", 20, "--out", out]

@@ -56,6 +56,7 @@ def capture():
     return psi, Frames(frames, np.full(frames.shape, 0.004), np.ones(frames.shape, bool))
 
 
+@pytest.mark.slow
 @pytest.mark.timing("compares two times")
 def test_the_time_of_a_window_predicts_that_of_the_whole(capture):
     psi, frames = capture
@@ -85,6 +86,7 @@ def test_the_window_keeps_pixels_whole(random_psi, monkeypatch, binning, size):
     assert readings[0, 0, 0] == (psi.frames_shape[1] - part.frames_shape[1]) // 2
 
 
+@pytest.mark.slow
 def test_reconstruct_chooses_by_the_time(run, tmp_path):
     scene = ("--scene", "dark", "--camera", "rgbw-bayer-1shot", "--size", "32x40")
     assert run("simulate", *scene)[0] == 0

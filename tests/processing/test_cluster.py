@@ -72,6 +72,7 @@ def test_a_cluster_that_is_not_there_is_reported_in_one_line(monkeypatch, tmp_pa
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
     frames = tmp_path / "frames"
@@ -90,6 +91,7 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
     assert there == here
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
     chosen = stability_settings(
@@ -120,6 +122,7 @@ def test_workers_of_another_version_are_refused(cluster, monkeypatch):
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
     cluster, monkeypatch, tmp_path
@@ -147,6 +150,7 @@ def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
     assert code == 0, err
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra `cluster`")

@@ -34,6 +34,7 @@ def test_as_many_workers_run_as_fit_beside_the_program():
         ceiling.workers(600 * MIB + 1)
 
 
+@pytest.mark.slow
 def test_a_task_needs_more_for_larger_blocks_halos_and_shots_and_never_less_than_the_survey():
     def need(shots, side, halo):
         psi: Any = SimpleNamespace(shape=(shots, 5, 5, 4000, 1, 3000), size=(4000, 3000))
@@ -44,6 +45,7 @@ def test_a_task_needs_more_for_larger_blocks_halos_and_shots_and_never_less_than
     assert need(1, 64, 8) == need(1, 32, 8) < need(2, 32, 8)
 
 
+@pytest.mark.slow
 @LINUX
 def test_a_task_that_needs_more_than_its_share_is_done_by_fewer_workers():
     pool = Processes(2, Ceiling(1200 * MIB, 0))
@@ -98,6 +100,7 @@ def children(process):
     return [int(one) for one in text.split()]
 
 
+@pytest.mark.slow
 @LINUX
 def test_the_ceiling_that_a_refusal_names_works_and_is_kept(tmp_path):
     frames = tmp_path / "frames"

@@ -72,6 +72,7 @@ def content(folder):
     return (folder / "light_field.h5").read_bytes()
 
 
+@pytest.mark.slow
 def test_results_are_byte_identical_in_any_order_and_for_any_tile(place):
     metrics = here(place, "backwards", Here(backwards=True))
     assert metrics["blocks"] == [2, 3]
@@ -87,6 +88,7 @@ def test_the_truth_and_the_verdict_cover_all_blocks(place):
     assert content(place / "compared") == content(place / "alone")
 
 
+@pytest.mark.slow
 def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
     (place / "wide.yaml").write_text(yaml.safe_dump({"blocks": {"whole": 1000, "side": 64}}))
     metrics = here(place, "stated", settings="wide.yaml", method="adaptive-fast")
@@ -99,6 +101,7 @@ def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
     assert json.loads((place / "alone/metrics.json").read_text())["stated_db"] is None
 
 
+@pytest.mark.slow
 def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others(place):
     (place / "bad").mkdir()
     code, out, _ = reconstructed(place, "all", "--workers", 2, frames=("frames", "bad", "others"))
@@ -111,6 +114,7 @@ def test_several_captures_share_processes_and_a_bad_one_does_not_stop_the_others
     assert not (place / "all/bad").exists()
 
 
+@pytest.mark.slow
 def test_a_capture_of_one_block_comes_out_as_without_workers(place):
     (place / "none.yaml").write_text(yaml.safe_dump({"tv": BLOCKS["tv"]}))
     here(place, "shared", settings="none.yaml", method="adaptive-fast")
@@ -155,6 +159,7 @@ def wait_for(condition, process, steps=6000):
     raise AssertionError("nothing happened")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
 def test_killed_at_any_time_the_same_command_goes_on_to_the_same_bytes(place):
     """Every run but the last of a result is killed; EMMC_KILLS says how many in all."""
@@ -211,6 +216,7 @@ def test_blocks_that_are_done_are_not_computed_again(place):
     assert not kept(place, "stopped").exists()
 
 
+@pytest.mark.slow
 def test_blocks_that_were_damaged_on_the_disk_are_computed_again(place):
     found = stopped_after(place, "damaged", 4)
     content_of = bytearray(found[0].with_suffix(".h5").read_bytes())
@@ -257,6 +263,7 @@ def test_a_block_that_fails_is_named_and_the_others_are_kept(place, monkeypatch)
     assert len(list(kept(place, "bad-block").glob("block-*.json"))) == 2
 
 
+@pytest.mark.slow
 def test_blocks_of_other_frames_are_not_taken(place):
     stopped_after(place, "changed", 4)
     here(place, "changed", frames="others")

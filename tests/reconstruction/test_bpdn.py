@@ -228,6 +228,7 @@ def test_the_inverse_is_that_of_the_gram_matrix_with_its_ridge(count):
         ridge_inverse(np.zeros((5, 20), np.float32), 0.0)
 
 
+@pytest.mark.slow
 def test_matching_pursuit_agrees_with_scikit_learn():
     linear_model = pytest.importorskip("sklearn.linear_model", exc_type=ImportError)
     atoms, data, _ = problem(300, 45, sparsity=12)

@@ -278,6 +278,7 @@ def test_planes_are_one_pixel_apart_in_the_outermost_view():
     assert plane_disparities((5, 5), (1, 1)) == (0,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("views", "patch"), [((2, 2), (4, 6)), ((7, 7), (8, 8)), ((9, 9), (3, 3))])
 def test_the_defaults_fit_any_views_and_patch(views, patch):
     for make in (dct_dictionary, lambertian_dictionary):

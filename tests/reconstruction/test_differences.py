@@ -91,6 +91,7 @@ def test_an_order_that_fits_nowhere_or_is_none_is_refused():
         multi_indices(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_dv_k_of_a_polynomial_of_lower_degree_is_zero(order):
     """DV_2 of an affine light field is 0, up to its borders: stencils do not look beyond them."""

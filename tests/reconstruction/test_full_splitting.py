@@ -45,6 +45,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "cfa", "binning", "shots", "views", "patched", "mu", "gamma", "primal_step"), CASES
 )
@@ -195,6 +196,7 @@ def test_frames_and_settings_that_make_no_sense_are_refused(coded_psi):
         assert "\n" not in str(fault.value)
 
 
+@pytest.mark.slow
 def test_not_converging_is_a_status_with_advice(coded_psi):
     psi = coded_psi()
     frames = np.full(psi.frames_shape, 0.3, np.float32)

@@ -62,6 +62,7 @@ USED = textwrap.dedent("""
 """)
 
 
+@pytest.mark.slow
 def test_another_package_offers_a_method_by_one_module_with_settings_of_its_own(tmp_path):
     (tmp_path / "mean_picture.py").write_text(MEAN_PICTURE, encoding="utf-8")
     installed = tmp_path / "mean_picture-1.dist-info"

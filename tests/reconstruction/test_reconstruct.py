@@ -107,6 +107,7 @@ def test_a_misspelt_method_is_reported_first(tmp_path):
         reconstruct_folder(tmp_path, tmp_path, "tvv")
 
 
+@pytest.mark.slow
 def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames, tmp_path):
     settings = load_settings(None).model_copy(
         update={"adaptive": AdaptiveSettings(texture=TextureSettings(steps=3, refine_steps=1))}

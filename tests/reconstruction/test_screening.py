@@ -142,6 +142,7 @@ def test_screening_mends_what_would_break_a_method(name, strength, least_db):
     assert reported[1] == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
 def test_screening_costs_good_frames_next_to_nothing(method):
     one = made("flicker", 0)

@@ -200,6 +200,7 @@ def test_a_shipped_camera_reconstructs_with_a_dictionary(random_psi, scene):
     assert psnr_db(result.light_field, truth) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, one in METHODS.items() if one.package is None])
 def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
     dictionary, truth = scene

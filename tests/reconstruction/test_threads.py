@@ -1,5 +1,6 @@
 """What is computed is the same to the last bit with any number of threads."""
 
+import pytest
 import json
 import os
 import subprocess
@@ -89,6 +90,7 @@ def differing(found):
     return [threads for threads, value in found.items() if value != found["1"]]
 
 
+@pytest.mark.slow
 def test_every_method_gives_the_same_light_field_maps_and_figures_with_any_number_of_threads():
     methods = list(METHODS)
     found = printed(METHOD, *methods)
@@ -96,6 +98,7 @@ def test_every_method_gives_the_same_light_field_maps_and_figures_with_any_numbe
     assert {name: differing(of) for name, of in found.items() if differing(of)} == {}
 
 
+@pytest.mark.slow
 def test_every_route_of_calibration_gives_the_same_psi_with_any_number_of_threads():
     camera = {
         "title": "small",

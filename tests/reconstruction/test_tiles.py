@@ -84,6 +84,7 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "binning"),
     [
@@ -161,6 +162,7 @@ def test_progress_is_reported_block_by_block(random_psi):
     assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
+@pytest.mark.slow
 def test_a_block_without_usable_pixels_is_dark_and_the_others_are_judged(random_psi):
     psi, frames, _ = scene(random_psi)
     usable = np.ones(psi.frames_shape, dtype=bool)
@@ -189,6 +191,7 @@ def test_shots_that_do_not_fit_are_left_out_and_evened_for_all_blocks_alike(rand
     )
 
 
+@pytest.mark.slow
 def test_the_halo_follows_from_the_largest_disparity(random_psi):
     psi, frames, _ = scene(random_psi)
     usable = np.ones(frames.shape, dtype=bool)

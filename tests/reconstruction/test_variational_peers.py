@@ -134,6 +134,7 @@ def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_st
     assert found.objective[-1][1] == pytest.approx(least, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_steps_without_over_relaxation_are_pyproximals(coded_psi):
     pytest.importorskip("pyproximal")
     psi = coded_psi("rggb", 2, 3, (4, 6), (2, 3), np.float64)

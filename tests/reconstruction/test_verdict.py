@@ -200,6 +200,7 @@ def judged_trial(
     return verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "strength", "reason"),
     [
@@ -433,6 +434,7 @@ def motion_effect(fault, strength):
     return motion.effect
 
 
+@pytest.mark.slow
 def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
     assert motion_effect("bad-pixels", 3) < 0.02
     assert motion_effect("camera-motion", 1) > 0.2
@@ -520,6 +522,7 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["deep-occlusions", "wide-disparity"])
 def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
     given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
@@ -532,6 +535,7 @@ def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
     assert stated_db == pytest.approx(given.psnr_db(result.light_field), abs=3)
 
 
+@pytest.mark.slow
 def test_with_several_shots_the_default_is_as_good_as_surfaces_and_as_patches():
     given = trial_of(Capture("wide-disparity", find_camera("rgbw-bayer-3shots"), SIZE, zoom=3))
     surfaces = fast(AdaptiveSettings())

@@ -126,6 +126,7 @@ def assert_nothing_is_doubled_or_torn(folder, meet):
     assert not (folder / "s" / "session.lock").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meeting", MEETINGS)
 def test_two_programs_that_meet_at_a_session_spoil_nothing(memory_folder, meet, prepared, meeting):
     before, *commands, longest = MEETINGS[meeting]

@@ -119,6 +119,7 @@ def test_frames_that_only_a_plug_in_could_decode_are_read_back_without_it(tmp_pa
         assert (back.original, back.sha256) == (frame.original, frame.sha256)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_power_cut_at_any_operation_loses_and_doubles_nothing(undisturbed, seed):
     operations, expected = undisturbed

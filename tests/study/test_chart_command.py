@@ -65,6 +65,7 @@ def command(run):
     return call
 
 
+@pytest.mark.slow
 def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
     measured_scene = tmp_path / "shed"
     save_views(measured_scene, render("near-planar", size=(30, 36)).light_field)
@@ -105,6 +106,7 @@ def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
     assert front
 
 
+@pytest.mark.slow
 def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
     calls = []
 
@@ -133,6 +135,7 @@ def job(tmp_path):
     return Job(point, tmp_path / "x.webp", tmp_path / "truth.webp", None, 2, 60.0)
 
 
+@pytest.mark.slow
 def test_a_worker_outlives_what_fails_and_says_each_jobs_peak(job, tmp_path):
     capture = replace(job.point.capture, size=(96, 160))
     later = replace(job, point=replace(job.point, capture=capture))
@@ -153,6 +156,7 @@ def test_a_worker_outlives_what_fails_and_says_each_jobs_peak(job, tmp_path):
     assert again["psnr_db"] == first["psnr_db"]
 
 
+@pytest.mark.slow
 def test_a_job_that_takes_too_long_is_given_up_and_the_next_is_done(job):
     with Worker(0.01) as worker:
         assert worker.measure(job) == {"failed": "not done after 0 s"}
@@ -160,6 +164,7 @@ def test_a_job_that_takes_too_long_is_given_up_and_the_next_is_done(job):
         assert worker.measure(job)["steps"] == 3
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_a_failure_that_may_pass(job):
     with Worker(300) as worker:
         worker.measure(job)
@@ -201,6 +206,7 @@ def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, report
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_a_real_light_field_is_charted(quick, tmp_path):
     folder = os.environ["EMMC_LIGHTFIELDS"]

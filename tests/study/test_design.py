@@ -242,6 +242,7 @@ BENCH = {
 }
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_camera_a_mask_and_a_page_that_other_commands_take(
     run, tmp_path, monkeypatch
 ):

@@ -145,6 +145,7 @@ def test_screening_is_compared_where_it_should_matter():
     assert full <= set(METHODS)
 
 
+@pytest.mark.slow
 def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_path):
     monkeypatch.setattr(drawing, "PNG_DPI", 40)
     shed = tmp_path / "shed"

@@ -187,6 +187,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(
     assert not [path for path in folder.rglob("*") if ".part" in path.name]
 
 
+@pytest.mark.slow
 def test_a_part_alone_is_done_from_the_command_line(run, scenes):
     code, out, _ = run("--scenes", scenes, "--only", "figure6", "--fast", "--out", "r")
     assert code == 0
@@ -222,6 +223,7 @@ def test_a_dictionary_that_saw_the_scene_is_refused(run, scenes, tmp_path):
     assert (code, "was trained on 'attic'" in one_line(err)) == (1, True)
 
 
+@pytest.mark.slow
 def test_ctrl_c_is_reported_with_how_to_go_on(run, scenes, monkeypatch):
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
@@ -234,6 +236,7 @@ def test_ctrl_c_is_reported_with_how_to_go_on(run, scenes, monkeypatch):
         assert "run the same command again" in one_line(err)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(run, scenes, monkeypatch):
     def full(*arguments, **named):
         raise OSError(28, "No space left on device")

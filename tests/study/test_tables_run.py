@@ -105,6 +105,7 @@ class Impatient(Silent):
             raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(scenes, tmp_path):
     whole = a_run(scenes, tmp_path / "whole")
     whole.measure(Silent())
