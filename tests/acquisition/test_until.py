@@ -27,6 +27,8 @@ from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify
 from reconstruction.result import Reconstruction, Status
 
+pytestmark = pytest.mark.slow
+
 SIZE = (32, 40)
 RIG = ("--rig", "simulated", "--scene", "deep-occlusions", "--size", "32x40", "--rays", "64")
 CAMERA = {
@@ -143,7 +145,6 @@ def test_its_page_shows_what_was_decided_and_when(every):
     assert metrics["spared"] == 0
 
 
-@pytest.mark.slow
 def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enough, tmp_path):
     code, _, err = program("calibrate", enough, "--out", tmp_path / "c")
     assert code == 0, err
@@ -174,7 +175,6 @@ def test_every_next_shot_is_the_one_expected_to_help_most(every):
         assert one["expected_db"][str(one["next"])] > one["stated_db"]
 
 
-@pytest.mark.slow
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(enough, copy)
@@ -192,7 +192,6 @@ def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, t
     assert any(kind == "until" and "70 dB" in line for kind, line in events(again))
 
 
-@pytest.mark.slow
 def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(every, tmp_path):
     """What a kill leaves: a journal up to a line, and perhaps a file that no line tells of."""
     whole = (every / JOURNAL).read_bytes().splitlines(keepends=True)

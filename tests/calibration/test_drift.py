@@ -163,6 +163,7 @@ def test_a_darker_second_shot_is_reported_as_brightness_and_not_as_a_move():
     assert not found.drifted
 
 
+@pytest.mark.slow
 def test_the_mended_psi_is_that_of_the_bench_as_it_stands():
     drift = (8.0, -9.0, 0.0, 0.0, 0.0)
     found = found_for(drift)

@@ -106,6 +106,7 @@ def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, 
     assert frames.shape == psi.frames_shape == (1, 32, 48)
 
 
+@pytest.mark.slow
 def test_an_array_of_readings_is_taken_with_the_noise_of_the_sensor(taken):
     _, psi, frames = taken
     given = emmc.reconstruct(psi, frames, "tv")

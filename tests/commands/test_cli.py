@@ -227,6 +227,7 @@ def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
     from emmc_rig import demo
 

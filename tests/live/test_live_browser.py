@@ -111,6 +111,7 @@ def test_the_page_opens_and_its_frame_updates_without_a_complaint(page):
     assert page.get_log("browser") == []
 
 
+@pytest.mark.slow
 def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     """Click by click: centre, expose, read the mask off a board, look at the scene's views."""
     wait(page, lambda: "away from the centre" in text(page, "hint"))

@@ -21,6 +21,8 @@ from emmc_rig.session.session import Session
 from simulators.bench import MountingErrors
 from simulators.effects import flawed
 
+pytestmark = pytest.mark.slow
+
 SIZE = (32, 48)
 RIG = ("--rig", "simulated", "--scene", "near-planar", "--size", "32x48", "--rays", "1024")
 
@@ -48,7 +50,6 @@ def test_the_plan_written_is_one_that_captures(captured):
     assert plan.whiteboards.views == "all"
 
 
-@pytest.mark.slow
 def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
     out = captured / "calibration"
     assert exit_code("calibrate", captured / "session", "--out", out) == 0
@@ -68,7 +69,6 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     assert "session" in (out / "report.html").read_text()
 
 
-@pytest.mark.slow
 def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
     found = session_readings(Session(captured / "session"))
     psi = ImagingMatrix.load(captured / "calibration" / "psi.h5")
@@ -86,7 +86,6 @@ def test_the_free_route_takes_the_same_session(captured):
     assert free.relative_difference(both) < 0.01
 
 
-@pytest.mark.slow
 def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured, capsys):
     out = captured / "sensor"
     assert exit_code("calibrate", captured / "session", "--sensor", "--out", out) == 0
@@ -109,7 +108,6 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
         assert f'alt="{drawn}"' in page
 
 
-@pytest.mark.slow
 def test_the_mask_stage_is_mapped_by_the_session_that_calibrates(captured, capsys):
     out = captured / "stage"
     assert exit_code("calibrate", captured / "session", "--stage", "--out", out) == 0
@@ -149,7 +147,6 @@ def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path
 EFFECTS = "lamp,response,crosstalk,board,dark"
 
 
-@pytest.mark.slow
 def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, capsys):
     """Error of Psi against the coefficients that the bench's own rays integrate to."""
     plan, session, out = (tmp_path / name for name in ("plan", "session", "calibration"))
@@ -172,7 +169,6 @@ def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, c
     assert np.linalg.norm(off) / np.linalg.norm(true) < min(1.25 * stated, 0.01)
 
 
-@pytest.mark.slow
 def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, capsys):
     plan, out = tmp_path / "plan", tmp_path / "session"
     without = ("--leave-out", "lamp,response,colours,turned")

@@ -1,11 +1,11 @@
 """What is computed is the same to the last bit with any number of threads."""
 
-import pytest
 import json
 import os
 import subprocess
 import sys
 
+import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from emmc_rig.model.blas import one_blas_thread
