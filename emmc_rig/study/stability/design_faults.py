@@ -72,12 +72,12 @@ def pixel_size(capture: Capture, r: float) -> Trial:
 FAULTS = (
     Fault(
         "mask-cell", "Mask cell", "px",
-        (0.1, 0.25, 0.5, 1, 1.5, 2, 3, 4, 8, 16, 32, 64), (0.1, 0.5, 1.5, 6, 32),
+        (0.1, 0.25, 0.5, 1, 1.5, 2, 3, 4, 8, 16, 32, 64), (0.1, 1.5, 6, 32),
         DESIGN, mask_cell,
     ),
     Fault(
         "mask-distance", "Mask distance", "px of shadow per view",
-        (0, 0.125, 0.25, 0.5, 1, 2, 4, 8, 16), (0, 0.25, 1, 4, 16),
+        (0, 0.125, 0.25, 0.5, 1, 2, 4, 8, 16), (0, 0.25, 1, 8),
         DESIGN, mask_distance, clean=False,
     ),
     Fault(
@@ -92,7 +92,7 @@ FAULTS = (
     ),
     Fault(
         "r", "Pixel size, r", "measurements per sample",
-        (1, 1 / 4, 1 / 16, 1 / 64), (1, 1 / 4, 1 / 16),
+        (1, 1 / 4, 1 / 16, 1 / 64), (1, 1 / 4),
         DESIGN, pixel_size, whole=True,
     ),
 )  # fmt: skip
