@@ -1,6 +1,6 @@
 """The rules: figures beyond a limit become reasons, each with its remedy, and reasons a verdict.
 
-The limits are tuned, not derived: `emmc-rig stability --verdicts` measures how many broken results
+The limits are tuned, not derived: `benchmarks/verdicts.py` measures how many broken results
 and how many good ones they flag. Twice and half of each, on 13 of its cases, are in
 docs/results/verdict-constants.csv: but for DISPLACED_PX none flags more or fewer.
 """
