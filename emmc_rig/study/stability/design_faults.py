@@ -92,7 +92,7 @@ FAULTS = (
     ),
     Fault(
         "r", "Pixel size, r", "measurements per sample",
-        (1, 1 / 4, 1 / 16, 1 / 64), (1, 1 / 4),
+        (1, 1 / 4, 1 / 16, 1 / 64), (1, 1 / 4, 1 / 16),
         DESIGN, pixel_size, whole=True,
     ),
 )  # fmt: skip
