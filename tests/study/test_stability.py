@@ -17,7 +17,7 @@ from emmc_rig.pages import drawing
 from emmc_rig.progress import Silent
 from emmc_rig.study import trial
 from emmc_rig.study.points import StudyStopped
-from emmc_rig.study.stability import stability_run
+from emmc_rig.study.stability import stability_page, stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
     Span,
@@ -132,6 +132,28 @@ def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
     assert methods == ("tv",)
     assert [row.title for row in rows] == ["Mask shift", "Occlusion density"]
     assert rows[1].cells == ("10 / 10",)
+
+
+def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
+    levels = {
+        ("mask-shift", "tv"): (30, 29, 10),
+        ("flicker", "tv"): (30, 29, 29),
+        ("mask-shift", "dict-omp"): (30, 20, 10),
+        ("flicker", "dict-omp"): (30, 20, 10),
+    }
+    results: dict[Point, dict] = {
+        Point(Capture("a", "cam"), fault, strength, method, screened): {
+            "psnr_db": level,
+            "view_db": 5,
+        }
+        for (fault, method), row in levels.items()
+        for screened in ((True, False) if fault == "flicker" else (True,))
+        for strength, level in zip((0, 1, 4), row if screened else (30, 29, 28), strict=True)
+    }
+    head = stability_page._head(curves(results))
+    assert head.level == "tv"
+    assert "under 1 of 2 faults" in head.why
+    assert any("compare dict-omp: under 2 of 2" in line for line in head.next)
 
 
 def test_screening_is_compared_where_it_should_matter():

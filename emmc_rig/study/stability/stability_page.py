@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
-from emmc_rig.study.stability.curves import LOST_DB, Curve, breaking_rows, known_levels
+from emmc_rig.study.stability.curves import LOST_DB, Curve, Span, breaking_rows, known_levels
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.stability.stability_study import StabilityStudy
 
@@ -162,10 +162,13 @@ def stability_page(
 
 def _head(curves: Sequence[Curve]) -> Head:
     """Return the method that breaks under the fewest faults; curves: pooled first."""
-    shown = [one for one in curves if one.scene == curves[0].scene]
-    faults = len({one.fault.name for one in shown})
-    broken = Counter({one.label: 0 for one in shown})
-    broken.update(one.label for one in shown if one.below_best() is not None)
+    first = [curve for curve in curves if curve.scene == curves[0].scene]
+    faults = len({curve.fault.name for curve in first})
+    # Not screened are only the faults that screening is for: no number to compare with.
+    shown = [curve for curve in first if curve.screened] or first
+    broken = Counter({curve.label: 0 for curve in shown})
+    never = Span(None, None)
+    broken.update(curve.label for curve in shown if curve.below_best() != never)
     if not broken:
         why = "no method ran under any of the faults"
         return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
