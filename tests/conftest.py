@@ -55,7 +55,8 @@ def pytest_xdist_auto_num_workers(config):
 
 def pytest_sessionstart(session):
     """Compile what most tests need once, before the workers begin: each would compile it again."""
-    if hasattr(session.config, "workerinput") or tests_are_named(session.config):
+    config = session.config
+    if hasattr(config, "workerinput") or tests_are_named(config) or config.option.collectonly:
         return
     first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
     parts = [["search"], ["fit"]], [["dict-admm"], ["dict-omp"]]

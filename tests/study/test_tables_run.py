@@ -54,7 +54,7 @@ def small_dictionary():
     """A dictionary of few atoms in place of `lambertian`, which has 1,024."""
     few = dct_dictionary((5, 5), (9, 9), (1, 1, 3, 3), (1, 1, 1, 1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tables_study, "open_dictionary", lambda *_: few)
+        patch.setattr(tables_study, "open_dictionary_once", lambda *_: few)
         yield few
 
 

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 
 from pydantic import Field
 
-from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import Results, Study
@@ -17,6 +16,7 @@ from emmc_rig.study.scores import colour_scored
 from emmc_rig.study.tables.cells import Capture, Cell, Part, cells_of
 from emmc_rig.study.tables.shots import Shots, shots_of
 from emmc_rig.study.tables.table_scenes import VIEWS, Array, Scenes, Size, check_dictionary
+from emmc_rig.study.trial import open_dictionary_once
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
@@ -89,7 +89,7 @@ class TablesStudy(Study[Cell]):
     def dictionary(self, binning: int) -> Dictionary:
         """Return the dictionary for pixels of so many samples; raises as `check_dictionary`."""
         spec = self.settings.dictionary
-        opened = open_dictionary(spec, VIEWS, binning)
+        opened = open_dictionary_once(spec, VIEWS, binning)
         scored = sorted({cell.scene for cell in self.cells})
         check_dictionary(opened, spec or opened.kind, scored, binning)
         return opened
