@@ -502,8 +502,7 @@ def fit_advice(fit: Fit) -> list[str]:
         if moved > LARGEST_MOVE_UM and moved > 5 * one.moved_deviation_um:
             found.append(
                 f"{one.name}: the mask stands {moved:.1f} um from where the stage says "
-                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again, or measure "
-                "the stage map"
+                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again"
             )
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")

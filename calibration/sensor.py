@@ -6,11 +6,9 @@ its slope is the gain K in DN per electron. Every figure's deviation is a jackkn
 groups of rows. Under a colour filter each of its 2 x 2 phases has its own level; all lie on one
 curve.
 
-What differs from pixel to pixel is separated from noise by the covariance of the two frames, and
-split into rows, columns and pixels.
+What differs from pixel to pixel is separated from noise by the covariance of the two frames.
 
-Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8) and general (row, column and pixel
-nonuniformity, spectrograms).
+Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8).
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class TransferCurve:
     """The photon transfer curve of all rows: signal above the dark, variance, exposure."""
 
     mean_dn: Array
@@ -61,24 +59,18 @@ class Curve:
     exposure_s: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Nonuniformity:
-    """What differs between pixels, without noise: the variances of its parts.
+    """What differs between pixels, without noise: its variance, and the variance of that."""
 
-    variances: of those. spectra: by direction ("horizontal", "vertical"), amplitude at `frequency`,
-    cycles a pixel.
-    """
+    variance: float
+    uncertainty: float
 
-    parts: dict[str, float]
-    variances: dict[str, float]
-    frequency: dict[str, Array]
-    spectra: dict[str, Array]
-
-    def figure(self, name: str, scale: float) -> tuple[float, float]:
-        """Return the deviation of a part (or of `total`) and how sure it is, times a scale."""
-        found, sure = self.parts[name], float(np.sqrt(self.variances[name]))
-        value = float(np.sqrt(max(found, 0.0)))
-        return scale * value, scale * (sure / (2 * value) if found > sure else float(np.sqrt(sure)))
+    def figure(self, scale: float) -> tuple[float, float]:
+        """Return the deviation between pixels and how sure it is, times a scale."""
+        value, sure = float(np.sqrt(max(self.variance, 0.0))), float(np.sqrt(self.uncertainty))
+        spread = sure / (2 * value) if self.variance > sure else float(np.sqrt(sure))
+        return scale * value, scale * spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +98,7 @@ class SensorSheet:
     dynamic_range_db: float
     hot_pixels: int
     dead_pixels: int
-    curve: Curve
+    curve: TransferCurve
     linearity_residual: Array
     good: NDArray[np.bool_]
     deviations: dict[str, float] = field(default_factory=dict)
@@ -126,9 +118,7 @@ class SensorSheet:
             ("DSNU", self.dsnu, 1 / self.gain_dn_per_electron, "e"),
             ("PRNU", self.prnu, 100.0, "%"),
         ):
-            for name in one.parts:
-                part = words if name == "total" else f"{words} of {name}s"
-                found.append((part, *one.figure(name, scale), unit))
+            found.append((words, *one.figure(scale), unit))
         return found
 
 
@@ -356,11 +346,11 @@ def _linearity(signal: Array, times: Array, saturation: float) -> Array:
     return residual
 
 
-def _curve(darks: Sequence[_Level], flats: Sequence[_Level]) -> tuple[Curve, Array]:
+def _curve(darks: Sequence[_Level], flats: Sequence[_Level]) -> tuple[TransferCurve, Array]:
     """Return every phase's points in one curve, and its deviations from the line."""
     signal, spread, times, clipped, *_ = _points(darks, flats, np.arange(BLOCKS))
     residual = _linearity(signal, times, _saturation(signal, spread, clipped))
-    return Curve(signal.ravel(), spread.ravel(), times.ravel()), residual.ravel()
+    return TransferCurve(signal.ravel(), spread.ravel(), times.ravel()), residual.ravel()
 
 
 def _hot(darks: Sequence[Pair]) -> NDArray[np.bool_]:
@@ -392,41 +382,21 @@ def _nonuniformity(pair: Pair, dark: Pair | None, good: NDArray[np.bool_]) -> No
     if dark is not None:
         # One dark each, so that their noise does not vary together.
         frames = [one - black for one, black in zip(frames, (dark.first, dark.second), strict=True)]
-    parts: dict[str, list[float]] = {name: [] for name in ("total", "row", "column", "pixel")}
-    variances: dict[str, list[float]] = {name: [] for name in parts}
-    spectra: dict[str, list[Array]] = {"horizontal": [], "vertical": []}
+    variances, uncertainties = [], []
     planes = (_phases(one[:rows, :columns]) for one in (*frames, good))
     for first, second, use in zip(*planes, strict=True):
         smooth = _quadratic((first + second) / 2, use)
         scale = smooth if dark is not None else 1.0
         a, b = (np.where(use, (one - smooth) / scale, 0) for one in (first, second))
-        m, n = a.shape
-        both = float(np.sum(a * b) / use.sum())
-        alone = float((np.sum(a**2) + np.sum(b**2)) / (2 * use.sum()))
-        of_rows, of_columns = (float(np.mean(a.mean(k) * b.mean(k))) for k in (1, 0))
-        pixel = (both - of_rows - of_columns) / (1 - 1 / m - 1 / n)
-        found = (both, of_rows - pixel / n, of_columns - pixel / m, pixel)
-        for name, value in zip(parts, found, strict=True):
-            parts[name].append(value)
-        noise = max(alone - both, 0.0)
+        count = use.sum()
+        both = float(np.sum(a * b) / count)
+        alone = float((np.sum(a**2) + np.sum(b**2)) / (2 * count))
+        variances.append(both)
         # Of a covariance of count pairs: (s^4 + (s^2 + noise)^2) / count.
-        for name, covariance, more, count in (
-            ("total", both, noise, use.sum()),
-            ("row", of_rows, noise / n, m),
-            ("column", of_columns, noise / m, n),
-            ("pixel", pixel, noise, use.sum()),
-        ):
-            squares = covariance**2 + (max(covariance, 0.0) + more) ** 2
-            variances[name].append(squares / float(count))
-        for name, axis in (("horizontal", 1), ("vertical", 0)):
-            spectrum = np.fft.rfft(a, axis=axis) * np.conj(np.fft.rfft(b, axis=axis))
-            spectra[name].append(spectrum.real.mean(axis=1 - axis) / a.shape[axis])
-    halves = {"horizontal": columns // 2, "vertical": rows // 2}
+        squares = both**2 + (max(both, 0.0) + max(alone - both, 0.0)) ** 2
+        uncertainties.append(squares / float(count))
     return Nonuniformity(
-        {name: float(np.mean(values)) for name, values in parts.items()},
-        {name: float(np.sum(values)) / len(values) ** 2 for name, values in variances.items()},
-        {name: np.fft.rfftfreq(count, 2.0) for name, count in halves.items()},
-        {name: np.sqrt(np.maximum(np.mean(values, axis=0), 0)) for name, values in spectra.items()},
+        float(np.mean(variances)), float(np.sum(uncertainties)) / len(uncertainties) ** 2
     )
 
 
