@@ -22,10 +22,10 @@ from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
 from drivers.cameras import CAMERA_HELP, CAMERAS
 from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.dng import SMALLEST_SIDE_PX
 from drivers.errors import DriverError, TransportTimeoutError
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
-from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.ports import find_port, list_serial_ports
 from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
