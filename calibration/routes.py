@@ -29,14 +29,13 @@ from calibration.choice import (
     worst,
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
-from calibration.combine import combined
 from calibration.defects import View, find_defects, loss_variance
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
 from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
-from calibration.misfit import Misfit, measured_misfit
+from calibration.misfit import Misfit, combined, measured_misfit
 from calibration.parametric import (
     Parametric,
     Stages,

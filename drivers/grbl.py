@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from drivers import grbl_codec as codec
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -100,6 +100,14 @@ class GrblStage(HostStage):
         """Return what the controller takes for a millimetre, its `$100` and following."""
         self._require_axis(axis)
         return self._positive(codec.STEPS_PER_MM, axis)
+
+    def stop(self, axes: Iterable[str] | None = None) -> None:
+        """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
+        self._choose(axes)
+        self._stop_axis(self._axes[0])
+        if self._controller.status().state == "Run":
+            self._controller.send(codec.FEED_HOLD)
+        super().stop(axes)
 
     def _configure(self) -> None:
         self._controller = _Controller(self._transport, self._clock, self._distrust_all)

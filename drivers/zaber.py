@@ -348,7 +348,7 @@ class _Chain:
                 except TransportTimeoutError:
                     break
                 message = codec.decode_message(line)
-                if isinstance(message, codec.Reply) and message.message_id == message_id:
+                if message is not None and message.message_id == message_id:
                     replies.append(message)
         return replies
 
@@ -363,7 +363,7 @@ class _Chain:
             for _ in range(FOREIGN_MESSAGES_TOLERATED):
                 line = self._transport.read_until(codec.TERMINATOR)
                 message = codec.decode_message(line, checksum_required)
-                if isinstance(message, codec.Reply) and (
+                if message is not None and (
                     message.device,
                     message.axis,
                     message.message_id,
