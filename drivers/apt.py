@@ -99,16 +99,9 @@ class AptStage(HostStage):
         self._homing_since_s: dict[str, float] = {}
         self._start_up()
 
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move, as the controller last said it."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
-
     def _configure(self) -> None:
         self._homing_since_s.clear()
         self._velocities: dict[str, codec.VelocityParameters] = {}
-        self._move_speeds_um_s: dict[str, float] = {}
-        self._home_speeds_um_s: dict[str, float] = {}
         for axis, channel in self._channels.items():
             channel.send(Id.HW_NO_FLASH_PROGRAMMING)
             channel.send(Id.HW_STOP_UPDATEMSGS)
@@ -194,9 +187,6 @@ class AptStage(HostStage):
 
     def _top_speed_um_s(self, axis: str) -> float:
         return self._channels[axis].actuator.top_speed_um_s
-
-    def _homing_speed_um_s(self, axis: str) -> float:
-        return self._home_speeds_um_s[axis]
 
     def _read_velocity(self, axis: str) -> None:
         answer = self._channels[axis].query(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)

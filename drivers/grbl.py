@@ -91,11 +91,6 @@ class GrblStage(HostStage):
             self._require_axis(axis)
         self._start_up()
 
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move; it is the host's to choose, up to the axis's `$110`."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
-
     def steps_per_mm(self, axis: str) -> float:
         """Return what the controller takes for a millimetre, its `$100` and following."""
         self._require_axis(axis)

@@ -186,7 +186,8 @@ class HostStage(ABC):
 
     No move is ever sent twice: when the answer to one is lost, the position decides whether it
     was carried out. Any exception during a move, Ctrl-C included, stops the axes that move.
-    A protocol's constructor ends with `_start_up`.
+    A protocol's constructor ends with `_start_up`; `_configure` and `_apply_speed` fill in the
+    speeds of moves, and of homing where it differs.
     """
 
     def __init__(
@@ -202,6 +203,8 @@ class HostStage(ABC):
         self._settings = settings
         self._speeds_um_s = dict(settings.speeds_um_s)
         self._not_trusted: dict[str, str] = {}
+        self._move_speeds_um_s: dict[str, float] = {}
+        self._home_speeds_um_s: dict[str, float] = {}
         chosen = (settings.soft_limits_um, settings.speeds_um_s, settings.top_speeds_um_s)
         for axis in chain.from_iterable(chosen):
             self._require_axis(axis)
@@ -242,9 +245,10 @@ class HostStage(ABC):
     def _top_speed_um_s(self, axis: str) -> float:
         """Return the fastest speed that the device can give the axis."""
 
-    @abstractmethod
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
+        self._require_axis(axis)
+        return self._move_speeds_um_s[axis]
 
     def _is_homing(self, axis: str) -> bool:
         """Return whether the homing that was started still goes on; raises as `_is_moving`."""
@@ -252,7 +256,7 @@ class HostStage(ABC):
 
     def _homing_speed_um_s(self, axis: str) -> float:
         """Return the speed at which the axis looks for its reference."""
-        return self.speed_um_s(axis)
+        return self._home_speeds_um_s.get(axis) or self.speed_um_s(axis)
 
     def _readings_are_checked(self, axis: str) -> bool:
         """Return whether a checksum protects what `_read` reads."""

@@ -118,11 +118,6 @@ class ZaberStage(HostStage):
         self._require_axis(axis)
         return self._resolutions[axis]
 
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move, as the device last said it."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
-
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
         self._chain.checksummed = frozenset(
@@ -191,9 +186,6 @@ class ZaberStage(HostStage):
         if resolution is None:
             return self._first_speeds_um_s[axis]
         return models.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
-
-    def _homing_speed_um_s(self, axis: str) -> float:
-        return self._home_speeds_um_s[axis]
 
     def _readings_are_checked(self, axis: str) -> bool:
         return self._addresses[axis][0] in self._chain.checksummed
