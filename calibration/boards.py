@@ -137,6 +137,11 @@ class Board:
     shot: int
 
     @property
+    def opening(self) -> tuple[NDArray[np.bool_], tuple[float, float], int]:
+        """Views open, place of the mask, shot: what `Shadow.readings` takes."""
+        return self.views_open, self.stage_um, self.shot
+
+    @property
     def usable(self) -> NDArray[np.bool_]:
         """Which pixels count, (pixel_y, pixel_x)."""
         return np.isfinite(self.variance)

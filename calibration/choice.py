@@ -50,9 +50,7 @@ def worst(judged: Mapping[str, HeldOut]) -> HeldOut:
 def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
     """Return what a placement predicts of a whiteboard, (pixel_y, pixel_x)."""
     pixels = np.argwhere(np.ones(board.reading.shape, dtype=bool))
-    read = shadow.readings(
-        pixels, board.channels.ravel(), board.views_open, board.stage_um, board.shot
-    )
+    read = shadow.readings(pixels, board.channels.ravel(), *board.opening)
     return read.reshape(board.reading.shape)
 
 

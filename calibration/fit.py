@@ -169,13 +169,7 @@ def _samples(
 
 
 def _scaled_residuals(shadow: Shadow, sample: _Sample) -> Array:
-    predicted = shadow.readings(
-        sample.pixels,
-        sample.channels,
-        sample.board.views_open,
-        sample.board.stage_um,
-        sample.board.shot,
-    )
+    predicted = shadow.readings(sample.pixels, sample.channels, *sample.board.opening)
     return (sample.reading - predicted) / sample.deviation
 
 
@@ -219,11 +213,7 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
         for first in range(0, len(residual), CHUNK):
             part = slice(first, first + CHUNK)
             slope = shadow.with_slopes(
-                sample.pixels[part],
-                sample.channels[part],
-                sample.board.views_open,
-                sample.board.stage_um,
-                sample.board.shot,
+                sample.pixels[part], sample.channels[part], *sample.board.opening
             )[1]
             slope /= sample.deviation[part, None] * spread
             scaled = residual[part] / spread
@@ -247,17 +237,12 @@ def _view_terms(
     mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
     pull = np.zeros(own_size)
     for sample in samples:
-        board = sample.board
         scaled = _scaled_residuals(shadow, sample) / spread
         weight = _weights(scaled)
         for first in range(0, len(scaled), CHUNK):
             part = slice(first, first + CHUNK)
             slope, by_view = shadow.slopes_by_view(
-                sample.pixels[part],
-                sample.channels[part],
-                board.views_open,
-                board.stage_um,
-                board.shot,
+                sample.pixels[part], sample.channels[part], *sample.board.opening
             )
             scale = 1 / (sample.deviation[part, None] * spread)
             slope, by_view = slope * scale, by_view * scale
@@ -504,9 +489,7 @@ def _check(mask: ShadowMask, placement: Placement, sample: _Sample) -> BoardChec
     """Return how far one board's brightness and mask are off, all else as fitted."""
     shadow = Shadow(mask, placement)
     board = sample.board
-    fitted, slope = shadow.with_slopes(
-        sample.pixels, sample.channels, board.views_open, board.stage_um, board.shot
-    )
+    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *board.opening)
     rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
     residual = (sample.reading - fitted) / sample.deviation
     weight = np.ones(len(residual))

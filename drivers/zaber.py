@@ -8,7 +8,6 @@ from itertools import cycle
 from typing import Any
 
 from drivers import zaber_codec as codec
-from drivers import zaber_models as models
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     AxisFaultError,
@@ -185,7 +184,7 @@ class ZaberStage(HostStage):
         resolution = self._resolutions[axis]
         if resolution is None:
             return self._first_speeds_um_s[axis]
-        return models.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
+        return codec.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
 
     def _readings_are_checked(self, axis: str) -> bool:
         return self._addresses[axis][0] in self._chain.checksummed
@@ -205,7 +204,7 @@ class ZaberStage(HostStage):
             )
         device_id = self._optional(axis, "deviceid", whole_device=True)
         peripheral_id = self._optional(axis, "peripheralid")
-        model = models.find_model(device_id or 0, peripheral_id)
+        model = codec.find_model(device_id or 0, peripheral_id)
         identity = f"device id {device_id}, peripheral id {peripheral_id or 'none'}"
         if self._is_modified(axis, peripheral_id):
             model, identity = None, f"{identity}, modified hardware"
@@ -217,7 +216,7 @@ class ZaberStage(HostStage):
                 what = f"the length of its microstep is unknown ({identity})"
                 raise ScaleError(axis, what, SCALE_ADVICE)
             return stated_um
-        known_um = model.microstep_um * models.DEFAULT_RESOLUTION / resolution
+        known_um = model.microstep_um * codec.DEFAULT_RESOLUTION / resolution
         if stated_um is not None and abs(stated_um / known_um - 1) > SCALES_AGREE:
             raise ScaleError(
                 axis,
