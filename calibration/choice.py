@@ -25,16 +25,13 @@ ROUTES = ("combined", "parametric", "mixed", "free")
 class HeldOut:
     """How one description predicts a whiteboard that it has not seen.
 
-    chi2: mean squared residual over its variance, all usable pixels. trimmed: without the worst
-    1 % of them. whiteness: correlation of neighbours' residuals. residual: (pixel_y, pixel_x), in
-    deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted. groups:
-    chi2 by kind of whiteboard; all else is of the worst.
+    chi2: mean squared residual over its variance, all usable pixels. residual: (pixel_y, pixel_x),
+    in deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted.
+    groups: chi2 by kind of whiteboard; all else is of the worst.
     """
 
     route: str
     chi2: float
-    trimmed: float
-    whiteness: float
     relative_error: float
     residual: NDArray[np.float32]
     brightness: float = 1.0
@@ -111,34 +108,13 @@ def judge(
         scaled[rows] = residual / np.sqrt(np.where(good, variance, 1.0))
         missed, power = missed + float((residual**2).sum()), power + float((reading**2).sum())
         light, expected = light + float(reading.sum()), expected + float(prediction.sum())
-    squares = scaled[usable] ** 2
-    limit = np.quantile(squares, 0.99)
     return HeldOut(
         route,
-        float(squares.mean(dtype=np.float64)),
-        float(squares[squares <= limit].mean(dtype=np.float64)),
-        neighbour_correlation(scaled, usable),
+        float(np.mean(scaled[usable] ** 2, dtype=np.float64)),
         float(np.sqrt(missed / power)),
         scaled,
         light / max(expected, 1e-9),
     )
-
-
-def neighbour_correlation(residual: Array, usable: NDArray[np.bool_]) -> float:
-    """Return the correlation of residuals two pixels apart along rows and columns: 0 if white.
-
-    Two, so that neighbours see the same colour of a Bayer mosaic.
-    """
-    limit = 5 * max(float(np.median(np.abs(residual[usable]))) * 1.4826, 1e-12)
-    values = np.clip(residual, -limit, limit)
-    product = squares = 0.0
-    for axis in (0, 1):
-        a, b = (np.moveaxis(values, axis, 0)[part] for part in (slice(None, -2), slice(2, None)))
-        m, n = (np.moveaxis(usable, axis, 0)[part] for part in (slice(None, -2), slice(2, None)))
-        both = m & n
-        product += float((a[both] * b[both]).sum())
-        squares += float((0.5 * (a[both] ** 2 + b[both] ** 2)).sum())
-    return product / max(squares, 1e-12)
 
 
 def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:

@@ -184,7 +184,7 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         lamp[1:, channel] = solution[part]
         deviations.append(np.sqrt(np.diag(covariance)[part]) * max(residual, 1.0))
         steps.append(np.abs(lamp[1:, channel]))
-    known = bool(np.ptp([one.exposure_s for one in checks if one.board == boards[0]]) > 0) or any(
+    known = any(
         np.ptp([one.exposure_s for one in checks if one.board == board]) > 0 for board in boards
     )
     spread = np.ptp(lamp[:, channels], axis=0)

@@ -125,23 +125,26 @@ def psi_deviation(
     return deviation
 
 
-def psi_information(
-    shadow: Shadow, pixels: int = SAMPLED, seed: int = 0
-) -> tuple[NDArray[np.float64], float]:
+def drawn_pixels(mask: ShadowMask) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return SAMPLED pixels (n, 2) drawn at random, and the one colour that each sees."""
+    rng = np.random.default_rng(0)
+    rows, columns = mask.pixel_shape()
+    chosen = np.stack([rng.integers(rows, size=SAMPLED), rng.integers(columns, size=SAMPLED)], 1)
+    return chosen, rng.integers(ANY_COLOUR, size=SAMPLED).astype(np.uint8)
+
+
+def psi_information(shadow: Shadow) -> tuple[NDArray[np.float64], float]:
     """Return what turns a covariance of the placement into the error of Psi, and |Psi|^2.
 
     The expected squared Frobenius error of Psi is trace(matrix covariance); both per pixel and
-    coefficient, from `pixels` of them drawn at random, each seeing one colour.
+    coefficient, from SAMPLED of them drawn at random, each seeing one colour.
     """
     mask = shadow.mask
-    rng = np.random.default_rng(seed)
-    rows, columns = mask.pixel_shape()
-    chosen = np.stack([rng.integers(rows, size=pixels), rng.integers(columns, size=pixels)], 1)
-    channels = rng.integers(ANY_COLOUR, size=pixels).astype(np.uint8)
+    chosen, channels = drawn_pixels(mask)
     size = len(shadow.placement.vector())
     matrix, squares = np.zeros((size, size)), 0.0
     for v, u in np.ndindex(mask.views):
         values, slopes = shadow.with_slopes(chosen, channels, _one_view(mask.views, v, u))
         matrix += slopes.T @ slopes
         squares += float(values @ values)
-    return matrix / pixels, squares / pixels
+    return matrix / SAMPLED, squares / SAMPLED

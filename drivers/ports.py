@@ -10,10 +10,10 @@ import glob
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.errors import PortNotFoundError
 
@@ -30,39 +30,15 @@ PROTOCOLS_BY_USB_ID = {
 COMMAND_LINE_SHOWN = 60
 
 
-@dataclass(frozen=True)
-class PortInfo:
-    """One serial port of this computer; what its USB adapter does not state is None or ""."""
-
-    device: str
-    description: str
-    vendor_id: int | None
-    product_id: int | None
-    serial_number: str
-    manufacturer: str
-
-    @property
-    def guess(self) -> str:
-        """The protocol that usually answers here, "" where anything may."""
-        if self.vendor_id is None:
-            return ""
-        exact = PROTOCOLS_BY_USB_ID.get((self.vendor_id, self.product_id))
-        return exact or PROTOCOLS_BY_USB_ID.get((self.vendor_id, None), "")
+def guess_of(port: ListPortInfo) -> str:
+    """Return the protocol that usually answers on a port, "" where anything may."""
+    exact = PROTOCOLS_BY_USB_ID.get((port.vid, port.pid))
+    return exact or PROTOCOLS_BY_USB_ID.get((port.vid, None), "")
 
 
-def list_serial_ports() -> list[PortInfo]:
+def list_serial_ports() -> list[ListPortInfo]:
     """Return the serial ports of this computer, by name."""
-    return [
-        PortInfo(
-            device=port.device,
-            description=port.description or "",
-            vendor_id=port.vid,
-            product_id=port.pid,
-            serial_number=port.serial_number or "",
-            manufacturer=port.manufacturer or "",
-        )
-        for port in sorted(list_ports.comports(), key=lambda port: port.device)
-    ]
+    return sorted(list_ports.comports(), key=lambda port: port.device)
 
 
 def find_port(wanted: str) -> str:
@@ -91,7 +67,7 @@ def usb_serial_number(device: str) -> str:
     real = os.path.realpath(device)
     for port in list_serial_ports():
         if os.path.realpath(port.device) == real:
-            return port.serial_number
+            return port.serial_number or ""
     return ""
 
 

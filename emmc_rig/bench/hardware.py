@@ -26,7 +26,7 @@ from drivers.dng import SMALLEST_SIDE_PX
 from drivers.errors import DriverError, TransportTimeoutError
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
-from drivers.ports import find_port, list_serial_ports
+from drivers.ports import find_port, guess_of, list_serial_ports
 from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
 from drivers.transport import SerialTransport, Transport
@@ -341,7 +341,7 @@ def probe_port(port: str) -> str:
     may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
     """
     device = find_port(port)
-    guesses = {one.device: one.guess for one in list_serial_ports()}
+    guesses = {one.device: guess_of(one) for one in list_serial_ports()}
     guess = guesses.get(device, "")
     transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
     with closing(transport):

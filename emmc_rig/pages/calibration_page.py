@@ -127,8 +127,6 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
             name,
             outcome.frames[name],
             f"{one.chi2:.2f}",
-            f"{one.trimmed:.2f}",
-            f"{one.whiteness:+.3f}",
             f"{one.relative_error:.3%}",
             known(name, ".3%"),
         )

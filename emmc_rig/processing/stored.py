@@ -32,8 +32,6 @@ def outcome_figures(outcome: Outcome) -> dict:
         "held_out": {
             name: {
                 "chi2": one.chi2,
-                "chi2_without_worst_percent": one.trimmed,
-                "neighbour_correlation": one.whiteness,
                 "relative_error": one.relative_error,
                 "chi2_by_kind": dict(one.groups),
             }

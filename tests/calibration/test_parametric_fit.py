@@ -96,7 +96,6 @@ def test_one_frame_verifies_a_stage_position_that_was_never_calibrated(outcome, 
         bench.capture([Setting(stage_um=(133.0, -71.0))]), design.layout, outcome.good
     )
     judged = judge("mixed", boards[0], predicted_by_shadow(outcome.mixed.shadow, boards[0]))
-    assert judged.trimmed < 1.5
     assert judged.relative_error < 0.01
 
 
@@ -361,7 +360,7 @@ def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
 
 def test_the_simplest_route_at_the_noise_is_chosen():
     def judged(route, chi2):
-        return HeldOut(route, chi2, chi2, 0.0, 0.0, np.zeros((2, 2), np.float32))
+        return HeldOut(route, chi2, 0.0, np.zeros((2, 2), np.float32))
 
     def pick(*pairs):
         return choose([judged(*pair) for pair in pairs])[0].route

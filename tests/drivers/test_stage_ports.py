@@ -25,7 +25,7 @@ from drivers.errors import (
     PortPermissionError,
     TransportTimeoutError,
 )
-from drivers.ports import find_port, holder_of, list_serial_ports, udev_rule_path
+from drivers.ports import find_port, guess_of, holder_of, list_serial_ports, udev_rule_path
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
@@ -95,7 +95,7 @@ def test_what_usually_answers_is_guessed_from_the_adapter(usb_ports):
         usb_port("/dev/c", vid=0x0403, pid=0x6001),
         usb_port("/dev/d", vid=None, pid=None),
     ]
-    assert [port.guess for port in list_serial_ports()] == ["apt", "grbl", "", ""]
+    assert [guess_of(port) for port in list_serial_ports()] == ["apt", "grbl", "", ""]
 
 
 def test_a_port_opened_by_name_is_found_again_under_another_name(tmp_path, usb_ports):
