@@ -103,17 +103,15 @@ class BoardCheck:
 class Fit:
     """The placement fitted, how sure it is, and how well it explains the whiteboards.
 
-    covariance: (parameter, parameter), in the order of `placement.vector()`; bound: likewise, the
-    inverse of the Fisher information of the readings used (with the prior), which it does not
-    fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
-    parameters that the prior decides more than the whiteboards; more_boards: how many more of the
-    same kinds would decide them (MOST_MORE: no number of them). history: robust deviation of the
-    residuals over the noise after every step, at least 1.
+    covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
+    residual over the noise without outliers. undecided: names of parameters that the prior decides
+    more than the whiteboards; more_boards: how many more of the same kinds would decide them
+    (MOST_MORE: no number of them). history: robust deviation of the residuals over the noise after
+    every step, at least 1.
     """
 
     placement: Placement
     covariance: NDArray[np.float64]
-    bound: NDArray[np.float64]
     correlation: float
     chi2: float
     outliers: float
@@ -190,11 +188,10 @@ def _weights(scaled: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
-    """Gauss-Newton normal equations, Fisher information, loss and what the residuals are like."""
+    """Gauss-Newton normal equations, and what the residuals are like."""
 
     matrix: NDArray[np.float64]
     gradient: NDArray[np.float64]
-    information: NDArray[np.float64]
     spread: float
     squares: float
     kept: int
@@ -206,8 +203,7 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
     residuals = [_scaled_residuals(shadow, sample) for sample in samples]
     spread = _spread(residuals)
     size = len(placement.vector())
-    matrix, information = np.zeros((size, size)), np.zeros((size, size))
-    gradient = np.zeros(size)
+    matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
     for sample, residual in zip(samples, residuals, strict=True):
         for first in range(0, len(residual), CHUNK):
@@ -219,13 +215,12 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
             scaled = residual[part] / spread
             weight = _weights(scaled)
             matrix += slope.T @ (slope * weight[:, None])
-            information += slope.T @ slope
             gradient += slope.T @ (weight * scaled)
             inside = weight > 0
             squares += float((residual[part][inside] ** 2).sum())
             kept += int(inside.sum())
     count = sum(len(residual) for residual in residuals)
-    return _Normal(matrix, gradient, information, spread, squares, kept, count)
+    return _Normal(matrix, gradient, spread, squares, kept, count)
 
 
 def _view_terms(
@@ -337,8 +332,6 @@ def fit_placement(
     assert normal is not None
     placement = with_aperture_mean_one(placement)
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior)), np.float64)
-    information = normal.information * normal.spread**2 + np.diag(prior)
-    bound = np.asarray(np.linalg.inv(information), np.float64)
     correlation = _correlation(mask, placement, samples)
     if correlation < LEAST_FIT_CORRELATION:
         raise CalibrationError(
@@ -359,7 +352,6 @@ def fit_placement(
     return Fit(
         placement,
         covariance + bias_covariance(covariance, *terms),
-        bound,
         correlation,
         normal.squares / kept,
         1 - normal.kept / max(normal.count, 1),
