@@ -20,7 +20,7 @@ Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -106,8 +106,7 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
-    (MOST_MORE: no number of them). history: robust deviation of the residuals over the noise after
-    every step, at least 1.
+    (MOST_MORE: no number of them).
     """
 
     placement: Placement
@@ -121,7 +120,6 @@ class Fit:
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
-    history: tuple[float, ...] = field(default=())
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -320,13 +318,12 @@ def fit_placement(
     centre[OFFSETS] = placement.vector()[OFFSETS]
     prior = 1 / deviations**2
     rng = np.random.default_rng(settings.seed)
-    history: list[float] = []
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
         placement, taken, converged, normal = _descend(
-            mask, placement, samples, prior, centre, settings, history
+            mask, placement, samples, prior, centre, settings
         )
         steps += taken
     assert normal is not None
@@ -361,7 +358,6 @@ def fit_placement(
         undecided,
         more,
         tuple(_check(mask, placement, sample) for sample in samples),
-        tuple(history),
     )
 
 
@@ -408,7 +404,6 @@ def _descend(
     prior: Array,
     centre: Array,
     settings: FitSettings,
-    history: list[float],
 ) -> tuple[Placement, int, bool, _Normal]:
     """Return the placement after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
@@ -430,7 +425,6 @@ def _descend(
         if found <= value:
             placement = trial
         normal = _normal(mask, placement, samples)
-        history.append(normal.spread)
         if size < settings.tolerance or value - found < LEAST_GAIN:
             return placement, step + 1, True, normal
     return placement, settings.max_steps, False, normal

@@ -127,7 +127,6 @@ class Status:
     machine: tuple[float, ...] | None
     work: tuple[float, ...] | None
     offset: tuple[float, ...] | None
-    pins: str = ""
 
 
 Message = Ok | Refusal | Alarm | Banner | Setting | Feedback | Status
@@ -214,7 +213,6 @@ def _decode_status(line: bytes, text: str) -> Status:
         machine=machine,
         work=work,
         offset=offset,
-        pins=values.get("Pn", ""),
     )
 
 

@@ -174,12 +174,6 @@ class UsbDevice:
             )
         return answer.tobytes() if isinstance(answer, array.array) else b""
 
-    def reset(self) -> None:
-        """Reset the device as if it had been plugged in again; claims are lost."""
-        self._require_open()
-        with self._faults():
-            self._device.reset()
-
     def close(self) -> None:
         """Let go of the device, unplugged or not; closing twice is allowed."""
         if self._closed:

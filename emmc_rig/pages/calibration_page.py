@@ -70,11 +70,8 @@ def write_calibration_report(
         *_listed("found", "Found and taken into account", outcome.findings),
         *_listed("unwatched", "Not measured", unwatched),
     ]
-    best = outcome.mixed or outcome.parametric
-    first = outcome.parametric
-    if best is not None and first is not None:
-        body = _fit(metrics, truth or {}, first.fit.history)
-        sections.append(Section("fit", "Fit", body))
+    if outcome.parametric is not None:
+        sections.append(Section("fit", "Fit", _fit(metrics, truth or {})))
     body = _kinds(outcome.judged[outcome.chosen]) + _residuals(list(outcome.judged.values()))
     sections += [Section("residuals", "Residual maps", body), Section("psi", "Psi", _psi(outcome))]
     if sensor is not None:
@@ -149,24 +146,19 @@ def _kinds(judged: HeldOut) -> str:
     return fragment("figures.html", heads=heads, rows=rows, pictures={})
 
 
-def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float]) -> str:
+def _fit(metrics: Mapping, truth: Mapping[str, float]) -> str:
     rows = []
     for name, (words, unit) in WORDS.items():
         found = metrics["parameters"][name]
         row = [words, f"{found['value']:.6g}", f"{found['deviation']:.2g}", unit]
         known = [f"{truth[name]:.6g}" if name in truth else ""] if truth else []
         rows.append([*row, *known])
-    figure, (axes,) = sheet(1, 5.2, label="typical residual / noise")
-    axes.plot(np.arange(1, len(history) + 1), history, "o-", color=ACCENT, markersize=3)
-    axes.set_ylim(bottom=0)
-    titled(axes, "Convergence", "step, over widening windows")
     heads = ["Parameter", "Fitted", "Standard deviation", "Unit"]
     return fragment(
         "calibration_fit.html",
         fit=metrics["fit"],
         heads=[*heads, *(["Simulated bench"] if truth else [])],
         rows=rows,
-        picture=data_address(svg_of(figure), ".svg"),
     )
 
 

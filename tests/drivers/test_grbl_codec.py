@@ -67,7 +67,7 @@ def test_every_kind_of_message_is_read(line, message):
         ),
         (
             b"<Hold:1|MPos:0.000,0.000,0.000|F:500|Pn:PZ|Ov:100,100,100|A:SFM>\r\n",
-            Status("Hold", 1, (0.0, 0.0, 0.0), None, None, "PZ"),
+            Status("Hold", 1, (0.0, 0.0, 0.0), None, None),
         ),
         (
             b"<Door:3|MPos:1.000,2.000,3.000,4.000|Ln:99999>\r\n",
