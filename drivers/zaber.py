@@ -58,10 +58,7 @@ REFUSAL_ADVICE = {
 
 SCALES_AGREE = 1e-3
 """Relative: data sheets round a microstep to at least that, and no two screws are so alike."""
-SCALE_ADVICE = (
-    "write microstep_um from its data sheet into the stage's YAML file, or measure it with "
-    "`emmc-rig devices scale`"
-)
+SCALE_ADVICE = "write microstep_um into the stage's YAML file, from its data sheet or as Zaber Launcher shows it"
 
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d+)?")
 
@@ -82,9 +79,8 @@ class ZaberStage(HostStage):
 
     `microstep_um` is the length of a microstep, one for all axes or by name; what it does not
     state is looked up by the ids of device and peripheral. `resolution` is the device's setting
-    of that name for which it was stated. `in_microsteps` takes a microstep as the unit in place
-    of a micrometre: only to measure its length. Construction asks every axis for its scale,
-    limits and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
+    of that name for which it was stated. Construction asks every axis for its
+    scale, limits and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
     contradicts what was stated, `TransportTimeoutError` for a device that does not answer.
     Source: Zaber ASCII Protocol Manual (commands `home`, `move abs`, `stop`, `warnings`,
     `driver enable`; settings `pos`, `limit.min`, `limit.max`, `maxspeed`, `comm.checksum`,
@@ -100,22 +96,15 @@ class ZaberStage(HostStage):
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
         resolution: int | Mapping[str, int] | None = None,
-        in_microsteps: bool = False,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         self._chain = _Chain(transport, clock)
         self._addresses = dict(axes)
         self._stated_um = _by_axis(microstep_um, axes)
         self._stated_resolution = _by_axis(resolution, axes)
-        self._in_microsteps = in_microsteps
         for axis in (*self._stated_um, *self._stated_resolution):
             self._require_axis(axis)
         self._start_up()
-
-    def resolution(self, axis: str) -> int | None:
-        """Return how many microsteps make a full step; None for a motor that has no steps."""
-        self._require_axis(axis)
-        return self._resolutions[axis]
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
@@ -191,8 +180,6 @@ class ZaberStage(HostStage):
 
     def _scale_um(self, axis: str) -> float:
         """Return the length of a microstep, from the device or stated; both must agree."""
-        if self._in_microsteps:
-            return 1.0
         resolution = self._resolutions[axis]
         stated_um = self._stated_um.get(axis)
         wanted = self._stated_resolution.get(axis)

@@ -22,7 +22,6 @@ from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
-from emmc_rig.commands.stage_scale import register as register_scale
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 register(app)
 app.command()(conform)
-register_scale(app)
 
 
 @app.command("list")

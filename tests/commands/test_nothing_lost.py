@@ -25,7 +25,6 @@ RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
     "session export",
-    "devices scale",
     "devices serve",
 }
 WRITERS = {
@@ -39,7 +38,6 @@ WRITERS = {
     "chart": ("--fast",),
     "demo": (*SIZE,),
     "design": (),
-    "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
@@ -214,8 +212,8 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert not list(tmp_path.rglob(".*"))
 
 
-AT_ONCE = {"capture --new", "devices scale", "devices serve"}
-"""Done at once, shown by what they print; `devices scale` is given no stage here."""
+AT_ONCE = {"capture --new", "devices serve"}
+"""Done at once, shown by what they print."""
 
 
 @pytest.mark.slow
