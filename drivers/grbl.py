@@ -62,8 +62,9 @@ class GrblStage(HostStage):
     not report whether it was homed, so every axis must be homed after connecting. Homing some of
     the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
     controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
-    be, without which the firmware's default counts as never set. Construction
-    waits up to `boot_s` for the controller to start; it moves nothing. Raises `ScaleError`, or `TransportTimeoutError` when the controller does not answer.
+    be, without which the firmware's default counts as never set. Construction waits up to
+    `boot_s` for the controller to start; it moves nothing. Raises `ScaleError`, or
+    `TransportTimeoutError` when the controller does not answer.
     Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
     """
 

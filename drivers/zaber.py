@@ -58,7 +58,7 @@ REFUSAL_ADVICE = {
 
 SCALES_AGREE = 1e-3
 """Relative: data sheets round a microstep to at least that, and no two screws are so alike."""
-SCALE_ADVICE = "write microstep_um into the stage's YAML file, from its data sheet or as Zaber Launcher shows it"
+SCALE_ADVICE = "write microstep_um into the stage's YAML file, from its data sheet or Zaber Launcher"
 
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d+)?")
 
@@ -79,8 +79,8 @@ class ZaberStage(HostStage):
 
     `microstep_um` is the length of a microstep, one for all axes or by name; what it does not
     state is looked up by the ids of device and peripheral. `resolution` is the device's setting
-    of that name for which it was stated. Construction asks every axis for its
-    scale, limits and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
+    of that name for which it was stated. Construction asks every axis for its scale, limits
+    and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
     contradicts what was stated, `TransportTimeoutError` for a device that does not answer.
     Source: Zaber ASCII Protocol Manual (commands `home`, `move abs`, `stop`, `warnings`,
     `driver enable`; settings `pos`, `limit.min`, `limit.max`, `maxspeed`, `comm.checksum`,

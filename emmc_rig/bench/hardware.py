@@ -269,7 +269,8 @@ def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
     `emmc_rig.bench.stage_config`;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
-    once. settings: single settings that replace those of the file. Raises AppError or a `DriverError`.
+    once. settings: single settings that replace those of the file.
+    Raises AppError or a `DriverError`.
     """
     name, _, protocol = spec.partition(":")
     if name == SIMULATED:

@@ -64,8 +64,8 @@ class Bench:
         self.exposures.append(exposure_s)
         return self.mosaic
 
-    def open(self):
-        return open_u3v("", self.clock, self.bus)
+    def open(self, serial=""):
+        return open_u3v(serial, self.clock, self.bus)
 
 
 @pytest.fixture
