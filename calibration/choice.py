@@ -15,7 +15,7 @@ from calibration.shadow import Shadow
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
-AT_THE_NOISE = 1.5
+LARGEST_CHI2 = 1.5
 """Mean squared residual over the variance: what is left is less than the noise."""
 ROUTES = ("combined", "parametric", "mixed", "free")
 """The surest first, then from the simplest to the freest."""
@@ -126,15 +126,15 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
         raise CalibrationError("no description of Psi to choose from")
     known = sorted(judged, key=lambda one: ROUTES.index(one.route))
     for one in known:
-        if one.chi2 <= AT_THE_NOISE:
+        if one.chi2 <= LARGEST_CHI2:
             return one, (
                 f"{one.route}: every kind of whiteboard lies at the noise (the worst, "
-                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {AT_THE_NOISE:g})"
+                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {LARGEST_CHI2:g})"
             )
     best = min(known, key=lambda one: one.chi2)
     return best, (
         f"{best.route}: none reaches the noise on every kind of whiteboard; this one comes nearest "
-        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {AT_THE_NOISE:g}), and its "
+        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {LARGEST_CHI2:g}), and its "
         "deviations count what is missed"
     )
 

@@ -50,11 +50,11 @@ CHUNK = 4096
 FIRST_WINDOW_PX = 64
 FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
-DECIDED = 0.7
+MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
-MOST_MORE = 200
+MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 SOFT_EDGES = 0.1
 """Of a cell: how soft edges are taken to be where a fit begins."""
@@ -106,7 +106,7 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
-    (MOST_MORE: no number of them).
+    (MOST_MORE_BOARDS: no number of them).
     """
 
     placement: Placement
@@ -338,12 +338,14 @@ def fit_placement(
         )
     shares = shares_of_prior(placement, covariance, tolerances)
     undecided = tuple(
-        name for name, share in zip(labels(camera.views), shares, strict=True) if share > DECIDED
+        name
+        for name, share in zip(labels(camera.views), shares, strict=True)
+        if share > MOST_OF_PRIOR
     )
     # Precision beyond the prior's grows with the number of whiteboards.
     have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
-    lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
-    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
+    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
+    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
     terms = _view_terms(mask, placement, samples, normal.spread)
     return Fit(

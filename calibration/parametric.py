@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibration.defects import Defects
 from calibration.fit import Fit
 from calibration.misfit import Misfit
+from calibration.openings import views_open
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
@@ -51,12 +52,6 @@ def shot_stages(camera: Camera) -> Stages:
     return [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
 
 
-def _one_view(views: tuple[int, int], v: int, u: int) -> NDArray[np.bool_]:
-    chosen = np.zeros(views, dtype=bool)
-    chosen[v, u] = True
-    return chosen
-
-
 def _bands(
     layout: PsiLayout, shot: int, stored: int
 ) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.uint8]]]:
@@ -87,7 +82,7 @@ def coefficient_planes(
     scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         plane = np.empty(layout.size, dtype=np.float32)
-        chosen = _one_view((views_v, views_u), v, u)
+        chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
             read = samples_shadow.readings(samples, channels, chosen, stages[shot], shot)
             plane[band] = read.reshape(plane[band].shape) / scale
@@ -116,7 +111,7 @@ def psi_deviation(
     shots, views_v, views_u, _, stored_colours, _ = layout.shape
     scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
-        chosen = _one_view((views_v, views_u), v, u)
+        chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
             slopes = samples_shadow.with_slopes(samples, channels, chosen, stages[shot], shot)[1]
             spread = np.sqrt(np.square(slopes @ root).sum(axis=1)) / scale
@@ -144,7 +139,7 @@ def psi_information(shadow: Shadow) -> tuple[NDArray[np.float64], float]:
     size = len(shadow.placement.vector())
     matrix, squares = np.zeros((size, size)), 0.0
     for v, u in np.ndindex(mask.views):
-        values, slopes = shadow.with_slopes(chosen, channels, _one_view(mask.views, v, u))
+        values, slopes = shadow.with_slopes(chosen, channels, views_open(mask.views, (v, u)))
         matrix += slopes.T @ slopes
         squares += float(values @ values)
     return matrix / SAMPLED, squares / SAMPLED

@@ -587,13 +587,13 @@ def _bits(node: _Node, length: int) -> tuple[int, int]:
 
 HAS, READ, WRITE = "has", "reads", "writes"
 Access = frozenset[str]
-"""What a camera has of a feature, and what it lets be done with it now."""
+"""Whether a feature exists, and can be read and written now."""
 ABSENT: Access = frozenset()
 UNAVAILABLE, READABLE = Access((HAS,)), Access((HAS, READ))
 EVERYTHING = Access((HAS, READ, WRITE))
 ACCESS_MODES = {"RO": READABLE, "WO": Access((HAS, WRITE)), "RW": EVERYTHING}
 EVERYTHING_OF = {READABLE: EVERYTHING, UNAVAILABLE: UNAVAILABLE, ABSENT: ABSENT}
-"""What may be left of a node by what it is worked out from."""
+"""Access to a node that the access to its inputs allows."""
 _INPUTS = ("pVariable", "pAddress", "pIndex", "pMin", "pMax", "pInc")
 _COMPUTED = ("SwissKnife", "IntSwissKnife", "Category", "EnumEntry")
 _ENDS = ("LSB", "MSB")

@@ -103,11 +103,11 @@ class GrblStage(HostStage):
         super().stop(axes)
 
     def _configure(self) -> None:
-        self._controller = _Controller(self._transport, self._clock, self._distrust_all)
+        self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
         self._controller.wait_for_boot(self._boot_s)
         self._options = self._controller.command("$I").get("OPT", "").split(",")[0]
         self._controller.command("$$")
-        self._distrust_all("it was not homed since it was connected")
+        self._mark_all_unknown("it was not homed since it was connected")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
             self._check_scale(axis)
@@ -213,8 +213,8 @@ class GrblStage(HostStage):
             raise _no_such_axis(axis, "$$", f"${number}={value:g}")
         return value
 
-    def _distrust_all(self, why: str) -> None:
-        self._distrust(self._axes, why)
+    def _mark_all_unknown(self, why: str) -> None:
+        self._mark_unknown(self._axes, why)
 
 
 class _Controller:

@@ -48,7 +48,7 @@ STALE_EVENTS_TOLERATED = 64
 NO_WAIT_S = 0.001
 MOST_NEW_OBJECTS = 64
 LONGEST_EXPOSURE_S = 3600.0
-"""What a camera that states nonsense can make the driver wait."""
+"""Upper bound on the wait for an exposure, whatever the camera states."""
 EXPOSURE_UNIT_S = 1e-4
 EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
 """Bulb and time, by which no exposure can be asked for."""
@@ -109,7 +109,7 @@ class PtpSession:
         self._transport = transport
         self._transaction = 0
         self._broken = False
-        self._owed = False
+        self._picture_pending = False
         self._stop_wanted = threading.Event()
         self._closed = False
         try:
@@ -222,13 +222,13 @@ class PtpSession:
             seen = set(self.handles())
             self._stop_wanted.clear()
             self.request(Operation.INITIATE_CAPTURE, 0, 0)
-            self._owed = True
+            self._picture_pending = True
             taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
-            self._owed = False
+            self._picture_pending = False
             return taken
 
     def stop_capture(self) -> None:
-        """Let the capture under way, if any, raise `ExposureStoppedError`; any thread may call."""
+        """Let the capture under way raise `ExposureStoppedError`; any thread may call."""
         self._stop_wanted.set()
 
     def download(
@@ -317,7 +317,7 @@ class PtpSession:
 
     def _forget_events(self) -> None:
         """Read events away; one picture too late must not pass for the next."""
-        wait_s = self.settings.pair_limit_s if self._owed else NO_WAIT_S
+        wait_s = self.settings.pair_limit_s if self._picture_pending else NO_WAIT_S
         for _ in range(STALE_EVENTS_TOLERATED):
             if self._transport.event(wait_s) is None:
                 return

@@ -143,7 +143,7 @@ class PtpUsb:
         self.recover(0)
 
     def close(self) -> None:
-        """Let go of the camera; closing twice is allowed."""
+        """Close the camera; closing twice is allowed."""
         self._device.close()
 
     def _flush(self) -> None:

@@ -98,7 +98,7 @@ class Transport(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the port; closing twice is allowed."""
+        """Close the port; closing twice is allowed."""
 
     @abstractmethod
     def _now_s(self) -> float:
@@ -214,7 +214,7 @@ class SerialTransport(Transport):
             self._serial = self._open(find_port(BY_SERIAL_NUMBER + number if number else self.port))
 
     def close(self) -> None:
-        """Let go of the port; closing twice is allowed."""
+        """Close the port; closing twice is allowed."""
         with self.lock:
             # pyserial forgets to close a socket that the other side has closed already.
             opened = getattr(self._serial, "_socket", None)

@@ -175,7 +175,7 @@ class UsbDevice:
         return answer.tobytes() if isinstance(answer, array.array) else b""
 
     def close(self) -> None:
-        """Let go of the device, unplugged or not; closing twice is allowed."""
+        """Close the device, unplugged or not; closing twice is allowed."""
         if self._closed:
             return
         self._closed = True

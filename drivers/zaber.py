@@ -58,7 +58,7 @@ REFUSAL_ADVICE = {
 
 SCALES_AGREE = 1e-3
 """Relative: data sheets round a microstep to at least that, and no two screws are so alike."""
-SCALE_ADVICE = "write microstep_um into the stage's YAML file, from its data sheet or Zaber Launcher"
+SCALE_ADVICE = "write microstep_um (data sheet, Zaber Launcher) into the stage's YAML file"
 
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d+)?")
 
