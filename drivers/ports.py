@@ -28,6 +28,7 @@ PROTOCOLS_BY_USB_ID = {
 }
 """What usually answers behind a USB vendor and product; other adapters may carry anything."""
 COMMAND_LINE_SHOWN = 60
+PROC = Path("/proc")
 
 
 def guess_of(port: ListPortInfo) -> str:
@@ -77,7 +78,7 @@ def holder_of(device: str) -> str:
     Looks for a lock on the device in /proc/locks, which shows those of every user, then for the
     device among the open files of the processes that this user may inspect. Linux only.
     """
-    pid = next(_pids_with_lock(device), None) or next(_pids_with_open_file(device), None)
+    pid = next(_pids_with_lock(device), None) or next(pids_with_open_file(device), None)
     return "" if pid is None else f"{_program(pid)} (pid {pid})"
 
 
@@ -100,13 +101,13 @@ def _pids_with_lock(device: str) -> Iterator[int]:
             yield int(fields[4])
 
 
-def _pids_with_open_file(device: str) -> Iterator[int]:
-    real = os.path.realpath(device)
-    for process in glob.iglob("/proc/[0-9]*"):
+def pids_with_open_file(path: str, proc: Path = PROC) -> Iterator[int]:
+    """Yield the processes that have a file open, as far as this user may see; Linux only."""
+    real = os.path.realpath(path)
+    for process in sorted(proc.glob("[0-9]*")):
         with suppress(OSError):  # a process of another user, or one that has just ended
-            numbers = os.listdir(f"{process}/fd")
-            if any(os.readlink(f"{process}/fd/{number}") == real for number in numbers):
-                yield int(os.path.basename(process))
+            if any(os.readlink(link) == real for link in (process / "fd").iterdir()):
+                yield int(process.name)
 
 
 def _program(pid: int) -> str:
