@@ -170,7 +170,7 @@ def test_the_second_process_on_a_port_hears_who_holds_it(served):
 
 def test_a_lock_names_its_holder_even_where_open_files_may_not_be_seen(served, monkeypatch):
     transport = SerialTransport(served.port)
-    monkeypatch.setattr(ports, "_pids_with_open_file", lambda device: iter(()))
+    monkeypatch.setattr(ports, "pids_with_open_file", lambda device: iter(()))
     assert holder_of(served.port).endswith(f"(pid {os.getpid()})")
     transport.close()
 
