@@ -275,7 +275,6 @@ def reconstruct_sparse(
     settings: SparseSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
     found: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field whose patches are sparse in the dictionary.
@@ -288,7 +287,7 @@ def reconstruct_sparse(
     patch.
     """
     settings = settings or SparseSettings()
-    started = clock()
+    started = time.perf_counter()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
     if found is None:
         found = estimate_patches(psi, frames, noise_sigma, dictionary, settings, usable, on_step)
@@ -312,7 +311,7 @@ def reconstruct_sparse(
         advice="; ".join(advice),
         steps=round(found.passes),
         objective=(),
-        seconds=clock() - started,
+        seconds=time.perf_counter() - started,
         parameters={
             "noise_sigma": noise_sigma,
             "patches": len(found.atoms),

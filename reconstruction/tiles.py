@@ -31,7 +31,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.flat import flat_psi
 from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
 from reconstruction.methods.surfaces import sparse_patches, takes_patches
-from reconstruction.methods.tv_dict import patched_weights
+from reconstruction.methods.variational import patched_weights
 from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.screening import screened
 from reconstruction.sparse import SparseSettings
@@ -494,13 +494,12 @@ def reconstruct_in_blocks(
     settings: MethodSettings,
     usable: NDArray[np.bool_],
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[Reconstruction, Verdict]:
     """Return a light field and the verdict on it, block by block in this process.
 
     frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError as `reconstruct`.
     """
-    started = clock()
+    started = time.perf_counter()
     if not usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
     survey = surveyed(name, psi, frames, noise_sigma, usable, dictionary, settings)
@@ -521,7 +520,7 @@ def reconstruct_in_blocks(
         if on_step is not None:
             on_step(Progress(done, None, None, len(grid)))
     arrays = _whole(grid, parts)
-    whole = summed_up(name, results, survey, clock() - started)
+    whole = summed_up(name, results, survey, time.perf_counter() - started)
     light_field = arrays.pop("light_field")
     return replace(whole, light_field=light_field, maps=arrays), judged_together(verdicts)
 
