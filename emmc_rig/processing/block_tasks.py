@@ -391,14 +391,12 @@ def compute_blocks(
     job: BlockJob,
     frames: Frames,
     pool: Pool,
-    group: int | None = None,
     on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    group: rows and columns in samples of the tiles that are handed out one after another; the
-    blocks in them, and so the light field, are the same for any. on_block: called with the blocks
-    done and their number. Raises WorkersError, AppError, and what a block raises.
+    on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
+    a block raises.
     """
     started = time.perf_counter()
     psi, dictionary = job.psi, job.opened_dictionary()
@@ -411,8 +409,6 @@ def compute_blocks(
     tasks = [BlockTask(job, survey, block) for block in grid]
     done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
     left = [task for task in tasks if task.block.name not in done]
-    if group is not None:
-        left.sort(key=lambda task: [part.start // group for part in task.block.inner])
     if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):

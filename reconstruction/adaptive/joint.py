@@ -1,7 +1,7 @@
 """The texture of surfaces, and their disparity per pixel, from all frames at once.
 
 Half-quadratic splitting with momentum: with the noise that is still presumed in the texture falling
-from step to step, remove it (`shrinkage`), then fit the frames again (`texture.fitted`). Once the
+from step to step, remove it (`shrinkage`), then fit the frames again (`refine.fitted`). Once the
 texture is nearly known, planes are swept with it (`sweep`), and its residual of the frames sharpens
 the disparity (`refine`).
 """
@@ -18,9 +18,8 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import refined
+from reconstruction.adaptive.refine import fitted, refined
 from reconstruction.adaptive.shrinkage import denoised
-from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.visibility import carried
 
 Array = NDArray[np.floating]

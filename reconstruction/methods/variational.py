@@ -51,6 +51,7 @@ def _solve_tv(given: Given, settings: MethodSettings) -> Reconstruction:
 
 
 def solve_tv_dict(given: Given, settings: MethodSettings) -> Reconstruction:
+    """Return the light field of `tv-dict`; `adaptive` averages with it."""
     started = time.perf_counter()
     psi, noise, dictionary = given.psi, given.typical_noise, given.needed_dictionary("tv-dict")
     frames, usable = checked_inputs(psi, given.frames, noise, given.usable)

@@ -1,4 +1,4 @@
-"""DV_K and patches by their definitions, in plain NumPy: what `reconstruction.tv` is tested with."""
+"""DV_K and patches by their definitions, in plain NumPy: what solvers are tested with."""
 
 from functools import cache, reduce
 

@@ -9,11 +9,10 @@ import pytest
 from scipy.sparse.linalg import aslinearoperator, lsqr
 
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.model import kernels
 from emmc_rig.model.camera import Camera, build_imaging_matrix, draw_plates, sensor_response
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.masks import CFA
-from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
+from emmc_rig.model.sensing import ImagingMatrix
 
 EPS = float(np.finfo(np.float32).eps)
 VIEWS = (2, 3)

@@ -3,7 +3,7 @@
 import numpy as np
 
 import emmc_rig as emmc
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 
 
 def test_readings_are_missed_where_the_light_field_is_wrong_and_nowhere_else():
