@@ -186,13 +186,6 @@ class Camera(Settings):
 
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
 
-    def with_pattern(self, mask: str, **changes: object) -> Camera:
-        """Return a camera with other settings of one mask's pattern, which are not checked."""
-        one = self.masks[mask]
-        pattern = one.pattern.model_copy(update=changes)
-        masks = {**self.masks, mask: one.model_copy(update={"pattern": pattern})}
-        return self.model_copy(update={"masks": masks})
-
     def psi(self, size: tuple[int, int]) -> ImagingMatrix:
         """Return the imaging matrix for light fields of `size` (rows, columns) samples.
 

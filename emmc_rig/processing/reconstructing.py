@@ -41,7 +41,7 @@ from reconstruction.tiles import reconstruct_in_blocks
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
-PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_scipy(matrix, ...)"
+PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi(weights, colour)"
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import aslinearoperator, lsqr
 
-from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix, draw_plates, sensor_response
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.masks import CFA
@@ -210,18 +209,6 @@ def test_a_pixel_behind_the_wrong_filter_sees_nothing():
     expected = np.zeros((4, 4))
     expected[::2, ::2] = 1
     np.testing.assert_allclose(seen, expected, atol=20 * EPS)
-
-
-@pytest.mark.parametrize(
-    ("name", "blind"),
-    [("coded-aperture-random", True), ("rgbw-mono", False), ("conventional", False)],
-)
-def test_a_camera_is_colour_blind_where_neither_filter_nor_mask_has_a_colour(name, blind):
-    psi = find_camera(name).psi((8, 10))
-    assert psi.is_colour_blind is blind
-    coloured = np.random.default_rng(0).random(psi.light_field_shape, dtype=np.float32)
-    swapped = psi.forward(np.ascontiguousarray(coloured[..., ::-1]))
-    assert np.allclose(psi.forward(coloured), swapped, atol=1e-5) is blind
 
 
 def test_the_light_efficiency_of_an_rgbw_mask_is_a_half():
