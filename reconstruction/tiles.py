@@ -10,9 +10,8 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -39,7 +38,6 @@ from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
-NUMBER = re.compile(r"\d+(?:\.\d+)?")
 REACH = 48
 """Samples of halo for methods that carry information from sample to sample: steps of the
 variational methods move it by one, and what lies further hardly matters."""
@@ -440,41 +438,18 @@ def summed_up(
     # Where the whole has no single place, the verdict names the block.
     for key in ("misfit_row", "misfit_column"):
         parameters.pop(key, None)
-    count = len(solved)
+    advice = [one.advice for one in solved if one.advice]
     return Reconstruction(
         method=name,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         status=Status.IN_TILES,
-        advice="; ".join(in_few_words([[one.advice] for one in solved if one.advice], count)),
+        advice=f"{len(advice)} of {len(solved)} blocks, the first: {advice[0]}" if advice else "",
         steps=sum(one.steps for one in solved),
         objective=(),
         seconds=seconds,
         parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},
         screening=survey.words,
     )
-
-
-def in_few_words(said: Sequence[Sequence[str]], blocks: int) -> list[str]:
-    """Return what blocks have in common once, with the range of its numbers.
-
-    said: the lines of each block; blocks: how many there are in all. Lines are taken apart at
-    semicolons; parts that the same blocks have stay together.
-    """
-    alike: dict[tuple[str, ...], dict[int, str]] = {}
-    for block, lines in enumerate(said):
-        for part in (part for line in lines for part in line.split("; ")):
-            alike.setdefault(tuple(NUMBER.split(part)), {})[block] = part
-    together: dict[frozenset[int], list[str]] = {}
-    for words, by_block in alike.items():
-        numbers = zip(*(NUMBER.findall(part) for part in by_block.values()), strict=True)
-        spans = [sorted(set(each), key=float) for each in numbers]
-        ends = [f"{span[0]} to {span[-1]}" if len(span) > 1 else span[0] for span in spans]
-        whole = "".join(word for pair in zip(words, [*ends, ""], strict=True) for word in pair)
-        together.setdefault(frozenset(by_block), []).append(whole)
-    return [
-        f"{'; '.join(parts)}, in {len(where)} of {blocks} blocks"
-        for where, parts in together.items()
-    ]
 
 
 def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:

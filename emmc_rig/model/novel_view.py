@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from emmc_rig.model.lightfield import centre_view, focus_disparities, shear
+from emmc_rig.model.lightfield import centre_view, focus_disparities, shear, small_grey_views
 
 Array = NDArray[np.floating]
 STEPS = 3
@@ -45,15 +45,7 @@ def estimated_disparity(light_field: Array) -> NDArray[np.float32]:
     that estimate none. Even places have the disparity that happens to agree best there.
     """
     height, width = light_field.shape[2:4]
-    shrink = max(1.0, width / LARGEST_PX)
-    size = max(2, round(width / shrink)), max(2, round(height / shrink))
-    grey = light_field.mean(axis=4, dtype=np.float32)
-    small = np.stack(
-        [
-            cv2.resize(grey[place], size, interpolation=cv2.INTER_AREA)
-            for place in np.ndindex(grey.shape[:2])
-        ]
-    ).reshape(*grey.shape[:2], size[1], size[0], 1)
+    small, shrink = small_grey_views(light_field, LARGEST_PX)
     back, _, front = focus_disparities(light_field)
     margin = max(0.15 * (front - back), 0.1)
     tried = np.linspace(back - margin, front + margin, CANDIDATES) / shrink

@@ -82,7 +82,7 @@ def reconstruct_adaptive(
         "disparity": fits.scene.centre,
         "disparity_sigma": np.sqrt(search.variance_per_pixel(survey.volume, size, k)),
         "texture": _texture_map(survey.volume, size, k),
-        **({} if mean.sure is None else {"sigma": mean.sure.sigma}),
+        **({} if mean.sigma is None else {"sigma": mean.sigma}),
     }
     report(total)
     decided = _decided(survey.volume)

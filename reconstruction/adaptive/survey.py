@@ -145,7 +145,13 @@ def surveyed(
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
     psi = given.psi
-    volume = _searched(data, coarse, fine, settings, on_searched)
+    smooth = settings.slope_px, settings.jump
+    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
+    on_searched(1)
+    volume = search.fine(
+        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
+    )
+    on_searched(2)
     centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     held = held_out(given.usable)
     fitted = given.usable & ~held
@@ -171,21 +177,3 @@ def contrast_of(
     beyond = max(float(missed - noise[usable].sum(dtype=np.float64)), 0.0)
     rows = np.square(flat.forward(np.ones_like(picture)))[usable].sum(dtype=np.float64)
     return float(np.hypot(contrast(picture), np.sqrt(beyond / max(float(rows), 1e-20))))
-
-
-def _searched(
-    data: search.Data,
-    coarse: TexturePrior,
-    fine: TexturePrior,
-    settings: AdaptiveSettings,
-    on_searched: Callable[[int], None],
-) -> search.Volume:
-    """Return the disparities that patches and their neighbours agree on, coarse to fine."""
-    smooth = settings.slope_px, settings.jump
-    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
-    on_searched(1)
-    volume = search.fine(
-        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
-    )
-    on_searched(2)
-    return volume

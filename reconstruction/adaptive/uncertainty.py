@@ -22,8 +22,6 @@ unless one plane is the whole scene: its disparity is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -118,17 +116,6 @@ def apart(light_field: Array, other: Array) -> NDArray[np.float32]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Deviation:
-    """sigma: (v, u, y, x), standard deviation of a value of any colour there. scale, blur, spread:
-    the fitted s, b (a length squared, in pixels) and e."""
-
-    sigma: Array
-    scale: float
-    blur: float
-    spread: float
-
-
 def deviation(
     scene: Scene,
     scale: float,
@@ -136,8 +123,10 @@ def deviation(
     residual: Array,
     noise: Array,
     held: NDArray[np.bool_],
-) -> Deviation | None:
-    """Return the standard deviation of a mean of models; None with too few readings held out.
+) -> NDArray[np.float32] | None:
+    """Return the standard deviation of a mean of models, of a value of any colour, (v, u, y, x).
+
+    None with too few readings held out.
 
     scene: the last fit, of a light field over `scale`. spread: variance (v, u, y, x) between
     the models. residual: of the mean; noise: variance of the readings; held: those kept from the
@@ -164,4 +153,4 @@ def deviation(
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
     blur, apart = (float(one) for one in np.exp(logs))
     weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
-    return Deviation(np.sqrt(np.tensordot(weights, parts, axes=1)), scale, blur, apart)
+    return np.sqrt(np.tensordot(weights, parts, axes=1))
