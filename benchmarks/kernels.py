@@ -60,7 +60,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     pool = ThreadPoolExecutor(len(bands))
     one, operator = np.float32(1), (psi.weights, psi.colour_map)
-    data = tv_kernels.Data(*operator, inverse, frames, psi.binning)
+    data = tv_kernels.FrameFit(*operator, inverse, frames, psi.binning)
     steps = tv_kernels.Steps(one, one / 64, one, one, colour_metric(2.0).astype(np.float32))
     once = psi.weights.nbytes + light_field.nbytes
     return {

@@ -222,7 +222,7 @@ def assembled(grid: Grid, place: Place, axes: int, dtype: np.dtype, part: Part) 
 
 
 @dataclass(frozen=True)
-class Survey:
+class CaptureSurvey:
     """What is settled once for the whole capture, so that blocks are functions of it.
 
     settings: of the methods, with mu, primal step and steps settled. halo: see `Grid`. left_out:
@@ -237,7 +237,7 @@ class Survey:
     largest_px: float
 
     @classmethod
-    def of_one_block(cls, settings: MethodSettings, shots: int) -> Survey:
+    def of_one_block(cls, settings: MethodSettings, shots: int) -> CaptureSurvey:
         """Return what settles nothing: a single block is the whole."""
         return cls(settings, 0, (), (1.0,) * shots, (), 0.0)
 
@@ -289,7 +289,7 @@ def surveyed(
     usable: NDArray[np.bool_],
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
-) -> Survey:
+) -> CaptureSurvey:
     """Return what is settled from sample windows of a capture, read one at a time.
 
     frames, usable: (shot, pixel_y, pixel_x).
@@ -346,7 +346,7 @@ def surveyed(
     if patched:
         sparse = sparse_patches(settings.sparse, k)
     settled = _settled(mosaic, read, noise_sigma, use, settings, sparse)
-    return Survey(settled, halo, left_out, gains, words, largest)
+    return CaptureSurvey(settled, halo, left_out, gains, words, largest)
 
 
 def _settled(
@@ -422,7 +422,7 @@ AXES = {"light_field": 2, "sigma": 2}
 
 
 def summed_up(
-    name: str, results: Iterable[Reconstruction], survey: Survey, seconds: float
+    name: str, results: Iterable[Reconstruction], survey: CaptureSurvey, seconds: float
 ) -> Reconstruction:
     """Return what blocks say together, without arrays: the mean of their figures.
 

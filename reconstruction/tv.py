@@ -167,7 +167,7 @@ def sweeping(
     pull = problem.pixel_weight()
     total = 1 / gamma + pull
     inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
-    fit = kernels.Data(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
+    fit = kernels.FrameFit(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
     if problem.patch_term is not None:
         share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
         pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]

@@ -292,7 +292,7 @@ def refocus(lf: np.ndarray, disparity_px: float) -> np.ndarray:
 
 
 def small_grey_views(lf: np.ndarray, most_columns: int) -> tuple[np.ndarray, float]:
-    """Return the views (v, u, y, x, 1), grey, at most so many columns wide, and by what they shrank."""
+    """Return the views (v, u, y, x, 1), grey, at most so many columns wide, and the shrinkage."""
     shrink = max(1.0, lf.shape[3] / most_columns)
     grey = lf.mean(axis=4, dtype=np.float32)
     size = max(2, round(lf.shape[3] / shrink)), max(2, round(lf.shape[2] / shrink))

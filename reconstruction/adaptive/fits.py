@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.adaptive import mixture, search
-from reconstruction.adaptive.joint import Scene, solve
+from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 from reconstruction.adaptive.sweep import swept
@@ -32,7 +32,7 @@ class Fits:
 
     light_fields: list[Array]
     residuals: list[Array]
-    scene: Scene
+    scene: FittedScene
     patched: bool
 
 

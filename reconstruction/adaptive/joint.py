@@ -55,7 +55,7 @@ class TextureSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FittedScene:
     """Surfaces, their texture (c, y, x), the same less its noise (`clean`), and the centre view's
     disparity (y, x), without the margin that the textures have."""
 
@@ -83,7 +83,7 @@ def solve(
     settings: TextureSettings,
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
-) -> Scene:
+) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
@@ -139,4 +139,4 @@ def solve(
         if on_step is not None:
             on_step(step + 1)
     inner = np.s_[margin : margin + centre.shape[0], margin : margin + centre.shape[1]]
-    return Scene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))
+    return FittedScene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))

@@ -113,7 +113,7 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class SearchData:
     """What is to be explained. readings: frames less those of the smooth picture, variance: theirs,
     usable, all (shot, pixel_y, pixel_x); brightness: (pixel_y, pixel_x) of the smooth picture."""
 
@@ -161,7 +161,7 @@ def coarse_side(shots: int) -> int:
 
 
 def _evaluated(
-    data: Data, patches: EvidencePatches, disparities: Array, prior: TexturePrior
+    data: SearchData, patches: EvidencePatches, disparities: Array, prior: TexturePrior
 ) -> tuple[Array, NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return evidence (row, column, disparity), kinds (row, column), and the corners' grid."""
     rows, columns = patches.grid(data.psi.frames_shape[1:])
@@ -172,7 +172,7 @@ def _evaluated(
 
 
 def evidence_at(
-    data: Data,
+    data: SearchData,
     patches: EvidencePatches,
     corners: NDArray[np.int64],
     disparities: Array,
@@ -208,7 +208,7 @@ def _spacing(disparities: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def coarse(
-    data: Data, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
+    data: SearchData, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
 ) -> Volume:
     """Return the coarse search over disparities up to `furthest_px` to both sides."""
     side = coarse_side(data.psi.shots)
@@ -264,7 +264,7 @@ def _candidates(
 
 
 def fine(
-    data: Data,
+    data: SearchData,
     prior: TexturePrior,
     rough: Volume,
     stride: int,
@@ -306,7 +306,7 @@ def fine(
 
 
 def _on_grid(
-    data: Data,
+    data: SearchData,
     patches: EvidencePatches,
     first: int,
     prior: TexturePrior,

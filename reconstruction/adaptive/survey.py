@@ -133,7 +133,7 @@ def surveyed(
     bright = given.over(scale)
     picture = picture / np.float32(scale)
     grey = picture.mean(axis=-1)
-    data = search.Data(
+    data = search.SearchData(
         given.psi,
         (bright.frames - flat.forward(picture)).astype(np.float32),
         bright.variance(settings.misfit),

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from reconstruction.adaptive.joint import Scene
+from reconstruction.adaptive.joint import FittedScene
 from reconstruction.adaptive.refine import slopes
 
 Array = NDArray[np.floating]
@@ -62,7 +62,7 @@ def held_out(
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-def _parts(scene: Scene, scale: float, noise_variance: float, spread: Array) -> Array:
+def _parts(scene: FittedScene, scale: float, noise_variance: float, spread: Array) -> Array:
     """Return N, B and E of every sample, (3, v, u, y, x)."""
     let_in = np.square(scene.texture - scene.clean).mean(axis=0)
     steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
@@ -76,7 +76,7 @@ def _parts(scene: Scene, scale: float, noise_variance: float, spread: Array) -> 
     return parts
 
 
-def _of_readings(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _of_readings(scene: FittedScene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return what parts (part, v, u, y, x) add to the variance of the held-out readings.
 
     (part, reading). The rays of a pixel meet the texture |disparity| apart per view step.
@@ -117,7 +117,7 @@ def apart(light_field: Array, other: Array) -> NDArray[np.float32]:
 
 
 def deviation(
-    scene: Scene,
+    scene: FittedScene,
     scale: float,
     spread: Array,
     residual: Array,

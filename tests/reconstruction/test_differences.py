@@ -185,7 +185,7 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
     weight = np.zeros(psi.size) if pull is None else pull[0]
     pixels = weight[:: psi.binning, :: psi.binning]
     inverse = psi.inverted_blocks(np.where(usable, 1 / gamma + pixels, np.inf))
-    data = kernels.Data(psi.weights, psi.colour_map, inverse, frames, psi.binning)
+    data = kernels.FrameFit(psi.weights, psi.colour_map, inverse, frames, psi.binning)
     if pull is not None:
         share = 1 / (1 + gamma * weight)
         pulled = np.swapaxes(pull[1], -1, -2) * (1 - share)[:, None, :]

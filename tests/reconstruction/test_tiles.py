@@ -14,8 +14,8 @@ from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
 from reconstruction.result import Reconstruction, Status
 from reconstruction.sparse import SparseSettings
 from reconstruction.tiles import (
+    CaptureSurvey,
     Grid,
-    Survey,
     reconstruct_in_blocks,
     samples,
     summed_up,
@@ -250,5 +250,5 @@ def test_places_are_those_of_the_whole(blocks):
 def test_the_advice_of_blocks_is_the_first_s_and_how_many_have_any(advice, expected):
     empty = np.empty((0, 0, 0, 0, 3), np.float32)
     results = [Reconstruction("tv", empty, Status.STEP_LIMIT, a, 1, (), 0, {}) for a in advice]
-    survey = Survey.of_one_block(MethodSettings(), 1)
+    survey = CaptureSurvey.of_one_block(MethodSettings(), 1)
     assert summed_up("tv", results, survey, 0.0).advice == expected

@@ -29,7 +29,7 @@ from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
-from reconstruction.verdict.shots import Motion, compared
+from reconstruction.verdict.shots import ShotMotion, compared
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
@@ -441,7 +441,7 @@ def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
 
 
 def test_what_a_light_field_leaves_of_a_moved_place_is_beyond_noise():
-    moved = Motion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
+    moved = ShotMotion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
     assert moved.place == (20, 50)
     residual = np.full((3, 64, 80), 5.0)
     residual[:, 10:30, 40:60] = np.random.default_rng(0).normal(0, 0.05, (3, 20, 20))
