@@ -404,10 +404,6 @@ def test_bad_inputs_are_refused_in_one_line(bayer):
     tiny = bayer.window(slice(0, 4), slice(0, 4))
     with pytest.raises(ReconstructionError, match="do not fit a sensor"):
         reconstruct_adaptive(tiny, np.zeros((1, 4, 4), np.float32), 0.01)
-    with pytest.raises(ReconstructionError, match="no usable pixel"):
-        reconstruct_adaptive(
-            bayer, np.zeros(bayer.frames_shape), 0.01, usable=np.zeros(bayer.frames_shape, bool)
-        )
 
 
 def test_a_pixel_is_kept_from_the_fit_with_all_its_shots_or_not_at_all():
