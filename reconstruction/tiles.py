@@ -428,9 +428,12 @@ def summed_up(
 
     The halo's largest disparity is the survey's; steps are those of all blocks.
     """
-    solved = [one for one in results if one.status != Status.INCOMPLETE]
-    keys = dict.fromkeys(key for one in solved for key in one.parameters)
-    each = {key: [one.parameters[key] for one in solved if key in one.parameters] for key in keys}
+    solved = [result for result in results if result.status != Status.INCOMPLETE]
+    keys = dict.fromkeys(key for result in solved for key in result.parameters)
+    each = {
+        key: [result.parameters[key] for result in solved if key in result.parameters]
+        for key in keys
+    }
     parameters = {key: float(np.mean(values)) for key, values in each.items()}
     for key, extreme in (("lowest_px", min), ("highest_px", max)):
         if key in each:
@@ -438,13 +441,13 @@ def summed_up(
     # Where the whole has no single place, the verdict names the block.
     for key in ("misfit_row", "misfit_column"):
         parameters.pop(key, None)
-    advice = [one.advice for one in solved if one.advice]
+    advice = [result.advice for result in solved if result.advice]
     return Reconstruction(
         method=name,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         status=Status.IN_TILES,
         advice=f"{len(advice)} of {len(solved)} blocks, the first: {advice[0]}" if advice else "",
-        steps=sum(one.steps for one in solved),
+        steps=sum(result.steps for result in solved),
         objective=(),
         seconds=seconds,
         parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},

@@ -245,15 +245,15 @@ class Camera(Settings):
 
     def warnings(self) -> list[str]:
         """Return what the model neglects although it matters for this camera."""
-        found = []
+        neglected = []
         for name, mask in self.masks.items():
             number = fresnel_number(mask.cell_um, mask.distance_mm)
             if number < 1 and mask.distance_mm < self.lens.distance_mm:
-                found.append(
+                neglected.append(
                     f"mask '{name}': Fresnel number {number:.2g} < 1, diffraction blurs its "
                     "shadow and is not modelled; whiteboard calibration measures it"
                 )
-        return found
+        return neglected
 
 
 def shipped_camera_files() -> dict[str, Path]:

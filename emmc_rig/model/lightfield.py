@@ -345,8 +345,8 @@ def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     """
     _check_same_shape(estimate, truth)
     squares = 0.0
-    for one, other in zip(estimate, truth, strict=True):
-        error = np.subtract(one, other, dtype=np.float64).ravel()
+    for views, true in zip(estimate, truth, strict=True):
+        error = np.subtract(views, true, dtype=np.float64).ravel()
         squares += float(error @ error)
     if squares == 0:
         return float("inf")
