@@ -39,7 +39,7 @@ from emmc_rig.session.readings import scaled_readings, shot_frames
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.bench import Bench

@@ -39,12 +39,6 @@ def reconstruct(
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
-    tile: Annotated[
-        int | None,
-        typer.Option(
-            "--tile", min=1, help="large light fields: which blocks come first; changes no result"
-        ),
-    ] = None,
     workers: Annotated[
         int | None,
         typer.Option("--workers", min=1, help="processes that share blocks and captures"),
@@ -99,7 +93,7 @@ def reconstruct(
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
     requests = [
-        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
+        Request(folder, place, method, psi, dictionary, chosen, truth, why, as_zarr)
         for folder, place in _places(frames, out)
     ]
     limit = None if memory is None else parse_memory(memory)

@@ -58,7 +58,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     fitting = {name: values for name, values in maps.items() if _fits(values, light_field.shape)}
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
-            name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")
+            name: fitting.get(name) for name in ("disparity", "sigma", "misfit")
         },
     )  # fmt: skip
 

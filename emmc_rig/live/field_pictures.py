@@ -48,8 +48,8 @@ def export_of(
     light_field: Array, maps: Mapping[str, NDArray], misfit: Array | None = None
 ) -> Export:
     """Return a light field with those of a method's maps that the viewer shows."""
-    disparity, sigma, model = (maps.get(name) for name in ("disparity", "sigma", "model"))
-    return Export("", "", light_field, None, disparity, sigma, model, misfit)
+    disparity, sigma = (maps.get(name) for name in ("disparity", "sigma"))
+    return Export("", "", light_field, None, disparity, sigma, misfit)
 
 
 def field_pictures(

@@ -31,7 +31,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.preview import Preview
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 

@@ -43,10 +43,10 @@ from reconstruction.result import Reconstruction, Status
 from reconstruction.tiles import (
     AXES,
     Block,
+    CaptureSurvey,
     Grid,
     Place,
     SolvedBlock,
-    Survey,
     assembled,
     judged_block,
     multiple_of,
@@ -104,7 +104,7 @@ class BlockTask:
     """A block of a capture, with what the survey settled for all of them."""
 
     job: BlockJob
-    survey: Survey
+    survey: CaptureSurvey
     block: Block
 
     def path(self, suffix: str) -> Path:
@@ -165,7 +165,7 @@ def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
         return _sha256(partial)
 
 
-def survey_task(job: BlockJob) -> Survey:
+def survey_task(job: BlockJob) -> CaptureSurvey:
     """Settle in a worker what holds for the whole capture."""
     readings, usable = job.frames(EVERYWHERE)
     return surveyed(
@@ -251,7 +251,7 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
 
 
-def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> Survey:
+def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> CaptureSurvey:
     """Return what holds for all blocks, from an earlier run where it is of the same capture.
 
     Frames are on the disk then. alone: there is one block, which settles everything by itself.
@@ -265,12 +265,12 @@ def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> Survey:
             k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()
         }
         known["settings"] = MethodSettings.model_validate(known["settings"])
-        return Survey(**known)
+        return CaptureSurvey(**known)
     for path in job.kept.iterdir():
         path.unlink()
     sha256 = _write_arrays(job.kept / FRAMES, arrays)
     if alone:
-        survey = Survey.of_one_block(job.settings, len(frames.readings))
+        survey = CaptureSurvey.of_one_block(job.settings, len(frames.readings))
     else:
         ((_, survey),) = pool.run(survey_task, [job])
     plain = {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
@@ -287,7 +287,7 @@ class Blocks:
 
     job: BlockJob
     grid: Grid
-    survey: Survey
+    survey: CaptureSurvey
     done: Sequence[DoneBlock]
     seconds: float
     workers: int
@@ -391,14 +391,12 @@ def compute_blocks(
     job: BlockJob,
     frames: Frames,
     pool: Pool,
-    group: int | None = None,
     on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    group: rows and columns in samples of the tiles that are handed out one after another; the
-    blocks in them, and so the light field, are the same for any. on_block: called with the blocks
-    done and their number. Raises WorkersError, AppError, and what a block raises.
+    on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
+    a block raises.
     """
     started = time.perf_counter()
     psi, dictionary = job.psi, job.opened_dictionary()
@@ -411,8 +409,6 @@ def compute_blocks(
     tasks = [BlockTask(job, survey, block) for block in grid]
     done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
     left = [task for task in tasks if task.block.name not in done]
-    if group is not None:
-        left.sort(key=lambda task: [part.start // group for part in task.block.inner])
     if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):

@@ -42,7 +42,6 @@ class Request:
     settings: MethodSettings | None = None
     truth: str | None = None
     chosen: str | None = None
-    tile: int | None = None
     as_zarr: bool = False
 
 
@@ -122,8 +121,7 @@ def _outcome(
             try:
                 return reconstruct_folder(
                     request.folder, folder, request.method, request.psi, request.dictionary,
-                    request.settings, request.truth, on_step, request.chosen, pool, request.tile,
-                    request.as_zarr,
+                    request.settings, request.truth, on_step, request.chosen, pool, request.as_zarr,
                 )  # fmt: skip
             except KeyboardInterrupt as stop:
                 if not (folder.parent / KEPT).is_dir():

@@ -28,7 +28,7 @@ from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
 from emmc_rig.study.stability.stability_study import stability_settings
 from reconstruction.methods import BlockSettings, MethodSettings
-from reconstruction.tiles import Grid, Survey
+from reconstruction.tiles import CaptureSurvey, Grid
 from reconstruction.tv import TVSettings
 
 pytestmark = pytest.mark.timing("workers that answer late are taken for lost")
@@ -188,5 +188,7 @@ def test_arrays_do_not_travel_with_the_tasks():
     """A task is names and numbers: what 64 workers ask a scheduler for stays small."""
     job = BlockJob(Path("/kept"), Path("/psi.h5"), "adaptive", None, SETTINGS, 0.01, "0" * 64)
     block = Grid((8000, 6000), 2, 40, MethodSettings().blocks).block(3, 4)
-    assert len(pickle.dumps(BlockTask(job, Survey.of_one_block(SETTINGS, 3), block))) < 10_000
+    assert (
+        len(pickle.dumps(BlockTask(job, CaptureSurvey.of_one_block(SETTINGS, 3), block))) < 10_000
+    )
     assert np.prod([part.stop - part.start for part in block.outer]) > 10**5

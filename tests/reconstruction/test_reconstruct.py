@@ -119,9 +119,7 @@ def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames,
     assert shapes == {
         "disparity": SIZE,
         "disparity_sigma": SIZE,
-        "hidden": SIZE,
         "misfit": SIZE,
-        "model": SIZE,
         "texture": SIZE,
         "sigma": (5, 5, *SIZE),
     }
