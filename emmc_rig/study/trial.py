@@ -106,7 +106,7 @@ class Capture:
         """Return what its frames depend on, as plain data; of a measured scene its sums as well."""
         content = None
         if not self.is_built_in:
-            content = _sums(self.scene, self.size, self.described.views)
+            content = _sums(self.scene, self.size, self.described.views, self.seed, self.zoom)
         return {
             "scene": self.scene_name,
             "content": content,
@@ -129,8 +129,10 @@ def with_shots(camera: Camera, count: int) -> Camera:
 
 
 @lru_cache
-def _sums(spec: str, size: tuple[int, int] | None, views: tuple[int, int]) -> list[float]:
-    seen = zoomed_scene(spec, size, views).light_field
+def _sums(
+    spec: str, size: tuple[int, int] | None, views: tuple[int, int], seed: int, zoom: int
+) -> list[float]:
+    seen = _opened(spec, size, views, seed, zoom).light_field
     return [float(np.sum(one, dtype=np.float64)) for one in (seen, np.square(seen))]
 
 

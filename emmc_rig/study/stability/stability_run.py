@@ -103,7 +103,7 @@ def _write(study: StabilityStudy, folder: Path, outcome: StabilityOutcome) -> No
     breaks = [break_row(curve) for curve in found]
     text = stability_page(_about(study, outcome.left_out), sections, study, found)
     rows = [_row(*pair) for pair in study.results.items()]
-    write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS, forms={"strength": "g"}))
+    write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS))
     write_text(folder / BREAKS_CSV, csv_text(breaks, BREAK_COLUMNS))
     write_text(folder / PAGE, text)
     metrics = {
