@@ -12,7 +12,7 @@ from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.pages.paper_figure import FRAMES, CloseUp, Row, Tile, draw_tiles
-from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines, pictures_of
+from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 from emmc_rig.pages.result_figure import FigureSettings, draw_results
 
 SIZE = (36, 48)
@@ -151,5 +151,3 @@ def test_epipolar_lines_are_taken_where_views_differ():
     lf[:, -1, 11] = 1
     lf[-1, :, :, 17] += 0.5
     assert epipolar_lines(lf) == (11, 17)
-    kept = pictures_of(lf, (11, 17))
-    assert (kept.across.shape, kept.down.shape) == ((5, 30, 3), (5, 20, 3))
