@@ -94,9 +94,7 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
-    chosen = stability_settings(
-        True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",), screening="off"
-    )
+    chosen = stability_settings(True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",))
     monkeypatch.setattr(stability_run, "_write", lambda *_: None)
     ran = [
         run_stability(chosen, tmp_path / name, Silent(), cluster=address).curves
