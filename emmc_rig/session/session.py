@@ -264,7 +264,7 @@ class Session:
         name = amended_name(ORDER, self.amendments)
         try:
             return tuple(PlannedFrame.from_dict(one) for one in self._data(name))
-        except (KeyError, TypeError, IndexError) as fault:
+        except (AttributeError, KeyError, TypeError) as fault:
             raise AppError(
                 f"{self.folder / name}: is no list of frames; restore it from a copy"
             ) from fault

@@ -35,7 +35,7 @@ from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import SystemDisk
+from emmc_rig.session.storage import Disk
 from emmc_rig.session.verify import verify
 
 HOUSE = Path(emmc_rig.__file__).parent
@@ -582,7 +582,7 @@ def a_journal_that_cannot_be_read(bench):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "reader", refuse)
+        patch.setattr(Disk, "reader", refuse)
         line = bench.refused()
     yield line
 
@@ -593,7 +593,7 @@ def a_folder_that_cannot_be_made(bench):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "make_folder", refuse)
+        patch.setattr(Disk, "make_folder", refuse)
         line = bench.refused()
     yield line
 
@@ -624,7 +624,7 @@ def another_program_at_work(bench):
 @walk(" are free; make room, or name another --out")
 def a_small_disk(bench):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "free_bytes", lambda disk, folder: 1000)
+        patch.setattr(Disk, "free_bytes", lambda disk, folder: 1000)
         line = bench.refused()
     assert not bench.session.exists()
     yield line
@@ -632,7 +632,7 @@ def a_small_disk(bench):
 
 @walk(", then run the same command to go on; ")
 def a_disk_that_fills(bench):
-    honest = SystemDisk.create
+    honest = Disk.create
 
     def filling(disk, path):
         if AGAIN in path.name:
@@ -640,7 +640,7 @@ def a_disk_that_fills(bench):
         return honest(disk, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "create", filling)
+        patch.setattr(Disk, "create", filling)
         line = bench.refused()
     assert "9 of 10 frames are safe" in line
     yield line

@@ -28,7 +28,6 @@ darks: {repeats: 2}
 """
 CAPTURE = ["capture", "plan.yaml", "--rig", "simulated", "--out", "s"]
 GO_ON = ["capture", "s"]
-PRUNE = ["session", "prune", "s"]
 EXPORT = ["session", "export", "s", "--out", "s.h5"]
 CALIBRATE = ["calibrate", "s", "--out", "c"]
 NOTHING, PARTLY, COMPLETE = "nothing", "partly", "complete"
@@ -36,9 +35,7 @@ MEETINGS = {
     "create/create": (NOTHING, CAPTURE, CAPTURE, 0.02),
     "capture/capture": (NOTHING, CAPTURE, CAPTURE, 1.0),
     "capture/capture that goes on": (PARTLY, GO_ON, GO_ON, 1.0),
-    "capture/prune": (PARTLY, GO_ON, PRUNE, 1.0),
-    "prune/capture": (PARTLY, PRUNE, GO_ON, 0.1),
-    "export/prune": (COMPLETE, EXPORT, PRUNE, 1.0),
+    "export/capture": (COMPLETE, EXPORT, GO_ON, 1.0),
     "calibrate/capture": (PARTLY, CALIBRATE, GO_ON, 1.0),
 }
 """What is there before, who comes first and second, and the longest offset as a share of the

@@ -25,7 +25,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
 from emmc_rig.session.lock import held
-from emmc_rig.session.prune import prune
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
@@ -362,25 +361,21 @@ def test_a_foreign_file_is_named_and_left_alone(on_disk, tmp_path):
     assert verdict.foreign == ("frames/IMG_0001.DNG", "notes.txt")
     assert verdict.is_complete
     run_on(SYSTEM_DISK, tmp_path)
-    prune(Session(on_disk.folder))
     assert notes.read_text() == "mine"
     assert stray.read_bytes() == b"mine too"
 
 
-def test_pruning_removes_leftovers_and_nothing_else(on_disk):
+def test_leftovers_are_named_and_go_with_the_next_capture(on_disk, tmp_path):
     entry = on_disk.stored["dark-0-r0"]
     on_disk.discard("dark-0-r0", "for the test")
     part = part_of(on_disk.folder / FRAMES / "x.dng")
     part.write_bytes(b"half")
-    before = set((on_disk.folder / FRAMES).iterdir())
-    opened = Session(on_disk.folder)
-    names, size = prune(opened, dry_run=True)
-    assert set((on_disk.folder / FRAMES).iterdir()) == before
-    assert names == sorted([f"{FRAMES}/{part.name}", f"{FRAMES}/{entry['file']}"])
-    assert size == 4 + entry["bytes"]
-    prune(opened)
-    gone = before - set((on_disk.folder / FRAMES).iterdir())
-    assert {path.name for path in gone} == {part.name, entry["file"]}
+    named = (f"{FRAMES}/{part.name}", f"{FRAMES}/{entry['file']}")
+    assert verify(Session(on_disk.folder)).leftovers == tuple(sorted(named))
+    verdict = verify(run_on(SYSTEM_DISK, tmp_path))
+    assert verdict.is_complete
+    assert not verdict.leftovers
+    assert not part.exists()
 
 
 def test_a_folder_of_frames_that_somebody_removed_is_filled_again(on_disk, tmp_path, undisturbed):
