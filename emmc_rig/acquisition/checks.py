@@ -5,9 +5,6 @@ The checks look at some ten thousand pixels, and so take less than a millisecond
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +12,7 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Checks
 from emmc_rig.pages.frame_view import thinned
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 BRIGHT_PERCENTILE = 99.9
@@ -33,20 +31,6 @@ class SaturatedError(FrameRefusedError):
     """A frame too bright for its exposure, which a second try at that exposure would be too."""
 
 
-@dataclass(frozen=True)
-class Figures:
-    """Of one frame: share of saturated pixels; mean, median, 99.9th percentile above black, DN."""
-
-    saturated: float
-    mean_dn: float
-    median_dn: float
-    bright_dn: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data, for JSON."""
-        return asdict(self)
-
-
 def figures(frame: RawFrame) -> Figures:
     """Return a frame's figures, from `thinned` pixels."""
     black = float(frame.black_level_dn.mean())
@@ -56,7 +40,7 @@ def figures(frame: RawFrame) -> Figures:
     median, bright = np.searchsorted(np.cumsum(counts), shares * total)
     saturated = counts[frame.white_level_dn :].sum() / total
     mean = float(counts @ levels / total)
-    return Figures(float(saturated), mean - black, float(median) - black, float(bright) - black)
+    return Figures(float(saturated), mean - black, float(bright) - black, float(median) - black)
 
 
 def check(

@@ -63,7 +63,8 @@ def show(session: Folder) -> None:
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
-    listed, opened = summary(session), Session(session)
+    opened = Session(session)
+    listed = summary(opened)
     tell(f"{listed.name}: {listed.title}")
     tell(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
     tell(f"  {'begun':<12} {listed.created}")
@@ -72,7 +73,7 @@ def show(session: Folder) -> None:
     for kind, (done, planned) in counts(opened).items():
         tell(f"  {kind:<12} {done} of {planned}")
     if opened.amendments:
-        plans = Counter(entry.get("plan", 0) for entry in opened.stored.values())
+        plans = Counter(entry.plan for entry in opened.stored.values())
         for number in range(opened.amendments + 1):
             name = amended_name(PLAN, number)
             tell(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")

@@ -265,5 +265,5 @@ def _stage_of(session: Session, outcome: Outcome) -> SessionStage:
 
 
 def _read_um(session: Session, frame: PlannedFrame) -> tuple[float, float] | None:
-    read = session.stored[frame.id].get("read_um", {})
+    read = session.stored[frame.id].read_um
     return (read["mask_x"], read["mask_y"]) if {"mask_x", "mask_y"} <= set(read) else None

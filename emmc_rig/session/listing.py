@@ -1,7 +1,6 @@
 """Sessions at a glance: no frame is read.
 
-What a session holds comes from the heads of its journal lines, how far its light field is to be
-trusted from the figures that `reconstruct` left in it.
+How far a light field is to be trusted comes from the figures that `reconstruct` left in a session.
 """
 
 from __future__ import annotations
@@ -15,15 +14,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.reading import read_yaml
-from emmc_rig.session.journal import count_stored, ended, found_complete, heads, metered
-from emmc_rig.session.session import (
-    HEADER,
-    JOURNAL,
-    LISTED,
-    PLAN,
-    RECONSTRUCTION,
-)
+from emmc_rig.session.session import RECONSTRUCTION, Session
 
 
 @dataclass(frozen=True)
@@ -47,54 +38,25 @@ class Summary:
     folder: Path = Path()
 
 
-def summary(folder: Path) -> Summary:
+def summary(session: Session) -> Summary:
     """Return a session's summary; raises AppError when it cannot be read."""
-    refuse_missing(folder, LISTED)
-    try:
-        entries = heads((folder / JOURNAL).read_bytes())
-        header = parse_json((folder / HEADER).read_bytes(), str(folder / HEADER), AppError)
-        title, created = str(header["title"]), str(header["created"])
-    except OSError as fault:
-        raise AppError(f"{folder}: no session, or not readable ({fault.strerror})") from fault
-    except (ValueError, KeyError, TypeError) as fault:
-        raise AppError(f"{folder / HEADER}: is damaged; restore it from a copy") from fault
-    if not entries or entries[0]["kind"] != "created":
-        raise AppError(f"{folder / JOURNAL}: its first line is damaged; restore it from a copy")
-    if found_complete(entries):
-        state = "complete"
-    else:
-        state = "stopped" if entries[-1]["kind"] == "stopped" else "unfinished"
-    stored = count_stored(entries)
-    size = sum(entry["bytes"] for entry in stored.values())
-    name = folder.resolve().name
-    last = ended(entries)
-    begun = next(e for e in reversed(entries) if e["kind"] in ("created", "amended"))
-    planned = begun["frames"] - (0 if last is None else last["spared_frames"])
-    asked = metered(entries)
-    planned += 0 if asked is None else len(asked["asked"])
-    verdict, stated_db = reconstructed(folder)
+    header, last = session.header, session.journal.entries[-1]
+    stopped = "stopped" if last.kind == "stopped" else "unfinished"
+    plan = session.plan_data()
+    verdict, stated_db = reconstructed(session.folder)
     return Summary(
-        name,
-        title,
-        created,
-        state,
-        len(stored),
-        planned,
-        size,
-        _camera_name(folder / PLAN),
+        session.folder.name,
+        header["title"],
+        header["created"],
+        "complete" if session.is_complete else stopped,
+        len(session.stored),
+        len(session.needed),
+        sum(entry.bytes for entry in session.stored.values()),
+        str(plan.get("camera", "")) if isinstance(plan, dict) else "",
         verdict,
         stated_db,
-        folder,
+        session.folder,
     )
-
-
-def _camera_name(plan: Path) -> str:
-    """Return which camera a plan is for, "" where it cannot be read."""
-    try:
-        read = read_yaml(plan, AppError)
-    except AppError:
-        return ""
-    return str(read.get("camera", "")) if isinstance(read, dict) else ""
 
 
 def reconstructed(session: Path) -> tuple[str, float | None]:
@@ -125,8 +87,6 @@ def sessions_in(folder: Path) -> Iterator[Summary]:
             continue
         below.clear()
         try:
-            yield summary(one)
+            yield summary(Session(one))
         except AppError as fault:
             yield Summary(one.resolve().name, str(fault), "", "damaged", 0, 0, 0, folder=one)
-
-

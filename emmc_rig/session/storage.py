@@ -14,8 +14,8 @@ import shutil
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from io import BytesIO, FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 from emmc_rig.files.lock_file import is_running
 
@@ -56,7 +56,7 @@ class Disk:
         """Begin to write at the end of a file, made where missing."""
         return OpenFile(path, os.O_APPEND)
 
-    def reader(self, path: Path) -> BinaryIO:
+    def reader(self, path: Path) -> FileIO | BytesIO:
         """Open a file for reading."""
         return open(path, "rb", buffering=0)
 

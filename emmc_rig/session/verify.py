@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from emmc_rig.errors import AppError
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.session import Session
 
 THREADS = min(8, os.cpu_count() or 1)
@@ -66,33 +66,33 @@ class Verdict:
 
 def verify_frames(
     session: Session,
-    entries: Iterable[Entry],
+    entries: Iterable[FrameEntry],
     on_frame: Callable[[str], None] = lambda frame_id: None,
 ) -> dict[str, str]:
     """Return, by id, what is wrong with the files of journal lines; nothing for good ones."""
 
-    def fault_of(entry: Entry) -> tuple[str, str]:
+    def fault_of(entry: FrameEntry) -> tuple[str, str]:
         fault = _fault(session, entry)
-        on_frame(entry["id"])
-        return entry["id"], fault
+        on_frame(entry.id)
+        return entry.id, fault
 
     with ThreadPoolExecutor(THREADS, "verify") as pool:
         return {name: fault for name, fault in pool.map(fault_of, entries) if fault}
 
 
-def _fault(session: Session, entry: Entry) -> str:
+def _fault(session: Session, entry: FrameEntry) -> str:
     try:
         with session.disk.reader(session.path_of(entry)) as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
             size = file.seek(0, os.SEEK_END)
     except FileNotFoundError:
-        return f"{entry['file']} is gone"
+        return f"{entry.file} is gone"
     except OSError as fault:
-        return f"{entry['file']} cannot be read ({fault.strerror})"
-    if size != entry["bytes"]:
-        return f"{entry['file']} has {size} bytes instead of {entry['bytes']}"
-    if digest != entry["sha256"]:
-        return f"{entry['file']} is damaged: its SHA-256 is not the journal's"
+        return f"{entry.file} cannot be read ({fault.strerror})"
+    if size != entry.bytes:
+        return f"{entry.file} has {size} bytes instead of {entry.bytes}"
+    if digest != entry.sha256:
+        return f"{entry.file} is damaged: its SHA-256 is not the journal's"
     return ""
 
 

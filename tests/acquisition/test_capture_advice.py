@@ -405,7 +405,7 @@ def a_shot_that_is_too_bright(bench):
     line = bench.refused()
     assert "lower shots.1.exposure_s in the plan" in line
     before = Session(bench.session)
-    assert not [e for e in before.journal.entries if e["kind"] == "retry" and e["attempt"] > 1]
+    assert not [e for e in before.journal.entries if e.kind == "retry" and e.attempt > 1]
     yield line
     bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.002}])
     code, out, err = bench.run(*CAPTURE)
@@ -416,7 +416,7 @@ def a_shot_that_is_too_bright(bench):
     assert "plan 0       9 frames, by plan.yaml" in out
     assert "plan 1       1 frames, by amended-1-plan.yaml" in out
     after = Session(bench.session)
-    assert after.stored[AGAIN]["exposure_s"] == 0.002
+    assert after.stored[AGAIN].exposure_s == 0.002
     assert all(after.stored[name] == entry for name, entry in before.stored.items())
 
 
@@ -487,8 +487,8 @@ def a_board_that_was_moved(bench):
 @walk("its bytes changed in this computer's memory")
 def memory_that_loses_bits(bench):
     class Spoilt(Session):
-        def store(self, frame, suffix, data, sha256, facts):
-            super().store(frame, suffix, data, sha256[::-1], facts)
+        def store(self, frame, file, entry):
+            super().store(frame, replace(file, sha256=file.sha256[::-1]), entry)
 
     bench.patch.setattr(command, "Session", Spoilt)
     yield bench.refused()
@@ -819,8 +819,8 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
         line = bench.refused()
         assert str(fault) in line
         assert "9 frames are kept: mend it, then run the same command" in line
-        retries = [e for e in Session(bench.session).journal.entries if e["kind"] == "retry"]
-        assert retries[-1]["attempt"] == (1 if isinstance(fault, HOPELESS) else 2)
+        retries = [e for e in Session(bench.session).journal.entries if e.kind == "retry"]
+        assert retries[-1].attempt == (1 if isinstance(fault, HOPELESS) else 2)
     bench.light.faults.clear()
     assert bench.run(*CAPTURE)[0] == 0
     assert verify(Session(bench.session)).is_complete

@@ -171,25 +171,25 @@ def test_a_session_triggered_on_arrival_holds_the_very_frames_of_one_that_is_ask
     session, outcome = stepped_session(EVERY_AXIS)
     assert outcome.complete
     assert outcome.retries == 0
-    triggered = {name for name, entry in session.stored.items() if entry["triggered"]}
+    triggered = {name for name, entry in session.stored.items() if entry.triggered}
     # Of several axes at once, frames at one place, and metering nothing is triggered.
     assert {"shot-1-e0-r0", "shot-2-e0-r0"} <= triggered
     assert any(name.startswith("board-") for name in triggered)
     assert not any(name.startswith("meter-") for name in triggered)
     ours, theirs = mosaics(session), mosaics(asked)
     for name, entry in session.stored.items():
-        if entry["exposure_s"] == asked.stored[name]["exposure_s"]:
+        if entry.exposure_s == asked.stored[name].exposure_s:
             np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
         else:  # the other camera's nearest to what was metered
-            assert entry["exposure_s"] == pytest.approx(asked.stored[name]["exposure_s"], rel=0.02)
+            assert entry.exposure_s == pytest.approx(asked.stored[name].exposure_s, rel=0.02)
 
 
 def test_without_its_wire_a_frame_is_lost_and_then_asked_for():
     session, outcome = stepped_session(EVERY_AXIS, cut=True)
     assert outcome.complete
     assert outcome.retries > 0
-    assert not any(entry["triggered"] for entry in session.stored.values())
-    faults = [entry["fault"] for entry in session.journal.entries if entry["kind"] == "retry"]
+    assert not any(entry.triggered for entry in session.stored.values())
+    faults = [entry.fault for entry in session.journal.entries if entry.kind == "retry"]
     assert all("check the trigger" in fault for fault in faults)
 
 

@@ -303,8 +303,8 @@ def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path)
     assert len(now) == 63
     assert {name: now[name] for name in taken} == taken
     session = Session(copy)
-    assert session.stored["shot-1-e0-r2"]["exposure_s"] == 0.03
-    assert session.stored["shot-1-e0-r2"]["plan"] == 1
+    assert session.stored["shot-1-e0-r2"].exposure_s == 0.03
+    assert session.stored["shot-1-e0-r2"].plan == 1
     code, out, _ = run("session", "show", copy)
     assert "plan 0       62 frames, by plan.yaml" in out
     assert "plan 1       1 frames, by amended-1-plan.yaml" in out

@@ -113,11 +113,11 @@ def assert_nothing_is_doubled_or_torn(folder, meet):
     assert verdict.is_complete
     assert not verdict.leftovers
     assert not verdict.foreign
-    names = [entry["id"] for entry in session.journal.entries if entry["kind"] == "frame"]
+    names = [entry.id for entry in session.journal.entries if entry.kind == "frame"]
     assert sorted(names) == sorted(frame.id for frame in session.frames)
-    assert not [e for e in session.journal.entries if e["kind"] in ("retry", "discarded")]
+    assert not [e for e in session.journal.entries if e.kind in ("retry", "discarded")]
     for name, entry in session.stored.items():
-        assert session.read(name) == frame_bytes(name, entry["exposure_s"])
+        assert session.read(name) == frame_bytes(name, entry.exposure_s)
     hidden = [path for path in folder.rglob("*") if path.name.startswith(".")]
     assert not hidden
     assert not (folder / "s" / "session.lock").exists()
