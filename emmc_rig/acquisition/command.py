@@ -15,6 +15,7 @@ from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.estimate import (
     Estimate,
@@ -28,7 +29,6 @@ from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.metering import first_meterings
 from emmc_rig.acquisition.order import ordered
 from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
-from emmc_rig.acquisition.preflight import refuse_impossible
 from emmc_rig.acquisition.replay import missing_words, replaying, there
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check
+from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import Exposures, known_exposures, pace_of
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
-from emmc_rig.acquisition.preflight import refuse_impossible
 from emmc_rig.acquisition.retries import Budget, mending
 from emmc_rig.acquisition.suspend import Suspend
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd

@@ -58,7 +58,7 @@ def scale(
     from calibration.errors import CalibrationError
     from calibration.stage_scale import fit_step_length
     from drivers.errors import DriverError
-    from emmc_rig.acquisition.signals import signals_interrupt
+    from emmc_rig.acquisition.control import signals_interrupt
     from emmc_rig.bench.hardware import open_camera, open_stage
     from emmc_rig.bench.stage_config import parse_stage
     from emmc_rig.files.folders import refuse_inside_session

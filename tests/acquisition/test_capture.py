@@ -37,6 +37,7 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunEntry, of_kind
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
@@ -116,7 +117,7 @@ def test_the_journal_records_where_everything_stood_and_by_what_it_was_taken(und
     assert entry.lamp == "white"
     assert entry.shape == SIZE
     assert set(entry.spans_s) >= {"attend", "move", "expose", "read back", "check", "write"}
-    run = next(e for e in session.journal.entries if e.kind == "run")
+    run = next(iter(of_kind(session.journal.entries, RunEntry)))
     assert run.camera["serial"] == "S1"
     assert run.stage["mask_x"]["zero_um"] == 12_700
     assert "numpy" in run.versions
@@ -176,7 +177,8 @@ def test_a_resume_agrees_with_the_last_whiteboard_under_other_noise(undisturbed)
     again = Session(session.folder, session.disk)
     Sequencer(again, plan, rig).run()
     assert again.read("shot-0-e0-r0") != contents(undisturbed[0])["shot-0-e0-r0"]
-    entry = next(e for e in again.journal.entries if e.kind == "registered")
+    entry = next(iter(of_kind(again.journal.entries, ComparedEntry)))
+    assert entry.kind == "registered"
     assert entry.id.startswith("board")
     assert np.hypot(entry.x_px, entry.y_px) < 0.05
     assert entry.likeness > 0.9
@@ -307,7 +309,7 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
                 pushed.append(frame.id)
 
     assert Sequencer(session, plan, rig, Clumsy()).run().complete
-    retry = next(e for e in session.journal.entries if e.kind == "retry")
+    retry = next(iter(of_kind(session.journal.entries, RetryEntry)))
     assert retry.id == pushed[0]
     assert "off its place" in retry.fault or "home" in retry.fault
     assert contents(session) == contents(undisturbed[0])
@@ -351,7 +353,7 @@ def test_an_emergency_stop_is_never_argued_with():
     rig.chain.faults.inject("emergency_stop", skip=40)
     with pytest.raises(GaveUpError, match="emergency"):
         Sequencer(session, plan, rig).run()
-    assert not any(e.kind == "retry" and e.attempt > 1 for e in session.journal.entries)
+    assert not any(e.attempt > 1 for e in of_kind(session.journal.entries, RetryEntry))
 
 
 def test_what_has_to_be_mended_follows_from_the_fault():
@@ -412,7 +414,7 @@ def test_a_camera_that_repeats_itself_once_costs_a_try():
 
     wire.capture = repeating
     assert Sequencer(session, plan, rig).run().complete
-    faults = [e.fault for e in session.journal.entries if e.kind == "retry"]
+    faults = [e.fault for e in of_kind(session.journal.entries, RetryEntry)]
     assert len(faults) == 1
     assert "bit by bit" in faults[0]
     assert len(set(contents(session).values())) == 3
@@ -458,7 +460,7 @@ def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
     for entry in session.stored.values():
         for began_s, ended_s in entry.spans_s.values():
             assert 0 <= began_s <= ended_s
-    names = [e.id for e in session.journal.entries if e.kind == "frame"]
+    names = [e.id for e in of_kind(session.journal.entries, FrameEntry)]
     assert names == [frame.id for frame in session.frames]
 
 

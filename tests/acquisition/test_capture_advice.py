@@ -33,6 +33,7 @@ from emmc_rig.acquisition.retries import HOPELESS
 from emmc_rig.bench.rig_config import AskingAttendant, opened_rig
 from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
+from emmc_rig.session.journal import RetryEntry, of_kind
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import Disk
@@ -405,7 +406,7 @@ def a_shot_that_is_too_bright(bench):
     line = bench.refused()
     assert "lower shots.1.exposure_s in the plan" in line
     before = Session(bench.session)
-    assert not [e for e in before.journal.entries if e.kind == "retry" and e.attempt > 1]
+    assert not [e for e in of_kind(before.journal.entries, RetryEntry) if e.attempt > 1]
     yield line
     bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.002}])
     code, out, err = bench.run(*CAPTURE)
@@ -819,7 +820,7 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
         line = bench.refused()
         assert str(fault) in line
         assert "9 frames are kept: mend it, then run the same command" in line
-        retries = [e for e in Session(bench.session).journal.entries if e.kind == "retry"]
+        retries = of_kind(Session(bench.session).journal.entries, RetryEntry)
         assert retries[-1].attempt == (1 if isinstance(fault, HOPELESS) else 2)
     bench.light.faults.clear()
     assert bench.run(*CAPTURE)[0] == 0

@@ -26,6 +26,7 @@ from emmc_rig.bench.trigger import LINE_LATENCY_S, SimulatedTrigger, check_trigg
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.journal import RetryEntry, of_kind
 from simulators.clock import ManualClock
 from simulators.u3v import U3vCameraSimulator
 from simulators.usb import SimulatedUsb
@@ -189,7 +190,7 @@ def test_without_its_wire_a_frame_is_lost_and_then_asked_for():
     assert outcome.complete
     assert outcome.retries > 0
     assert not any(entry.triggered for entry in session.stored.values())
-    faults = [entry.fault for entry in session.journal.entries if entry.kind == "retry"]
+    faults = [entry.fault for entry in of_kind(session.journal.entries, RetryEntry)]
     assert all("check the trigger" in fault for fault in faults)
 
 

@@ -170,7 +170,8 @@ def test_every_next_shot_is_the_one_expected_to_help_most(every):
     taken = decided(Session(every))
     assert [len(one.shots) for one in taken] == [1, 2, 3]
     for one, after in pairwise(taken):
-        assert one.next == max(one.expected_db, key=one.expected_db.get)
+        assert one.next == max(one.expected_db, key=lambda shot: one.expected_db[shot])
+        assert one.next is not None
         assert after.shots == [*one.shots, one.next]
         assert one.expected_db[one.next] > one.stated_db
 

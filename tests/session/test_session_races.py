@@ -15,6 +15,7 @@ import pytest
 from capture_rigs import frame_bytes
 from programs import line_server
 
+from emmc_rig.session.journal import FrameEntry, of_kind
 from emmc_rig.session.session import FRAMES, Session
 from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify
@@ -113,7 +114,7 @@ def assert_nothing_is_doubled_or_torn(folder, meet):
     assert verdict.is_complete
     assert not verdict.leftovers
     assert not verdict.foreign
-    names = [entry.id for entry in session.journal.entries if entry.kind == "frame"]
+    names = [entry.id for entry in of_kind(session.journal.entries, FrameEntry)]
     assert sorted(names) == sorted(frame.id for frame in session.frames)
     assert not [e for e in session.journal.entries if e.kind in ("retry", "discarded")]
     for name, entry in session.stored.items():

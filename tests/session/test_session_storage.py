@@ -28,9 +28,11 @@ from emmc_rig.session.journal import (
     FrameEntry,
     Journal,
     RetryEntry,
+    RunEntry,
     count_stored,
     decode_line,
     encode_line,
+    of_kind,
 )
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
@@ -141,10 +143,10 @@ def test_a_power_cut_at_any_operation_loses_and_doubles_nothing(undisturbed, see
         assert_whole(survived, expected)
         # What was said to be safe before the cut was not taken again.
         entries = Session(ROOT / "s", survived).journal.entries
-        lines = [entry.id for entry in entries if entry.kind == "frame"]
+        lines = [entry.id for entry in of_kind(entries, FrameEntry)]
         assert all(lines.count(name) == 1 for name in promised.frames), cut
         if promised.frames:
-            runs = [entry.resumed for entry in entries if entry.kind == "run"]
+            runs = [entry.resumed for entry in of_kind(entries, RunEntry)]
             assert runs == [False, True], cut
 
 
