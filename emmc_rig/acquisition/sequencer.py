@@ -388,8 +388,9 @@ class Sequencer:
         camera = self._devices.camera
         entry = frame_entry(
             frame,
-            camera.exposure_s,
-            camera.gain,
+            # Only asked for where it is needed: a camera may read its next frame for that.
+            camera.exposure_s if frame.exposure_s is None else frame.exposure_s,
+            camera.gain if frame.gain is None else frame.gain,
             run=self._run,
             plan=self._session.amendments,
             lamp=planned.bench.lamp,

@@ -48,7 +48,9 @@ def test_a_frame_that_a_session_stored_is_read_back_without_the_camera(camera, t
     about = {"title": "conformance", "created": "", "command": "", "versions": {}}
     session = Session.create(tmp_path / "session", Frozen("", {}, {}, (planned,)), about)
     file = frame_file(frame)
-    entry = frame_entry(frame, camera.exposure_s, camera.gain, figures=NO_FIGURES)
+    exposure_s = camera.exposure_s if frame.exposure_s is None else frame.exposure_s
+    gain = camera.gain if frame.gain is None else frame.gain
+    entry = frame_entry(frame, exposure_s, gain, figures=NO_FIGURES)
     session.store(planned, file, lambda: entry)
     again = Session(session.folder)
     back = decode_frame(again.read(planned.id), again.stored[planned.id])

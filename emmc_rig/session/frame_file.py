@@ -41,7 +41,7 @@ class FrameFile:
 def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -> FrameEntry:
     """Return what a journal keeps of a frame beside its file, and `about` it.
 
-    exposure_s, gain: of the camera, where the frame does not say its own.
+    exposure_s, gain: the frame's own, or the camera's where it says none.
     """
     return FrameEntry(
         id="",
@@ -52,8 +52,8 @@ def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -
         cfa=frame.cfa,
         black_level_dn=frame.black_level_dn.tolist(),
         white_level_dn=frame.white_level_dn,
-        exposure_s=exposure_s if frame.exposure_s is None else frame.exposure_s,
-        gain=gain if frame.gain is None else frame.gain,
+        exposure_s=exposure_s,
+        gain=gain,
         camera_time_s=frame.camera_time_s,
         host_time_s=frame.host_time_s,
         metadata=dict(frame.metadata),

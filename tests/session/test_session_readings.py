@@ -180,7 +180,9 @@ def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
         frame = camera.snap()
     file = frame_file(frame)
     assert (file.suffix, file.data) == (".bin", frame.original)
-    entry = frame_entry(frame, 0.0, 0.0, figures=NO_FIGURES)
+    assert frame.exposure_s is not None
+    assert frame.gain is not None
+    entry = frame_entry(frame, frame.exposure_s, frame.gain, figures=NO_FIGURES)
     back = decode_frame(file.data, entry.model_copy(update={"file": "00000-x.bin"}))
     np.testing.assert_array_equal(back.mosaic, frame.mosaic)
     np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
