@@ -38,27 +38,28 @@ class FrameFile:
     camera_sha256: str | None = None
 
 
+def frame_facts(frame: RawFrame) -> dict[str, Any]:
+    """Return what is kept of a frame beside its bytes: plain data, for JSON."""
+    return {
+        "shape": list(frame.mosaic.shape),
+        "cfa": frame.cfa,
+        "black_level_dn": frame.black_level_dn.tolist(),
+        "white_level_dn": frame.white_level_dn,
+        "exposure_s": frame.exposure_s,
+        "gain": frame.gain,
+        "camera_time_s": frame.camera_time_s,
+        "host_time_s": frame.host_time_s,
+        "metadata": dict(frame.metadata),
+    }
+
+
 def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -> FrameEntry:
     """Return what a journal keeps of a frame beside its file, and `about` it.
 
     exposure_s, gain: the frame's own, or the camera's where it says none.
     """
-    return FrameEntry(
-        id="",
-        file="",
-        bytes=0,
-        sha256="",
-        shape=frame.mosaic.shape,
-        cfa=frame.cfa,
-        black_level_dn=frame.black_level_dn.tolist(),
-        white_level_dn=frame.white_level_dn,
-        exposure_s=exposure_s,
-        gain=gain,
-        camera_time_s=frame.camera_time_s,
-        host_time_s=frame.host_time_s,
-        metadata=dict(frame.metadata),
-        **about,
-    )
+    known = {**frame_facts(frame), "exposure_s": exposure_s, "gain": gain}
+    return FrameEntry(id="", file="", bytes=0, sha256="", **known, **about)
 
 
 def frame_file(frame: RawFrame) -> FrameFile:
