@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.cameras import CAMERAS
-from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
+from emmc_rig.acquisition.control import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell

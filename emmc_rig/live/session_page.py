@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.assessment import METHOD, stated_psnr_db
@@ -195,14 +193,13 @@ class SessionPage(EventWatcher):
         for frame in session.frames:
             entry = session.stored.get(frame.id)
             if entry is not None and frame.id not in self._frames:
-                span_dn = entry["white_level_dn"] - float(np.mean(entry["black_level_dn"]))
                 self._frames[frame.id] = {
                     "id": frame.id,
                     "kind": frame.kind,
                     "shot": frame.bench.shot,
-                    "exposure_s": entry["exposure_s"],
-                    "level": entry["figures"]["bright_dn"] / span_dn,
-                    "saturated": entry["figures"]["saturated"],
+                    "exposure_s": entry.exposure_s,
+                    "level": entry.level,
+                    "saturated": entry.figures.saturated,
                     "number": 0,
                     "stored": True,
                 }

@@ -52,8 +52,8 @@ WRITERS = {
 }  # fmt: skip
 READERS = {
     "devices camera", "devices conform", "devices home", "devices info", "devices jog",
-    "devices list", "devices probe", "devices udev-rule", "live", "session compare", "session list",
-    "session prune", "session show", "session verify",
+    "devices list", "devices probe", "devices udev-rule", "live", "session list",
+    "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
     "chart": "points.jsonl",
