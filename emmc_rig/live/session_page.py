@@ -57,7 +57,6 @@ class SessionPage(EventWatcher):
         super().__init__(self._heard, other)
         self._folder, self._control, self._computes = folder, control, computes
         self._changed = threading.Condition()
-        self._listeners: list[Callable[[], None]] = []
         self._frames: dict[str, dict[str, Any]] = {}
         self._small: dict[str, bytes] = {}
         self._newest: tuple[int, RawFrame] | None = None
@@ -127,10 +126,6 @@ class SessionPage(EventWatcher):
     def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
 
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change, by whichever thread made it."""
-        self._listeners.append(listener)
-
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Show what is under way."""
         super().step(name, frame)
@@ -159,8 +154,6 @@ class SessionPage(EventWatcher):
         with self._changed:
             self._state.update(parts)
             self._state["version"] += 1
-        for listener in self._listeners:
-            listener()
 
     def _heard(self, event: Event) -> None:
         with self._changed:
@@ -250,7 +243,7 @@ class SessionPage(EventWatcher):
         if newest is None:
             return None
         number, frame = newest
-        return Picture("newest", number, lambda: encoded(picture(frame, View(longest_px=1200))))
+        return Picture("newest", number, lambda: encoded(picture(frame, View(px=1200))))
 
     def _small_picture(self, query: Query) -> Picture | None:
         name = query.get("id", "")

@@ -111,7 +111,6 @@ class Watch:
         self._files = files or Files()
         self._found = Found()
         self._news = threading.Condition()
-        self._listeners: list[Callable[[], None]] = []
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
         self._focus = FocusMeter()
@@ -202,10 +201,6 @@ class Watch:
     def version(self) -> int:
         """Grows with every change of the state."""
         return self._state["version"]
-
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change, by whichever thread made it."""
-        self._listeners.append(listener)
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Let the frames that follow be exposed for so long."""
@@ -407,8 +402,6 @@ class Watch:
             self._state["steps"] = self._steps(self._state["hint"])
             self._state["version"] += 1
             self._news.notify_all()
-        for listener in self._listeners:
-            listener()
 
     def _away(self) -> list[str]:
         """Return the axes that stand elsewhere than centred, or not homed."""
