@@ -1,21 +1,23 @@
 """A lock on any disk, for one program at a time: the operating system's, or a file of that name.
 
 The system's lock goes with its program, however that ends. Where files cannot be locked (some
-network disks, Windows) the file itself is the lock, for only one program can make it; it stays when
+network disks) the file itself is the lock, for only one program can make it; it stays when
 that program is killed, and whoever meets it is told which file to delete.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from emmc_rig.model.json_text import parse_json
 
@@ -26,11 +28,18 @@ TRIES, WAIT_S = 200, 0.01
 class TakenError(Exception):
     """Another program has the lock; `holder` says which one, `advice` what to do."""
 
-    def __init__(self, path: Path, holder: str, by_file: bool, ended: bool = False) -> None:
-        self.holder = holder or "another program"
+    def __init__(self, path: Path, holder: Mapping[str, Any], by_file: bool) -> None:
+        self.holder = "another program"
+        if holder:
+            self.holder = "`{command}` (process {process} on {host}, since {since})".format(
+                **{"since": "an unknown time", **holder}
+            )
         self.advice = "wait until it ends, or stop it"
         if by_file:
             delete = f"delete {path}, for this disk cannot lock files"
+            here, process = holder.get("host") == socket.gethostname(), holder.get("process")
+            ours = process == os.getpid()
+            ended = here and isinstance(process, int) and not ours and not is_running(process)
             self.advice = (
                 f"it has ended: {delete}"
                 if ended
@@ -49,61 +58,43 @@ def take_lock(path: Path) -> Callable[[], None]:
             if not path.parent.is_dir():
                 raise
             continue  # it went between two looks at it
-        kept = False
+        by_file, is_free = False, True
         try:
-            try:
-                _lock(descriptor)
-                is_free = True
-            except BlockingIOError:
-                is_free = False
-            except (OSError, ImportError):
-                by_file, is_free = True, made
-            text = os.read(descriptor, 4096)
-            holder = _holder(text)
-            if holder and (not is_free or holder.get("by_file")):
-                stays = by_file or bool(holder.get("by_file"))
-                raise TakenError(path, _shown(holder), stays, _has_ended(holder))
-            if is_free and _is_named(descriptor, path):
-                if not text:
-                    # On a full disk the lock holds without a name.
-                    with suppress(OSError):
-                        os.write(descriptor, _own_name(by_file))
-                    kept = True
-                    return partial(_release, descriptor, path)
-                # Left by a killed program: its name must not be read any more.
-                os.unlink(path)
-        finally:
-            if not kept:
-                os.close(descriptor)
-        if not is_free:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            is_free = False
+        except OSError:
+            by_file, is_free = True, made
+        holder = _holder(os.read(descriptor, 4096))
+        is_taken = not is_free or bool(holder.get("by_file"))
+        if not is_taken and _is_named(descriptor, path):
+            with suppress(OSError):  # on a full disk the lock holds without a name
+                os.ftruncate(descriptor, 0)  # a killed program's name must not be read any more
+                os.pwrite(descriptor, _own_name(by_file), 0)
+            return partial(_release, descriptor, path)
+        os.close(descriptor)
+        if is_taken and holder:
+            raise TakenError(path, holder, by_file or bool(holder.get("by_file")))
+        if is_taken:
             time.sleep(WAIT_S)
-    raise TakenError(path, "", by_file)
+    raise TakenError(path, {}, by_file)
 
 
 def _opened(path: Path) -> tuple[int, bool]:
     """Return the file's descriptor, and whether this program made it."""
-    flags = os.O_RDWR | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
     except FileExistsError:
         return os.open(path, flags), False
 
 
-def _lock(descriptor: int) -> None:
-    import fcntl
-
-    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 def _release(descriptor: int, path: Path) -> None:
-    named, windows = _is_named(descriptor, path), os.name == "nt"
     try:
-        if named and not windows:
+        if _is_named(descriptor, path):
             os.unlink(path)
     finally:
         os.close(descriptor)
-    if named and windows:  # it removes no open file
-        os.unlink(path)
 
 
 def _is_named(descriptor: int, path: Path) -> bool:
@@ -126,7 +117,7 @@ def _own_name(by_file: bool) -> bytes:
     return json.dumps(name | ({"by_file": True} if by_file else {})).encode()
 
 
-def _holder(data: bytes) -> dict[str, object]:
+def _holder(data: bytes) -> dict[str, Any]:
     """Return who wrote a lock file; empty where it is not written yet."""
     try:
         name = parse_json(data, "the lock", ValueError)
@@ -135,31 +126,12 @@ def _holder(data: bytes) -> dict[str, object]:
     return name if isinstance(name, dict) and {*name} >= {"command", "process", "host"} else {}
 
 
-def _shown(holder: dict[str, object]) -> str:
-    """Return who holds a lock, in words."""
-    if not holder:
-        return ""
-    return "`{command}` (process {process} on {host}, since {since})".format(
-        **{"since": "an unknown time", **holder}
-    )
-
-
-def _has_ended(holder: dict[str, object]) -> bool:
-    """Return whether the holder is known to run no more: it ran on this computer."""
-    process = holder.get("process")
-    here = holder.get("host") == socket.gethostname() and os.name != "nt"
-    ours = process == os.getpid()
-    return here and isinstance(process, int) and not ours and not is_running(process)
-
-
 def is_running(process: int) -> bool:
-    """Return whether another process of that number runs; Windows is not asked."""
-    if process == os.getpid() or os.name == "nt":
-        return False
+    """Return whether another process of that number runs."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
-    return True
+    return process != os.getpid()
