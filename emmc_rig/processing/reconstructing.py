@@ -189,7 +189,6 @@ def reconstruct_folder(
     on_step: OnStep | None = None,
     chosen: str | None = None,
     pool: Pool | None = None,
-    tile: int | None = None,
     as_zarr: bool = False,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
@@ -198,7 +197,7 @@ def reconstruct_folder(
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    tile: see `compute_blocks`. as_zarr: write light field and maps as one Zarr group, by the pool,
+    as_zarr: write light field and maps as one Zarr group, by the pool,
     and no pictures.
     """
     find_method(method)
@@ -222,7 +221,7 @@ def reconstruct_folder(
                 on_step(Progress(done, None, None, of))
 
         with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
-            blocks = compute_blocks(job, frames, workers, tile, on_block)
+            blocks = compute_blocks(job, frames, workers, on_block)
             if as_zarr:
                 blocks.write_shards(out / RESULT_GROUP, workers)
         further |= blocks.metrics()

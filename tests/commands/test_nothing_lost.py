@@ -46,7 +46,6 @@ WRITERS = {
     "figure": ("scene.h5",),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
-    "reconstruct --tile": (8, "frames"),
     "session export": ("made-session",),
     "session sheet": ("made-session",),
     "simulate": (*SIZE,),
@@ -109,7 +108,7 @@ def world(tmp_path_factory):
 
 def edited(folder, typed):
     """Make a result of the command that somebody edited."""
-    command = typed.removesuffix(" SESSION").replace(" --theory", "").replace(" --tile", "")
+    command = typed.removesuffix(" SESSION").replace(" --theory", "")
     with result_folder(folder, command, belongs_to=folder, adds=True) as new:
         for name in ("metrics.json", "report.html"):
             (new / name).write_text("{}")
