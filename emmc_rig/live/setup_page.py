@@ -70,4 +70,4 @@ class SetupPage:
             assert frame is not None
             return encoded(picture(frame, view))
 
-        return Picture(view, newest.number, make)
+        return Picture(view.model_dump_json(), newest.number, make)

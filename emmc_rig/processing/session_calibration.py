@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from emmc_rig.model.arguments import path_of
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
-from emmc_rig.processing.calibration_settings import ROUTES
 from emmc_rig.processing.stored import REPORT, arrays_in, outcome_figures, save_outcome
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import sensor_pairs, stage_frames
@@ -31,6 +30,12 @@ from emmc_rig.session.readings import camera_json_of, taken_shots
 from emmc_rig.session.session import CALIBRATION, Session
 
 SENSOR, STAGE = "sensor.json", "stage.json"
+ROUTES = {
+    "auto": ("parametric", "mixed", "free", "combined"),
+    "parametric": ("parametric",),
+    "mixed": ("parametric", "mixed"),
+    "free": ("free",),
+}
 
 
 def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, Any]:
@@ -119,15 +124,14 @@ class SessionCalibration:
         with result_folder(Path(out), "calibrate", belongs_to=place) as folder:
             self.write(folder)
 
-    def write(self, folder: Path, truth: Mapping[str, float] | None = None) -> None:
-        """Write the same files into an existing folder; truth: parameters of a simulated bench."""
+    def write(self, folder: Path) -> None:
+        """Write the same files into an existing folder."""
         save_outcome(folder, self.outcome, self.calibration)
         stage = self.stage
         write_calibration_report(
             folder / REPORT,
             self.outcome,
             self.metrics,
-            truth,
             self.sensor,
             stage=None if stage is None else stage.map,
             places=() if stage is None else stage.rows(),

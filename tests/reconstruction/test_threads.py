@@ -56,8 +56,7 @@ def solved(method):
 print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
 """
 ROUTES = """
-from emmc_rig.processing.calibration_settings import CalibrateSettings
-from emmc_rig.processing.simulated import calibrate_simulated
+from simulated_calibration import CalibrateSettings, calibrate_simulated
 from emmc_rig.model.camera import Camera
 
 camera = Camera.model_validate_json(sys.argv[1])
