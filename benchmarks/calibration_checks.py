@@ -90,7 +90,7 @@ COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
-from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.processing.memory import peak_memory_mib
 atexit.register(lambda: print(peak_memory_mib(), time.process_time()))
 main()
 """

@@ -64,9 +64,9 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.processing.captures import reconstruct_captures
     from emmc_rig.processing.inputs import load_settings
     from emmc_rig.processing.memory import parse_memory
+    from emmc_rig.processing.reconstructing import reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:

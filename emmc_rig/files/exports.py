@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
-from emmc_rig.files.frames import FRAMES
+from emmc_rig.files.psi import FRAMES
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import fine_scene, open_scene, path_in
 from emmc_rig.model.errors import SceneError, nearest_of

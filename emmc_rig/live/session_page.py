@@ -18,7 +18,7 @@ from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import light_field_so_far
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import Pictures, export_of, field_pictures
+from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError

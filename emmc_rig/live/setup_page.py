@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import field_pictures
+from emmc_rig.live.light_field import field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite
 from emmc_rig.live.steps import LONGEST_UNASKED_S

@@ -26,14 +26,13 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.processing.memory import task_bytes
+from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary

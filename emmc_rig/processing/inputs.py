@@ -8,8 +8,7 @@ import numpy as np
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
-from emmc_rig.files.frames import PSI, read_frames
-from emmc_rig.files.psi import open_psi, psi_beside
+from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml

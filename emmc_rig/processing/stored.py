@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.placement import SCALARS, labels
 from calibration.routes import Outcome
 from calibration.whiteboard import Calibration, NewArray
-from emmc_rig.files.frames import PSI
+from emmc_rig.files.psi import PSI
 
 Array = NDArray[np.floating]
 

@@ -19,10 +19,10 @@ from pathlib import Path
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
 from emmc_rig.pages.pictures import epipolar_lines
 from emmc_rig.pages.thumbnails import save_thumbnail
+from emmc_rig.processing.memory import forget_peak, peak_memory_mib
 from emmc_rig.study.chart.chart_points import Point
 from emmc_rig.study.rows import available_cores, plain
 from emmc_rig.study.scores import scored
