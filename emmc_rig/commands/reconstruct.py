@@ -64,9 +64,8 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.processing.inputs import load_settings
     from emmc_rig.processing.memory import parse_memory
-    from emmc_rig.processing.reconstructing import reconstruct_captures
+    from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
@@ -82,7 +81,7 @@ def reconstruct(
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget chooses the method and its settings")
         from emmc_rig.processing.budget import method_within
-        from emmc_rig.processing.inputs import open_frames
+        from emmc_rig.processing.reconstructing import open_frames
 
         method, why = method_within(*open_frames(frames[0], psi), budget)
         say("chosen", why, "cyan")
