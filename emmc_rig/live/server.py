@@ -79,27 +79,17 @@ Action = Callable[..., Mapping[str, Any] | None]
 
 
 class Page(Protocol):
-    """What is served; every member may be used by any thread."""
+    """What is served; every member may be used by any thread.
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Files of the package `emmc_rig.live` or templates; the first is the page itself."""
-        ...
+    files: of the package `emmc_rig.live` or templates; the first is the page itself. pictures: by
+    name; each takes a query, and returns None while there is none. actions: by name, what POST
+    does; a mapping returned is part of the answer. urgent: the actions that wait for no other.
+    """
 
-    @property
-    def pictures(self) -> Mapping[str, Pictured]:
-        """By name; each takes a query, and returns None while there is none."""
-        ...
-
-    @property
-    def actions(self) -> Mapping[str, Action]:
-        """By name, what POST does; a mapping returned is part of the answer."""
-        ...
-
-    @property
-    def urgent(self) -> frozenset[str]:
-        """The actions that wait for no other."""
-        ...
+    files: tuple[str, ...]
+    pictures: Mapping[str, Pictured]
+    actions: Mapping[str, Action]
+    urgent: frozenset[str]
 
     @property
     def version(self) -> int:

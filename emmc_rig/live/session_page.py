@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,8 @@ class SessionPage(EventWatcher):
     the disk; where the capture itself does (`--until`) its light field is shown.
     """
 
-    files = ("session.html", "session.js", *COMMON_FILES)
-    urgent = frozenset({"pause", "stop"})
+    files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
+    urgent: frozenset[str] = frozenset({"pause", "stop"})
 
     def __init__(
         self,
@@ -89,12 +89,12 @@ class SessionPage(EventWatcher):
             "light_field": None,
             "trouble": {"light field": ""},
         }
-        self.pictures: dict[str, Pictured] = {
+        self.pictures: Mapping[str, Pictured] = {
             "newest.jpg": self._newest_picture,
             "frame.jpg": self._small_picture,
             **field_pictures(lambda: self._pictures),
         }
-        self.actions: dict[str, Action] = {
+        self.actions: Mapping[str, Action] = {
             "pause": lambda: self._wish("pausing after this frame", control.pause),
             "resume": lambda: self._wish("", control.resume),
             "stop": lambda: self._wish("stopping after this frame", control.stop),

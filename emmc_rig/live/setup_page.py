@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from emmc_rig.errors import AppError
@@ -19,16 +20,16 @@ class SetupPage:
     following: the command to go on with once a plan was saved; "": none is known.
     """
 
-    files = ("page.html", "page.js", *COMMON_FILES)
-    urgent = frozenset({"stop", "cancel"})
+    files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)
+    urgent: frozenset[str] = frozenset({"stop", "cancel"})
 
     def __init__(self, watch: Watch, following: str = "") -> None:
         self._watch = watch
-        self.pictures: dict[str, Pictured] = {
+        self.pictures: Mapping[str, Pictured] = {
             "picture.jpg": self._picture,
             **field_pictures(lambda: watch.light_field and watch.light_field.pictures()),
         }
-        self.actions: dict[str, Action] = {
+        self.actions: Mapping[str, Action] = {
             "exposure": lambda seconds: watch.set_exposure_s(finite(seconds)),
             "gain": lambda factor: watch.set_gain(finite(factor)),
             "autoexpose": lambda longest_s=LONGEST_UNASKED_S: watch.auto_expose(finite(longest_s)),
