@@ -20,7 +20,7 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.processing.exposure import expected_gain_db
+from emmc_rig.processing.reconstructing import expected_gain_db
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify

@@ -31,7 +31,6 @@ WRITERS = {
     "cameras": ("rgbw-mono",),
     "capture": ("other.yaml", *RIG),
     "capture --new": ("rgbw-mono",),
-    "calibrate": (*SIZE,),
     "calibrate SESSION": ("made-session",),
     "calibrate --drift": ("frames", "--known", "frames"),
     "calibrate --plan": (*SIZE,),

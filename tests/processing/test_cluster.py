@@ -133,14 +133,14 @@ def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
         "reconstruct", frames, "--method", "tv", "--settings", settings, "--out", tmp_path / "out",
         "--cluster", cluster.scheduler_address,
     )  # fmt: skip
-    written, first = block_tasks._write_arrays, threading.Lock()
+    written, first = block_tasks._write, threading.Lock()
 
-    def write_arrays(path, arrays):
+    def write_arrays(path, arrays, about):
         if path.name.startswith("block-") and first.acquire(blocking=False):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return written(path, arrays)
+        return written(path, arrays, about)
 
-    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
+    monkeypatch.setattr(block_tasks, "_write", write_arrays)
     code, _, err = program(*given)
     assert (code, "No space left" in err, "Traceback" in err) == (1, True, False), err
     assert not (tmp_path / "out/light_field.h5").exists()

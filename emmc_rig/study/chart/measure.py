@@ -19,8 +19,8 @@ from pathlib import Path
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
+from emmc_rig.processing.memory import forget_peak, peak_memory_mib
 from emmc_rig.study.chart.chart_points import Point
 from emmc_rig.study.pictured import save_pair
 from emmc_rig.study.rows import available_cores, plain
