@@ -19,10 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from emmc_rig.model import kernels
-from emmc_rig.model.arguments import numbers_of, path_of, refusal
+from emmc_rig.model.arguments import numbers_of, pair_of, path_of, refusal
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.json_text import parse_json
+from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.reading import stored_arrays
 
 Array = NDArray[np.floating]
@@ -295,6 +296,84 @@ class ImagingMatrix:
             (np.broadcast_to(row, shape)[kept], np.broadcast_to(column, shape)[kept]),
         )
         return sparse.csr_array(entries, shape=self.shape)
+
+    @classmethod
+    def from_scipy(
+        cls,
+        matrix: sparse.sparray | sparse.spmatrix,
+        views: tuple[int, int],
+        size: tuple[int, int],
+        cfa: str | tuple[str, ...] = "mono",
+        binning: int = 1,
+    ) -> ImagingMatrix:
+        """Return Psi from an explicit sparse matrix, such as another program's.
+
+        Args:
+            matrix: rows are readings (shot, pixel_y, pixel_x), row-major. Columns are samples of
+                the light field, (v, u, y, x, c) as `to_scipy` has them, or (v, u, y, x): light of
+                the colour that the pixel sees, of a monochrome sensor's white light.
+            views: rows and columns of views.
+            size: rows and columns of samples of a view.
+            cfa: the colour filters, where the columns have no colour.
+            binning: k; a pixel sums k x k samples.
+
+        Raises:
+            SensingError: a shape that does not fit, entries that are no finite numbers, a reading
+                of samples that do not lie at its own pixel.
+            ArgumentError: an argument of another type.
+
+        >>> psi = ImagingMatrix.from_scipy(sparse.eye_array(6), views=(1, 1), size=(2, 3))
+        >>> psi, psi.to_scipy().nnz
+        (Psi(1 shot, 1x1 views, 2x3, three colours a pixel, 7.2e-05 MB), 18)
+        """
+        if not sparse.issparse(matrix):
+            raise refusal(matrix, "matrix", "a sparse matrix of SciPy")
+        views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")
+        size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
+        if not isinstance(binning, int) or binning < 1:
+            raise refusal(binning, "binning", "the number of samples along a pixel's side")
+        entries = sparse.coo_array(sparse.csr_array(matrix, dtype=np.float32))
+        pixels = size[0] // binning, size[1] // binning
+        readings, samples = int(np.prod(pixels)), int(np.prod((*views, *size)))
+        rows, columns = entries.shape  # pyright: ignore[reportGeneralTypeIssues]
+        row, column = entries.row, entries.col
+        shots, per_sample = rows // max(readings, 1), columns // samples
+        if rows != shots * readings or not shots or columns not in (samples, 3 * samples):
+            raise SensingError(
+                f"a matrix of {rows} x {columns} is no Psi: {views} views of {size} samples need "
+                f"{samples} or {3 * samples} columns, and {readings} rows a shot"
+            )
+        v, u, y, x, c = np.unravel_index(column, (*views, *size, per_sample))
+        shot, pixel_y, pixel_x = np.unravel_index(row, (shots, *pixels))
+        astray = np.flatnonzero((y // binning != pixel_y) | (x // binning != pixel_x))
+        if astray.size:
+            n = astray[0]
+            raise SensingError(
+                f"{astray.size} entries lie off their pixel, the first in row {row[n]}, column "
+                f"{column[n]}: pixel ({pixel_y[n]}, {pixel_x[n]}) would see the sample ({y[n]}, "
+                f"{x[n]}); Psi here is of cameras whose pixels see the views at their own place"
+            )
+        weights = np.zeros((shots, *views, size[0], 3, size[1]), dtype=np.float32)
+        if per_sample == 3:
+            weights[shot, v, u, y, c, x] = entries.data
+            return cls(weights, None, binning)._compact()
+        tile = cfa_tile(cfa)
+        of_pixel = tile[pixel_y % tile.shape[0], pixel_x % tile.shape[1]]
+        shares = of_pixel / of_pixel.sum(axis=-1, keepdims=True)
+        for colour in range(3):
+            weights[shot, v, u, y, colour, x] = entries.data * shares[:, colour]
+        return cls(weights, None, binning)._compact()
+
+    def _compact(self) -> ImagingMatrix:
+        """Return Psi with one stored colour where every sample's pixel sees one at most."""
+        seen = self.weights.any(axis=(1, 2))  # (shot, y, colour, x)
+        if seen.sum(axis=2).max() > 1:
+            return self
+        colour = seen.argmax(axis=2).astype(np.uint8)
+        chosen = colour[:, None, None, :, None, :].astype(np.intp)
+        return ImagingMatrix(
+            np.take_along_axis(self.weights, chosen, axis=4), colour, self.binning, self.camera_json
+        )
 
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""

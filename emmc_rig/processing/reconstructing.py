@@ -53,7 +53,7 @@ from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
-PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi(weights, colour)"
+PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_scipy(matrix, ...)"
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""

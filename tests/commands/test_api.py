@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from matplotlib import pyplot
+from scipy import sparse
 
 import emmc_rig as emmc
 from emmc_rig.files import scenes
@@ -229,7 +230,7 @@ MISTAKES = {
     "a seed as text": (lambda t: api.scene("dark", size=(24, 32), seed="a"), "seed: got 'a'"),
     "a picture as a folder": (lambda t: api.open_frames(__file__), "a file; open_frames takes"),
     "frames of an array": (lambda t: api.open_frames(t[2].readings), "folder: got ndarray"),
-    "a Psi of SciPy": (lambda t: api.reconstruct(t[1].to_scipy(), t[2]), "Psi.load"),
+    "a Psi of SciPy": (lambda t: api.reconstruct(t[1].to_scipy(), t[2]), "Psi.from_scipy"),
     "a Psi's file": (lambda t: api.reconstruct("psi.h5", t[2]), "psi: got 'psi.h5'; it takes"),
     "Psi and frames swapped": (lambda t: api.reconstruct(t[2], t[1]), "psi: got SimulatedFrames"),
     "no frames": (lambda t: api.reconstruct(t[1], None), "frames: got None; it takes frames"),
@@ -267,6 +268,15 @@ MISTAKES = {
         "int64; it takes",
     ),
     "a file of no name": (lambda t: api.Psi.load(None), "path: got None; it takes"),
+    "a dense matrix": (lambda t: api.Psi.from_scipy(np.eye(6), (1, 1), (2, 3)), "matrix: got nd"),
+    "a matrix of another size": (
+        lambda t: api.Psi.from_scipy(sparse.eye_array(6), (2, 2), (2, 3)),
+        "need 24 or 72 columns, and 6 rows a shot",
+    ),
+    "a matrix that blurs": (
+        lambda t: api.Psi.from_scipy(sparse.eye_array(6, k=1), (1, 1), (2, 3)),
+        r"5 entries lie off their pixel, the first in row 0, column 1: pixel \(0, 0\)",
+    ),
     "a light field as text": (lambda t: t[1] @ "scene", "light field: got 'scene'"),
     "frames as text": (lambda t: t[1].T @ "frames", "frames: got 'frames'"),
     "Psi of one side": (lambda t: api.camera("rgbw-mono").psi(24), "size: got 24; it takes"),
@@ -298,6 +308,36 @@ def test_a_camera_is_also_a_dict_or_a_camera_and_a_scene_also_an_array(taken):
     given = emmc.scene(np.asarray(scene), size=(20, 24))
     np.testing.assert_array_equal(given, np.asarray(emmc.scene(scene, size=(20, 24))))
     np.testing.assert_array_equal(given, np.asarray(scene)[:, :, 8:28, 10:34])
+
+
+@pytest.mark.parametrize("name", ["rgbw-bayer-2shots", "rgbw-mono"])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_psi_becomes_a_matrix_of_scipy_and_comes_back(name, binning):
+    description = emmc.camera(name).model_dump(mode="json")
+    description["sensor"]["binning"] = binning
+    psi = emmc.camera(description).psi((12, 16))
+    back = emmc.Psi.from_scipy(psi.to_scipy(), (5, 5), (12, 16), binning=binning)
+    assert back.frames_shape == psi.frames_shape
+    np.testing.assert_array_equal(back.to_scipy().toarray(), psi.to_scipy().toarray())
+    assert back.weights.shape == psi.weights.shape
+
+
+def test_a_matrix_without_colours_gets_those_of_the_filters():
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(size=(2, 3, 4, 6))  # (v, u, y, x)
+    views = [np.diag(view.ravel()) for view in weights.reshape(6, 4, 6)]
+    matrix = sparse.csr_array(np.hstack(views))
+    light_field = rng.uniform(size=(2, 3, 4, 6, 3)).astype(np.float32)
+    psi = emmc.Psi.from_scipy(matrix, (2, 3), (4, 6), cfa="rggb")
+    tile = np.array([[0, 1], [1, 2]])  # red, green; green, blue
+    y, x = np.indices((4, 6))
+    seen = light_field[:, :, y, x, tile[y % 2, x % 2]]
+    np.testing.assert_allclose((psi @ light_field)[0], (weights * seen).sum(axis=(0, 1)), rtol=1e-5)
+    mono = emmc.Psi.from_scipy(matrix, (2, 3), (4, 6))
+    grey = light_field.mean(axis=-1)
+    np.testing.assert_allclose(
+        (mono @ light_field)[0], (weights * grey).sum(axis=(0, 1)), rtol=1e-5
+    )
 
 
 def test_a_verdict_is_one_sentence(taken):
