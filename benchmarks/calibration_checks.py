@@ -60,7 +60,7 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
 from emmc_rig.progress import Silent
-from emmc_rig.session.frame_file import frame_file
+from emmc_rig.session.frame_file import NO_FIGURES, frame_entry, frame_file
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import session_readings, shot_frames
@@ -415,9 +415,10 @@ def draw_session(folder: Path, settings: CalibrateSettings, channels: NDArray[np
         data = encode_dng(
             mosaic, camera.sensor.cfa_name, noise.black_level_dn, noise.white_level_dn, exposure_s
         )
-        file = frame_file(decode_raw(data))
-        facts = {**file.facts, "exposure_s": exposure_s, "gain": 1.0, "host_time_s": seconds}
-        session.store(planned, file.suffix, file.data, file.sha256, lambda facts=facts: facts)
+        frame = decode_raw(data)
+        entry = frame_entry(frame, exposure_s, 1.0, figures=NO_FIGURES)
+        entry = entry.model_copy(update={"host_time_s": seconds})
+        session.store(planned, frame_file(frame), lambda entry=entry: entry)
     return shadow
 
 
