@@ -257,10 +257,9 @@ def _is_packet(raw: memoryview) -> bool:
 def _leader_at_end(raw: memoryview) -> bytes | None:
     """Return the leader that a transfer is, or that ends it after the rest of a frame."""
     for at in (0, len(raw) - codec.LEADER_SIZE):
-        if at >= 0 and codec.begins_with(raw[at:], codec.LEADER_PREFIX):
-            with suppress(CameraFormatError):
-                codec.decode_leader(raw[at:])
-                return raw[at:].tobytes()
+        with suppress(CameraFormatError):
+            codec.decode_leader(raw[at:])
+            return raw[at:].tobytes()
     return None
 
 

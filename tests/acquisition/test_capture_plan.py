@@ -148,7 +148,8 @@ def test_an_estimate_counts_exposures_moves_and_bytes():
     assert reported.guessed == 0
     # Two moves settle for 1 s each and the second goes 4 mm at 1 mm/s.
     assert 6.0 <= reported.moving_s <= 7.0
-    assert 2e6 <= reported.bytes <= 2.1e6
+    # Each a megabyte of pixels, 4 KiB of the file's own and 1500 bytes of the journal's.
+    assert reported.bytes == 2 * (1_000_000 + 4096 + 1500)
     assert reported.by_hand == 0
 
 
@@ -238,6 +239,13 @@ def test_darks_of_the_shots_come_after_the_scene_is_metered_and_before_the_first
     for frame in darks:
         assert places[frame.id] < first_shot
         assert frame.exposure_s is not None or places[str(meter)] < places[frame.id]
+
+
+def test_shots_no_longer_than_a_planned_dark_need_no_darks_of_their_own():
+    darks = {"exposure_s": [0.01, 1.0], "of_shots": 2}
+    for exposure_s, count in ((0.5, 0), (2.0, 2)):
+        frames = frames_of(plan_of(shots=[{"exposure_s": exposure_s}], darks=darks))
+        assert sum(frame.is_dark_of_shots for frame in frames) == count
 
 
 @pytest.mark.parametrize("name", list(shipped_cameras()))

@@ -1,11 +1,15 @@
 """Which file of a recording is which planned frame: by name, time and exposure, never a guess."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from capture_rigs import begun, still_rig
+from simulated_disk import SimulatedDisk
 
 from drivers.dng import encode_dng
 from drivers.folder import FolderCamera, Recorded
-from emmc_rig.acquisition.replay import matched, missing_words
+from emmc_rig.acquisition.replay import matched, missing_words, there
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 
@@ -47,6 +51,21 @@ def test_metered_frames_are_matched_in_order_or_by_name_only():
     assert names(planned, files(a=0.3, b=0.1)) == {"meter": "a.dng", "shot": "b.dng"}
     assert names(planned, files(a=0.3)) == {}
     assert names(planned, [Recorded("00007-shot.dng", 0.1, "")]) == {"shot": "00007-shot.dng"}
+
+
+def test_a_frame_is_taken_once_it_and_what_meters_it_have_files():
+    session, _ = begun(Path("/disk"), SimulatedDisk(), still_rig())
+    (metered, *_), plain = (
+        [f for f in session.frames if f.metered_by == "meter-shot-1"],
+        "dark-e0-r0",
+    )
+    file = Recorded("x.dng", None, "")
+
+    def chosen(*names):
+        return {f.id for f in there(session, dict.fromkeys(names, file))(lambda: 0.0)}
+
+    assert chosen(plain, metered.id) == {plain}
+    assert chosen(metered.id, "meter-shot-1") == {metered.id, "meter-shot-1"}
 
 
 def test_what_is_missing_is_named_with_its_exposure(tmp_path):

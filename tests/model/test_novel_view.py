@@ -7,6 +7,7 @@ import pytest
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import (
     between,
+    centre_disparity,
     estimated_disparity,
     view_disparities,
 )
@@ -84,6 +85,18 @@ def test_what_every_view_sees_follows_from_the_centre(scene):
     agreed = np.abs(made - disparities)[:, :, *INNER] < 0.01
     assert agreed.mean() > 0.99
     assert np.isfinite(made).all()
+
+
+def test_a_disparity_of_the_centre_view_is_taken_and_any_other_estimated(scene):
+    light_field, disparities = scene
+    given = disparities[2, 2].copy()
+    given[:3] = np.nan
+    taken = centre_disparity(light_field, given)
+    np.testing.assert_array_equal(taken[3:], given[3:])
+    assert (taken[:3] == -1).all()  # the median: most of the picture is the far plane
+    for other in (None, given[::2, ::2]):
+        made = centre_disparity(light_field, other)
+        np.testing.assert_array_equal(made, estimated_disparity(light_field))
 
 
 def test_a_plane_s_disparity_is_estimated():

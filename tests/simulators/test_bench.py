@@ -114,6 +114,48 @@ def test_a_misplaced_mask_reads_as_the_imaging_matrix_of_a_moved_one():
     assert relative_error(found, expected) < 3e-3
 
 
+@pytest.mark.parametrize("skew", [0.0, 0.25])
+def test_a_mask_turned_by_a_right_angle_turns_its_shadow(skew):
+    """A mask's cells are the columns x + skew y and the rows y, both turned with the mask."""
+    camera, size = coded("mono"), (24, 24)
+
+    def shadow(turn_deg):
+        errors = MountingErrors((0.0, 0.0), turn_deg, 1.0, skew=skew)
+        bench = bench_for(camera, light_field(size=size), OPEN, errors, size=size)
+        bench.target = "whiteboard"
+        return bench.readings()
+
+    upright = shadow(0.0)
+    assert relative_error(shadow(90.0), np.rot90(upright, -1)) < 5e-3
+    assert relative_error(np.rot90(upright), upright) > 0.1
+
+
+def test_a_mask_s_columns_lean_by_its_skew():
+    """By half a pixel a row, with skew 1/2: each two rows shift the stripes by a whole one."""
+    stripes = {"kind": "tile", "cells": [[1, 0]]}
+    mask = {"code": {"distance_mm": 0.02, "cell_um": 96, "pattern": stripes}}
+    camera, size = coded("mono", masks=mask), (16, 24)
+    errors = MountingErrors((0.0, 0.0), 0.0, 1.0, skew=0.5)
+    bench = bench_for(camera, light_field(size=size), OPEN, errors, size=size)
+    bench.target = "whiteboard"
+    readings = bench.readings()
+    np.testing.assert_allclose(readings[2:, :-1], readings[:-2, 1:], atol=0.01)
+    assert np.ptp(readings) > 0.9
+
+
+@pytest.mark.parametrize(("finer", "focus_um"), [(1, 100.0), (2, 50.0)])
+def test_out_of_focus_every_view_moves_by_its_steps_from_the_middle(finer, focus_um):
+    """A hundredth of a sample per um and view: here one sample of the scene, however fine."""
+    camera = coded("mono", masks={})
+    scene = light_field(size=(finer * SIZE[0], finer * SIZE[1]))
+    moved = scene.copy()
+    for v, u in np.ndindex(5, 5):
+        moved[v, u] = np.roll(scene[v, u], (v - 2, u - 2), axis=(0, 1))
+    found = bench_for(camera, scene, {**OPEN, "focus": focus_um}).readings()
+    expected = bench_for(camera, moved, OPEN).readings()
+    np.testing.assert_allclose(found[2:-2, 2:-2], expected[2:-2, 2:-2], rtol=1e-5)
+
+
 def test_the_stage_moves_the_mask_as_an_offset_does():
     camera = coded(shots=[{"offset_um": {"code": [60.0, 20.0]}}])
     expected = build_imaging_matrix(camera, SIZE).forward(light_field())[0]
