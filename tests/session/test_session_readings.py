@@ -116,6 +116,13 @@ darks: {{repeats: 4, of_shots: {of_shots}}}
         assert off.mean() == pytest.approx(0.033, abs=0.003)
         assert off.mean() < 1.5 * deviation
         assert any("no dark frame is exposed as long" in text for text in reasons)
+        # 100 electrons/s for as much longer as the longest exposure is than the darks'.
+        shots = [entry for name, entry in session.stored.items() if name.startswith("shot-")]
+        longest = max(shots, key=lambda entry: entry.exposure_s)
+        more_s = longest.exposure_s - session.stored["dark-0-r0"].exposure_s
+        unknown_dn = noise.gain_dn_per_electron * 100 * more_s
+        (exposed,) = shot_exposures(session)
+        assert exposed.dark_share == pytest.approx(unknown_dn / longest.figures.bright_dn)
 
 
 def test_a_person_is_asked_again_only_when_something_changes():
