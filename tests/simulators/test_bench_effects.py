@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.special import fresnel
+from scipy.special import erf, fresnel
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.noise import SensorNoise
 from simulators.bench import NO_ERRORS, Bench, _met
 from simulators.flaws import BoardFlaws, LampFlaws, OpticsFlaws, SensorFlaws, diffracted
 
@@ -118,6 +119,111 @@ def test_an_edge_diffracts_as_fresnel_integrals_say():
     assert found.max() == pytest.approx(1.37, abs=0.02)
 
 
+def test_light_falls_off_by_the_fourth_power_of_the_cosine():
+    falls = OpticsFlaws(vignetting=1.0).falloff((5, 9), (3, 3), (50_000.0, 2_000.0, 5_000.0))
+    # The view at (v, u) = (-5, 5) mm at the lens, from the pixel at (y, x) = (4, -8) mm.
+    slope2 = ((4 + 5) ** 2 + (-8 - 5) ** 2) / 50**2
+    assert falls[0, 2, 4, 0] == pytest.approx((1 + slope2) ** -2)
+    assert falls[1, 1, 2, 4] == 1
+
+
+def test_a_microlens_sees_the_light_along_its_axis_best():
+    flaws = OpticsFlaws(microlens_power=8.0, chief_ray_error=0.5)
+    falls = flaws.falloff((5, 9), (3, 3), (50_000.0, 2_000.0, 5_000.0))
+    # Half the chief ray's slope missed: at x = 8 mm the axis meets the lens at 4 mm, not at 0.
+    assert falls[1, 2, 2, 8] == pytest.approx((1 + (1 / 50) ** 2) ** -4)
+    assert falls[0, 1, 0, 4] == pytest.approx((1 + (3 / 50) ** 2) ** -4)
+    np.testing.assert_allclose(falls, falls[::-1, ::-1, ::-1, ::-1])
+
+
+def test_open_and_closed_cells_pass_their_shares_and_dust_dims_its_disc():
+    cells = np.ones((30, 30, 3), np.float32)
+    cells[:, 15:] = 0
+    plain, side_um = OpticsFlaws(clear=0.9, leak=0.1).soiled(cells, 36.0, 300.0)
+    assert side_um == 36
+    np.testing.assert_allclose(plain, np.where(cells > 0, 0.9, 0.1), rtol=1e-6)
+    dusty = OpticsFlaws(dust_specks=1, dust_radius_um=(50.0, 50.0), dust_transmittance=0.25)
+    fine, side_um = dusty.soiled(np.ones((30, 30, 3), np.float32), 36.0, 300.0)
+    assert side_um == 6
+    specks = fine[..., 0] == 0.25
+    assert ((fine[..., 0] == 1) | specks).all()
+    assert specks.sum() * 6**2 == pytest.approx(np.pi * 50**2, rel=0.05)
+
+
+def test_a_blurred_edge_is_the_integral_of_a_normal_distribution():
+    cells = np.zeros((4, 8, 3), np.float32)
+    cells[:, 4:] = 1
+    fine, side_um = OpticsFlaws(colour_blur_um=(0.0, 12.0, 0.0)).soiled(cells, 36.0, 300.0)
+    x_um = (np.arange(48) + 0.5 - 24) * side_um
+    np.testing.assert_array_equal(fine[0, :, 0], x_um > 0)
+    np.testing.assert_allclose(fine[0, :, 1], (1 + erf(x_um / 12 / 2**0.5)) / 2, atol=0.01)
+
+
+NOISE = SensorNoise(
+    electrons_per_s=1e5,
+    gain_dn_per_electron=0.5,
+    read_noise_electrons=2.0,
+    black_level_dn=100,
+    white_level_dn=65535,
+)
+
+
+def electrons(flaws, reading=0.0, exposure_s=1.0, seconds=0.0):
+    """A frame (y, x) of an evenly lit sensor, in electrons above black."""
+    lit = np.full((200, 200), reading)
+    frame = flaws.expose_dn(NOISE, lit, exposure_s, 1.0, np.random.default_rng(0), seconds)
+    return (frame - 100.0) / 0.5
+
+
+def test_dark_current_collects_with_time_and_doubles_every_6_5_kelvin():
+    warming = SensorFlaws(dark_electrons_per_s=10_000.0, warming_k=6.5)
+    for seconds, times in ((0.0, 1.0), (120.0, 2 ** (1 - np.exp(-1))), (1e6, 2.0)):
+        collected = electrons(warming, exposure_s=0.5, seconds=seconds)
+        assert collected.mean() == pytest.approx(5_000 * times, rel=1e-3)
+        assert collected.var() == pytest.approx(5_000 * times, rel=0.05)
+
+
+def test_hot_pixels_collect_without_light_and_dead_ones_hardly_any():
+    flaws = SensorFlaws(bad_share=0.1)
+    hot, dead = flaws.bad((200, 200))
+    assert (hot.mean(), dead.mean()) == pytest.approx((0.05, 0.05), abs=0.005)
+    seen = electrons(flaws, reading=1.0, exposure_s=0.1)
+    assert seen[hot].mean() == pytest.approx(10_000 + 40_000, rel=0.01)
+    assert seen[dead].mean() == pytest.approx(0.02 * 10_000, rel=0.01)
+    assert seen[~hot & ~dead].mean() == pytest.approx(10_000, rel=0.01)
+
+
+def test_a_full_well_holds_no_more_and_the_response_bends_towards_it():
+    flaws = SensorFlaws(full_well_electrons=80_000.0, bend=0.1)
+    # A tenth is lost at full well, a twentieth at half.
+    assert electrons(flaws, reading=2.0).mean() == pytest.approx(72_000, rel=1e-4)
+    assert electrons(flaws, reading=0.4).mean() == pytest.approx(38_000, rel=1e-3)
+
+
+def test_pixels_differ_in_response_and_black_and_rows_in_their_noise():
+    uneven = electrons(SensorFlaws(response_spread=0.05), reading=0.5)
+    assert uneven.var() == pytest.approx((0.05 * 50_000) ** 2 + 50_000, rel=0.05)
+    black = electrons(SensorFlaws(offset_spread_dn=10.0))
+    assert black.var() == pytest.approx((10 / 0.5) ** 2 + 2**2, rel=0.05)
+    rows = electrons(SensorFlaws(row_noise_electrons=50.0), reading=0.01)
+    assert rows.mean(axis=1).std() == pytest.approx(50, rel=0.15)
+    assert rows.mean(axis=0).std() < 5
+
+
+def test_filters_pass_their_share_of_the_neighbouring_colours_and_open_pixels_all():
+    mixed = SensorFlaws(crosstalk=0.1).mixed(np.eye(3, dtype=np.float32))
+    np.testing.assert_allclose(mixed, [[0.9, 0.1, 0], [0.05, 0.9, 0.05], [0, 0.1, 0.9]])
+    white = np.ones((1, 3), np.float32)
+    np.testing.assert_array_equal(SensorFlaws(crosstalk=0.1).mixed(white), white)
+
+
+def test_a_board_out_of_focus_is_seen_shifted_by_its_parallax():
+    seen = BoardFlaws(place_spread=0.2, parallax_px=3.0).radiance((12, 18), (5, 5), 0.0)
+    np.testing.assert_allclose(seen[4, 2, :-3], seen[2, 2, 3:], rtol=1e-6)
+    np.testing.assert_allclose(seen[2, 0, :, 3:], seen[2, 2, :, :-3], rtol=1e-6)
+    assert np.ptp(seen[2, 2]) > 0.1
+
+
 def test_a_turned_board_turns_its_unevenness_and_keeps_its_mean():
     flaws = BoardFlaws(angle_spread=0.1)
     upright, turned = (flaws.radiance(SIZE, (5, 5), turn)[:, :, 0, 0] for turn in (0.0, 90.0))
@@ -133,3 +239,5 @@ def test_the_lamp_warms_up_and_its_colours_drift_apart():
     ratio = warm.readings() / cold.readings()
     assert ratio[0, 0] == pytest.approx(1.03, rel=1e-4)
     assert ratio[1, 1] == pytest.approx(1.01, rel=1e-4)
+    warming = LampFlaws(0.02, 0.01).levels(120.0)
+    np.testing.assert_allclose(warming, 1 + (1 - np.exp(-1)) * np.array([0.03, 0.02, 0.01]))
