@@ -357,10 +357,10 @@ def test_an_emergency_stop_is_never_argued_with():
 
 
 def test_what_has_to_be_mended_follows_from_the_fault():
-    first = mending(DriverError("x"), 1)
-    assert first == Mending(wait_s=0.1)
-    assert mending(DriverError("x"), 3).reopen_camera
-    assert mending(DriverError("x"), 9).wait_s == 5.0
+    found = [mending(DriverError("x"), attempt) for attempt in range(1, 8)]
+    assert found[0] == Mending(wait_s=0.1)
+    assert [one.wait_s for one in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
+    assert [one.reopen_camera for one in found] == [False, False, True, False, False, True, False]
 
 
 def planned(kind):

@@ -116,14 +116,20 @@ def test_a_metered_exposure_comes_after_its_metering():
                 assert names.index(frame.metered_by) < names.index(frame.id)
 
 
-def test_a_line_of_places_is_visited_from_end_to_end():
-    rng = np.random.default_rng(0)
-    places_um = rng.permutation(np.arange(60) * 100.0)
+@pytest.mark.parametrize("shape", [(60, 1), (5, 5)])
+def test_each_place_of_a_line_or_a_grid_is_one_step_from_the_one_before(shape):
+    """Axes move at once: a step along a grid's diagonal is no longer than one along an axis."""
+    places_um = 100.0 * np.random.default_rng(0).permutation(list(np.ndindex(shape)))
     frames = [
-        PlannedFrame(f"f{i}", "shot", Bench("scene", "white", 0, 0, True, {"mask_x": um}), 0.1)
-        for i, um in enumerate(places_um)
+        PlannedFrame(
+            f"f{i}",
+            "shot",
+            Bench("scene", "white", 0, 0, True, {"mask_x": x_um, "mask_y": y_um}),
+            0.1,
+        )
+        for i, (x_um, y_um) in enumerate(places_um)
     ]
-    assert travel_um(ordered(frames, "least-travel")) == pytest.approx(5900, rel=0.05)
+    assert travel_um(ordered(frames, "least-travel")) == 100 * (len(frames) - 1)
 
 
 def test_the_bench_is_changed_by_hand_as_rarely_as_can_be():
@@ -140,16 +146,17 @@ def test_frames_survive_the_way_through_json():
 
 
 def test_an_estimate_counts_exposures_moves_and_bytes():
-    bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0)]
+    bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0, 2000.0)]
     frames = [PlannedFrame(f"f{i}", "shot", one, 2.0) for i, one in enumerate(bench)]
     pace = Pace({"mask_x": 1000.0}, settle_s=1.0, frame_bytes=1_000_000)
     reported = pace.estimate(frames, lambda frame: frame.exposure_s)
-    assert reported.exposing_s == 4.0
+    assert reported.exposing_s == 6.0
     assert reported.guessed == 0
-    # Two moves settle for 1 s each and the second goes 4 mm at 1 mm/s.
-    assert 6.0 <= reported.moving_s <= 7.0
+    # Three moves, the first from an unknown place, settle for 1 s and begin and end in 0.2 s each.
+    # They go 0 mm, 4 mm up and 2 mm down at 1 mm/s: not upwards, 10 um further down and up again.
+    assert reported.moving_s == pytest.approx(3 * 1.2 + 0.02 + 4 + 2.02)
     # Each a megabyte of pixels, 4 KiB of the file's own and 1500 bytes of the journal's.
-    assert reported.bytes == 2 * (1_000_000 + 4096 + 1500)
+    assert reported.bytes == 3 * (1_000_000 + 4096 + 1500)
     assert reported.by_hand == 0
 
 

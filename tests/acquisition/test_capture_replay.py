@@ -55,17 +55,14 @@ def test_metered_frames_are_matched_in_order_or_by_name_only():
 
 def test_a_frame_is_taken_once_it_and_what_meters_it_have_files():
     session, _ = begun(Path("/disk"), SimulatedDisk(), still_rig())
-    (metered, *_), plain = (
-        [f for f in session.frames if f.metered_by == "meter-shot-1"],
-        "dark-e0-r0",
-    )
-    file = Recorded("x.dng", None, "")
+    plain, metered, meter = "dark-0-r0", "shot-1-e0-r0", "meter-shot-1"
 
     def chosen(*names):
-        return {f.id for f in there(session, dict.fromkeys(names, file))(lambda: 0.0)}
+        found = dict.fromkeys(names, Recorded("x.dng", None, ""))
+        return [frame.id for frame in there(session, found)(lambda: 0.0)]
 
-    assert chosen(plain, metered.id) == {plain}
-    assert chosen(metered.id, "meter-shot-1") == {metered.id, "meter-shot-1"}
+    assert chosen(plain, metered) == [plain]
+    assert chosen(metered, meter) == [meter, metered]
 
 
 def test_what_is_missing_is_named_with_its_exposure(tmp_path):

@@ -10,10 +10,11 @@ from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
 from drivers.errors import CameraSettingError
+from drivers.raw import RawFrame
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.command import _frozen, planned_frames
 from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.metering import BRACKET_STEP, asked_of_scene
+from emmc_rig.acquisition.metering import BRACKET_STEP, asked_of_scene, better_metering_s
 from emmc_rig.acquisition.plan import Metering
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -136,6 +137,25 @@ def test_a_dark_scene_is_refused_with_what_to_do():
     frames = [frame for frame in session.frames if frame.kind == "shot"]
     with pytest.raises(CameraSettingError, match="dark"):
         asked_of_scene(frames, {"meter-shot-0": entry}, Metering(), (1e-3, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("bright_dn", "better_s"), [(30, 0.4), (100, None), (3700, None), (3900, 0.025)]
+)
+def test_a_metering_frame_too_dark_or_bright_is_taken_again_two_stops_from_it(bright_dn, better_s):
+    frame = RawFrame(np.zeros(SIZE, np.uint16), np.full((2, 2), 100), 4100, "rggb", 0.1, b"", "")
+    seen = Figures(0.0, 10.0, bright_dn)
+    assert better_metering_s(frame, seen, 0.1, (0.025, 0.4)) == better_s
+    assert better_metering_s(frame, seen, 0.1, (0.03, 0.3)) is None
+
+
+def test_a_bracket_has_two_stops_for_each_four_times_that_the_range_is_above_eight(session):
+    frames = [frame for frame in session.frames if frame.is_metered_shot]
+    entry = session.stored["meter-shot-0"]
+    for bright_dn, longest in ((79, 1), (81, 4), (319, 4), (321, 16), (10_000, 16)):
+        seen = entry.model_copy(update={"figures": Figures(0.0, 20.0, bright_dn, 10.0)})
+        asked = asked_of_scene(frames, {"meter-shot-0": seen}, Metering(), (1e-6, 1e6)).asked
+        assert max([f.light for f in frames if f.id in asked], default=1) == longest
 
 
 class StopsAfter(CaptureWatcher):
