@@ -97,11 +97,12 @@ def levels(session):
 def names(session, boards):
     """Return of each whiteboard the name of the two frames that it is the mean of."""
     first = {level: name.removesuffix("-r0") for name, level in levels(session).items()}
-    return [first[float(board.frame.mean_dn.mean()) - 0.5] for board in boards.frames]
+    return [first[int(board.frame.mean_dn.mean())] for board in boards.frames]
 
 
 def test_every_whiteboard_goes_to_what_takes_it(session):
     boards = board_sets(session, CHANNELS)
+    assert boards.fit is not None
     pinholes = ["board-s0-v2-u2-white", "board-s0-v0-u1-white"]
     assert names(session, boards.fit) == ["open-0", "open-1", *pinholes]
     assert names(session, boards.pinholes) == pinholes
@@ -118,7 +119,9 @@ def test_every_whiteboard_goes_to_what_takes_it(session):
 
 
 def test_checks_are_the_references_and_what_is_seen_again_above_its_dark(session):
-    checks = board_sets(session, CHANNELS).fit.checks
+    boards = board_sets(session, CHANNELS)
+    assert boards.fit is not None
+    checks = boards.fit.checks
     # Two references, two of each response, two of the lamp, two references at the end.
     assert [one.masks_in for one in checks].count(True) == 2
     assert len(checks) == 2 + 3 * 2 + 2 + 2
