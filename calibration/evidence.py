@@ -78,7 +78,7 @@ def plane_prior(views: tuple[int, int], side: int, disparities_px: Array) -> Pri
     )
 
 
-@njit(cache=True)
+@njit(forceinline=True)
 def _add_grid(coefficients, down, across, first, count, matrix, at):
     """Add to matrix (n, ...) from column `at` the splines of one grid seen through coefficients.
 

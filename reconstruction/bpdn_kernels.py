@@ -13,7 +13,7 @@ import numpy as np
 from emmc_rig.model.compiling import njit
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(forceinline=True, fastmath=True)
 def combine(atoms, code, out):
     """Set out (measurement,) to the atoms weighted by the code."""
     out[:] = 0
@@ -25,7 +25,7 @@ def combine(atoms, code, out):
                 out[k] += weight * a[k]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(forceinline=True, fastmath=True)
 def _values(data, fitted, dual_point, shrink, eta, size):
     """Return the values of eq. 8, |code|_1 being `size`, and of its dual at the shrunk point."""
     fit = 0.0
@@ -37,13 +37,13 @@ def _values(data, fitted, dual_point, shrink, eta, size):
     return 0.5 * fit + eta * size, 0.5 * dual
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(forceinline=True, fastmath=True)
 def _soft(value, threshold):
     zero = np.float32(0)
     return max(value - threshold, zero) + min(value + threshold, zero)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(forceinline=True, fastmath=True)
 def _splitting_pass(atoms, pull, threshold, relax, state, fitted):
     """Do one step of every atom's state; set fitted to A z; return max |A^T pull|, |z|_1."""
     count, length = atoms.shape

@@ -55,7 +55,7 @@ class Steps(NamedTuple):
     metric: Any
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def mix(metric, lines):
     """Replace lines (colour, x) by metric @ lines."""
     red, green, blue = lines[0], lines[1], lines[2]
@@ -66,7 +66,7 @@ def mix(metric, lines):
         blue[x] = metric[2, 0] * r + metric[2, 1] * g + metric[2, 2] * b
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def pull_row(data, v, u, y, lines):
     """Draw lines (colour, x), row y of view (v, u), towards the target, if there is one."""
     if data.pulled.size > 0:
@@ -77,7 +77,7 @@ def pull_row(data, v, u, y, lines):
                 line[x] = share[x] * line[x] + pulled[x]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def fit_rows(data, steps, light_field, row, ahead, first, moved):
     """Finish the primal step of a row of pixels, descended to in `ahead` from its row `first` on.
 
@@ -131,13 +131,13 @@ class Stencils(NamedTuple):
     factor: Any
 
 
-@njit(cache=True)
+@njit(forceinline=True)
 def _fits(shape, reach, v, u, y):
     """Return whether a stencil fits along v, u and y."""
     return v + reach[3] < shape[0] and u + reach[2] < shape[1] and y + reach[1] < shape[2]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _differentiate(light_field, stencils, index, v, u, y, out):
     """Set out (3, x), colours apart, to a derivative that fits of a light field (v, u, y, 3 x).
 
@@ -169,7 +169,7 @@ def _differentiate(light_field, stencils, index, v, u, y, out):
     out[:, out.shape[1] - reach[index, 0] :] = 0
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _descend(light_field, dual, stencils, step, back, v, u, y, out):
     """Set out (3, x) to a row of the light field less step times the adjoint on the dual variable.
 
@@ -195,7 +195,7 @@ def _descend(light_field, dual, stencils, step, back, v, u, y, out):
         line[x] = row[x] - step * line[x]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _dual_rows(steps, stencils, ahead, dual, begin, end):
     """Do the dual step of rows begin to end: ahead (v, u, y, 3 x), dual (v, u, y, index, 3 x)."""
     _, step, bound, relax, _ = steps
@@ -232,22 +232,30 @@ def _dual_rows(steps, stencils, ahead, dual, begin, end):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved):
-    """Do the rows of pixels from begin to end, but for the dual steps of the last K rows."""
+def _sweep_band(data, steps, stencils, light_field, dual, ahead, band, last_rows, moved):
+    """Do a band of rows of pixels but for the dual steps of its last K rows; or those, last_rows.
+
+    One place calls the dual step: compiled at two, it might round differently at each.
+    """
     back = steps.metric.T.copy()
     furthest = stencils.reach[:, 1].max()
     flat = ahead.reshape((*ahead.shape[:3], ahead.shape[3] * ahead.shape[4]))
+    begin, end = band
     done = begin * data.binning
-    for row in range(begin, end):
+    if last_rows:
+        done = max(done, end * data.binning - furthest)
+    for row in range(end - 1 if last_rows else begin, end):
         base = row * data.binning
-        for v in range(light_field.shape[0]):
-            for u in range(light_field.shape[1]):
-                for y in range(base, base + data.binning):
-                    lines = ahead[v, u, y]
-                    _descend(light_field, dual, stencils, steps.primal, back, v, u, y, lines)
-                    pull_row(data, v, u, y, lines)
-        fit_rows(data, steps, light_field, row, ahead, base, moved)
-        ready = max(done, base + data.binning - furthest)
+        ready = base + data.binning
+        if not last_rows:
+            for v in range(light_field.shape[0]):
+                for u in range(light_field.shape[1]):
+                    for y in range(base, base + data.binning):
+                        lines = ahead[v, u, y]
+                        _descend(light_field, dual, stencils, steps.primal, back, v, u, y, lines)
+                        pull_row(data, v, u, y, lines)
+            fit_rows(data, steps, light_field, row, ahead, base, moved)
+            ready = max(done, ready - furthest)
         _dual_rows(steps, stencils, flat, dual, done, ready)
         done = ready
 
@@ -271,19 +279,12 @@ def sweep(
     thread pool: the bands are independent (numba's own parallel loop takes 15 s more to compile).
     """
     dual = dual.reshape(*dual.shape[:4], -1)
-    flat = ahead.reshape(*ahead.shape[:3], -1)
-    furthest = int(stencils.reach[:, 1].max())
+    for last_rows in (False, True):
 
-    def rows(band: int) -> None:
-        begin, end = bands[band]
-        _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, moved)
+        def work(band: NDArray[np.int64], last_rows: bool = last_rows) -> None:
+            _sweep_band(data, steps, stencils, light_field, dual, ahead, band, last_rows, moved)
 
-    def last_rows(band: int) -> None:
-        begin, end = bands[band] * data.binning
-        _dual_rows(steps, stencils, flat, dual, max(begin, end - furthest), end)
-
-    for stage in (rows, last_rows):
-        for _ in run(stage, range(len(bands))):
+        for _ in run(work, bands):
             pass
 
 

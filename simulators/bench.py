@@ -92,7 +92,7 @@ def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.
     return np.reshape(points, (*views, count, axes))
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, index):
     """Return where the ray from sensor point (x, y) to lens point (u, v) meets a mask.
 

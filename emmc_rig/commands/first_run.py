@@ -4,9 +4,7 @@ Numba keeps what it compiled on the disk, so that what one process compiled anot
 process needs a first kernel, one other searches disparities in a small light field and one fits it:
 each needs kernels that the other does not. Of a method that does neither, one process reconstructs.
 
-This process waits for them: machine code depends on whether what a kernel calls was compiled or
-loaded, and a process that compiled beside the others would compute with other code than the disk
-has for later runs, whose results then differ.
+This process waits for them, and then loads what they compiled: else it would compile the same.
 """
 
 from __future__ import annotations

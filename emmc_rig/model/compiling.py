@@ -3,6 +3,11 @@
 Numba keeps machine code until the kernel's own file changes. But helpers and constants of other
 files are part of that code, so it is kept here per state of all files that the kernel's file
 imports from its own package and from this project, directly or through others.
+
+What one kernel calls of another must be compiled into it (`forceinline=True`, and no cache of its
+own). Where a call is left, the caller's machine code brings a copy of what it calls, optimised once
+more, and a process calls whichever copy it met first: one that compiles that of the helper itself,
+one that loads from the disk that of the first caller. The two may round differently.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.compiling import njit
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def gather_row(weights, colour, block, part, shot, y, total):
     """Add to total (x,) what one shot sees of row y; block[:, :, part] is that row."""
     views_v, views_u, stored, width = weights.shape[1], weights.shape[2], *weights.shape[4:]
@@ -35,7 +35,7 @@ def gather_row(weights, colour, block, part, shot, y, total):
                         total[x] += weight[x] * line[x]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
     """Add to lines (colour, x), row y of view (v, u), the transpose of a shot on frame_row (x,)."""
     stored, width = weights.shape[4:]
@@ -52,7 +52,7 @@ def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
                 line[x] += weight[x] * frame_row[x]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def correct_row(inverse, frames, binning, row, seen):
     """Turn seen (shot, x), sums over views per sample, into -(Psi Psi^T + Lambda)^-1 residual."""
     shots, width = seen.shape

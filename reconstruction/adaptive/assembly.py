@@ -67,7 +67,7 @@ def first_tap(position, margin, last):
     return first, fraction
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(forceinline=True, fastmath=True)
 def _place(disparity, y, margin, size, taps, fractions):
     """Set taps and fractions (2, ray, x) of row y's rays, along y and x, see `first_tap`."""
     views_v, views_u, _, columns = disparity.shape
@@ -93,7 +93,7 @@ def _place(disparity, y, margin, size, taps, fractions):
                 tap_x[x] = np.int32(min(max(first_x, none), last_x))
 
 
-@njit(cache=True, nogil=True)
+@njit(forceinline=True)
 def _bound(weights, y, taps, reach):
     """Widen reach (5, x) by row y's rays: first and last taps along y and x, and entries.
 

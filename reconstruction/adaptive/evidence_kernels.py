@@ -50,7 +50,7 @@ class Hypotheses(NamedTuple):
     freedom: Any
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _gather(given, corners, rays, known, seen, measured):
     """Cut Psi, data, variances and colours into patches, one a lane; nothing where not usable.
 
@@ -92,7 +92,7 @@ def _gather(given, corners, rays, known, seen, measured):
                             a += 1
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _meet(here, there, meetings):
     """Add to meetings (wave, lane) the spectrum of how two pixels' rays are correlated.
 
@@ -106,7 +106,7 @@ def _meet(here, there, meetings):
             total[LANES + lane] += odd * b[lane] - even * b[LANES + lane]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _mixed(table, terms, out):
     """Set out (row, lane) to table (row, term) times terms (term, lane), the latter two flat.
 
@@ -132,7 +132,7 @@ def _mixed(table, terms, out):
                 total[3 * LANES + lane] += x * a + y * b + z * c + o * d
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _less_products(left, right, tile):
     """Take the product of a tile and another's transpose off a third, all (row, column, lane)."""
     for lane in range(LANES):
@@ -149,7 +149,7 @@ def _less_products(left, right, tile):
                 )
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _solved(diagonal, inverses, tile):
     """Divide a tile by the transpose of a diagonal one's factor; inverses: of its pivots."""
     for i in range(TERMS):
@@ -163,7 +163,7 @@ def _solved(diagonal, inverses, tile):
                 tile[at + lane] *= inverses[j * LANES + lane]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _factored(tile, inverses, product):
     """Put the Cholesky factor of a diagonal tile in its place; set product to that of its pivots.
 
@@ -186,7 +186,7 @@ def _factored(tile, inverses, product):
                     tile[at + lane] *= inverses[j * LANES + lane]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _log_likelihood(tiles, data, measured, freedom, inverses, product, square, out):
     """Set out (lane,) to the log-likelihoods of data (reading, lane), all flat.
 
@@ -229,7 +229,7 @@ def _log_likelihood(tiles, data, measured, freedom, inverses, product, square, o
         out[lane] -= 0.5 * (freedom + measured[lane]) * log(1 + square[lane] / freedom)
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _fill(sums, known, seen, strength, chroma, tiles, data):
     """Set tiles, see `_log_likelihood`, to the readings' covariance, and data to their values.
 

@@ -102,7 +102,7 @@ def _rows_synthesised(coefficients, first, last, out):
                     row[x + i] += values[i]
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _columns_analysed(block, side):
     """Set a flat block to the coefficients of its columns; side is SIDE."""
     for x in range(side):
@@ -115,7 +115,7 @@ def _columns_analysed(block, side):
         )  # fmt: skip
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _columns_synthesised(block, side):
     """The inverse of `_columns_analysed`."""
     for x in range(side):
@@ -128,7 +128,7 @@ def _columns_synthesised(block, side):
         )  # fmt: skip
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _hadamard(stack, count):
     """Transform a stack (block, value) of `count` blocks, a power of two; its own inverse."""
     width = 1
@@ -144,7 +144,7 @@ def _hadamard(stack, count):
         width *= 2
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _unlikeness(guide, y, x, top, left, width, squares):
     """Set squares (width,) to those of how far the blocks right of (top, left) are from (y, x)'s.
 
@@ -162,7 +162,7 @@ def _unlikeness(guide, y, x, top, left, width, squares):
             squares[n] += p * p + q * q + r * r + s * s + t * t + u * u + v * v + w * w
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _alike(guide, y, x, last_x, reach, unlike, squares, distances, places):
     """Set places (STACK, 2) to the blocks most like that at (y, x), itself first.
 
@@ -197,7 +197,7 @@ def _alike(guide, y, x, last_x, reach, unlike, squares, distances, places):
     return count
 
 
-@njit(cache=True, fastmath=True)
+@njit(forceinline=True, fastmath=True)
 def _cut(values, least):
     """Drop values below the least; return how many are kept."""
     kept = 0

@@ -53,7 +53,7 @@ def _carry(centre, margin, nearer, dv, du, out, mark):
                 out[y, x] = _settled(centre, margin, out[y, x], y, x, dv, du)
 
 
-@njit
+@njit(forceinline=True)
 def _fill(out, y, x, nearer, mark):
     """Give a ray that no point reaches the furthest disparity seen next along rows and columns."""
     rows, columns = out.shape
@@ -75,7 +75,7 @@ def _fill(out, y, x, nearer, mark):
     mark[y, x] = 1
 
 
-@njit
+@njit(forceinline=True)
 def _settled(centre, margin, d, y, x, dv, du):
     """Return the disparity of a ray on a slanted surface: that of the point it meets there."""
     last_y, last_x = centre.shape[0] - 2, centre.shape[1] - 2

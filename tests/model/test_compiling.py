@@ -1,5 +1,6 @@
 """Machine code kept on the disk: it is never older than a source that it was made of."""
 
+import ast
 import os
 import re
 import shutil
@@ -22,6 +23,19 @@ texture = np.arange(192, dtype=np.float32).reshape(1, 12, 16)
 rays._render(np.full((1, 1, 4, 6), 0.3, np.float32), texture, 4, 0, 4, out)
 kept = rays._render.stats.cache_hits
 print(out.sum(), sum(kept.values()), rays._render.stats.cache_path)
+"""
+RECONSTRUCT = """
+import hashlib
+import numpy as np
+import emmc_rig as emmc
+from reconstruction.adaptive import rays
+psi = emmc.camera("scenario-ii-cfa").psi((48, 64))
+frames = psi @ emmc.scene("near-planar", size=(48, 64))
+frames += np.float32(0.01) * np.random.default_rng(0).standard_normal(frames.shape, np.float32)
+found = emmc.reconstruct(psi, frames, "adaptive-fast", noise_sigma=0.01)
+digest = int(hashlib.sha256(found.light_field.tobytes()).hexdigest()[:12], 16)
+kept = rays._render.stats.cache_hits
+print(digest, sum(kept.values()), rays._render.stats.cache_path)
 """
 
 
@@ -124,3 +138,41 @@ def test_every_kernel_whose_file_imports_others_of_the_project_is_compiled_with_
         for file in sorted(set((ROOT / name).rglob("*.py")) - {own}):
             text = file.read_text()
             assert not (plain.search(text) and project.search(text)), file
+
+
+def kernels():
+    """Yield file, syntax tree and decorators of every function that is compiled."""
+    for name in PACKAGES:
+        for file in sorted((ROOT / name).rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.FunctionDef):
+                    how = " ".join(map(ast.unparse, node.decorator_list))
+                    if re.match(r"njit|row_kernel|_compiled\b", how):
+                        yield file, node, how
+
+
+def test_what_a_kernel_calls_is_compiled_into_it():
+    """Else which of several copies of the machine code it calls depends on what was loaded first.
+
+    `_compiled` of the ray caster is an `njit` that does so.
+    """
+    every = list(kernels())
+    names = {node.name for _, node, _ in every}
+    called = {
+        call.func.id
+        for _, node, _ in every
+        for call in ast.walk(node)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+    } & names
+    assert {"cubic", "_dual_rows", "_texel"} <= called
+    for file, node, how in every:
+        if node.name in called:
+            assert re.search(r"forceinline=True|inline='always'|_compiled", how), (file, node.name)
+
+
+@pytest.mark.slow
+def test_the_process_that_compiles_computes_what_later_ones_load(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    totals, kept, _ = zip(*(run(ROOT, RECONSTRUCT) for _ in range(2)), strict=True)
+    assert totals[0] == totals[1]
+    assert kept[0] == 0 < kept[1]
