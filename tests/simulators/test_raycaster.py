@@ -241,21 +241,25 @@ def test_glass_refracts_by_snells_law_in_and_out(build):
     np.testing.assert_allclose(view[compared], expected[compared], atol=2e-3)
 
 
-def test_gloss_changes_with_the_view_where_paint_does_not(build, monkeypatch):
-    surroundings = SMOOTH.copy()
-    colours = {}
-    for gloss in (0.0, 0.8):
-        # The tip of the ball has disparity 0: the same pixel in every view.
-        ball = Ball(
-            0, 0, quoted(-0.6), 0.25, quoted(0.6), texture=np.ones_like(SMOOTH), gloss=gloss
-        )
-        name = build(ball)
-        world = World((), (ball,), surroundings, ambient=1.0)
-        monkeypatch.setitem(SCENES, name, Scene("a test", (0, 0), lambda _rng, w=world: w))
-        light_field = render(name, (5, 5), SIZE_PX).light_field
-        colours[gloss] = light_field[:, :, SIZE_PX[0] // 2, SIZE_PX[1] // 2]
-    assert np.ptp(colours[0.0], axis=(0, 1)).max() < 0.01
-    assert np.ptp(colours[0.8], axis=(0, 1)).max() > 0.02
+@pytest.mark.parametrize("gloss", [0.0, 0.3])
+def test_a_ball_is_lit_by_lambert_s_law_and_mirrors_more_towards_its_rim(gloss):
+    """Schlick's rim, a mirrored room in Lambert's equal-area map, the lamp 1.15 times as bright."""
+    grey = np.full_like(SMOOTH, 0.5)
+    ball = Ball(0, 0, 0, 0.25, quoted(0.6), texture=grey, gloss=gloss)
+    tables = tabulated(World((), (ball,), SMOOTH, ambient=0.0))
+    view = rendered(tables, (1, 1), SIZE_PX).light_field[0, 0]
+    x, y = (part / 0.25 for part in subsampled(SIZE_PX))
+    inside = np.hypot(x, y) < 0.9
+    z = np.sqrt(np.where(inside, 1 - x**2 - y**2, 1))
+    lamp = np.array([-0.45, -0.65, 0.61]) / np.linalg.norm([-0.45, -0.65, 0.61])
+    lit = 0.5 * 1.15 * np.maximum(x * lamp[0] + y * lamp[1] + z * lamp[2], 0)
+    mirrored = gloss + (1 - gloss) * (1 - z) ** 5 if gloss else 0 * z
+    # The ray straight ahead leaves along (2 z x, 2 z y, 2 z^2 - 1).
+    to_map = 0.5 * 2 * z / np.sqrt(2 * 2 * z**2)
+    room = smooth(0.5 + to_map * x, 0.5 + to_map * y)
+    expected = mirrored[..., None] * room + ((1 - mirrored) * lit)[..., None]
+    compared = pixel_mean(inside[..., None].astype(float))[..., 0] == 1
+    np.testing.assert_allclose(view[compared], pixel_mean(expected)[compared], atol=2e-3)
 
 
 def test_twice_the_views_at_twice_the_size_have_the_same_disparity_per_step():
