@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import begun, plan_and_camera, request_for
+from capture_rigs import StopsAfter, begun, plan_and_camera, request_for
 from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
@@ -18,7 +18,6 @@ from emmc_rig.acquisition.metering import BRACKET_STEP, asked_of_scene, better_m
 from emmc_rig.acquisition.plan import Metering
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.processing.reconstructing import expected_gain_db
@@ -156,17 +155,6 @@ def test_a_bracket_has_two_stops_for_each_four_times_that_the_range_is_above_eig
         seen = entry.model_copy(update={"figures": Figures(0.0, 20.0, bright_dn, 10.0)})
         asked = asked_of_scene(frames, {"meter-shot-0": seen}, Metering(), (1e-6, 1e6)).asked
         assert max([f.light for f in frames if f.id in asked], default=1) == longest
-
-
-class StopsAfter(CaptureWatcher):
-    """Stops a capture once a frame is taken."""
-
-    def __init__(self, frame_id, control):
-        self.frame_id, self.control = frame_id, control
-
-    def taken(self, planned, frame, found):
-        if planned.id == self.frame_id:
-            self.control.stop()
 
 
 @pytest.mark.parametrize("last", ["meter-shot-0", "shot-0-e0-r0", "shot-0-e1-r0"])
