@@ -21,7 +21,7 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.processing.reconstructing import expected_gain_db
-from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
@@ -187,21 +187,6 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     assert Sequencer(session, edited, rig).run().complete
     taken_s = [session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("shots", "said"),
-    [
-        ([ShotExposure(0, 0.05, 0.0)], "shot 0 is 5.0% of white: 11.5 dB or more"),
-        ([ShotExposure(0, 0.7, 0.0), ShotExposure(1, 0.01, 0.0)], "shot 1 is 1.0% of white"),
-        ([ShotExposure(0, 1.0, 0.03)], "3.0% of the readings of shot 0 are saturated"),
-        ([ShotExposure(0, 0.3, 0.0005)], ""),
-    ],
-)
-def test_badly_exposed_shots_are_a_doubt(shots, said):
-    reasons = exposure_reasons(shots)
-    assert [reason.level for reason in reasons] == ["doubt"] * bool(said)
-    assert all(said in reason.what for reason in reasons)
 
 
 def test_less_light_than_metering_asks_for_is_reported_with_its_true_cost_in_noise():

@@ -21,6 +21,7 @@ from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.timeline import overlap, run_entries
+from emmc_rig.session.exposure import ShotExposure, exposure_reasons
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
 from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session
@@ -157,3 +158,18 @@ def test_a_still_stage_refuses_what_a_real_one_would():
         stage.move_to_um({"x": -1.0})
     assert stage.move_to_um({"x": 7.0}) == {"x": 7.0}
     assert stage.position_um("x") == 7.0
+
+
+@pytest.mark.parametrize(
+    ("shots", "said"),
+    [
+        ([ShotExposure(0, 0.05, 0.0)], "shot 0 is 5.0% of white: 11.5 dB or more"),
+        ([ShotExposure(0, 0.7, 0.0), ShotExposure(1, 0.01, 0.0)], "shot 1 is 1.0% of white"),
+        ([ShotExposure(0, 1.0, 0.03)], "3.0% of the readings of shot 0 are saturated"),
+        ([ShotExposure(0, 0.3, 0.0005)], ""),
+    ],
+)
+def test_badly_exposed_shots_are_a_doubt(shots, said):
+    reasons = exposure_reasons(shots)
+    assert [reason.level for reason in reasons] == ["doubt"] * bool(said)
+    assert all(said in reason.what for reason in reasons)
