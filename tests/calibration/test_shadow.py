@@ -112,12 +112,15 @@ def test_derivatives_are_those_of_the_readings(name, binning):
     assert error < 0.01
 
 
-def test_what_each_view_adds_to_a_derivative_is_all_of_it():
+@pytest.mark.parametrize(
+    "stage_um", [(0.0, 0.0), (1500.0, -1400.0)], ids=["whole", "beyond its rim"]
+)
+def test_what_each_view_adds_to_a_derivative_is_all_of_it(stage_um):
     camera = camera_of()
     shadow = Shadow(shadow_mask(camera, SIZE), askew(camera))
     pixels, colours = everywhere(), np.full(SIZE[0] * SIZE[1], ANY_COLOUR, np.uint8)
     every = np.ones(VIEWS, dtype=bool)
-    slopes, by_view = shadow.slopes_by_view(pixels, colours, every)
+    slopes, by_view = shadow.slopes_by_view(pixels, colours, every, stage_um)
     sums = by_view.reshape(len(pixels), -1, OF_VIEW).sum(axis=1)
     softer = SCALARS.index("blur_um")
     np.testing.assert_allclose(sums[:, :2], slopes[:, :2], rtol=1e-9, atol=1e-12)

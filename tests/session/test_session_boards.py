@@ -14,6 +14,7 @@ from simulated_disk import SimulatedDisk
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.errors import AppError
+from emmc_rig.session import measured_psi
 from emmc_rig.session.board_sets import board_sets, sensor_pairs, whiteboards
 from emmc_rig.session.frame_means import mean_dark, mean_of, session_darks
 from emmc_rig.session.session import Session
@@ -88,6 +89,12 @@ def names(session, boards):
     return [first[int(board.frame.mean_dn.mean())] for board in boards.frames]
 
 
+def whiteboards_of(session, routes):
+    """Return the routes, and how many whiteboards judge, fit and measure by the pinhole."""
+    routes, *boards = measured_psi.session_outcome(session, routes)
+    return (routes, *(len(some.frames) if some else 0 for some in boards))
+
+
 def test_every_whiteboard_goes_to_what_takes_it(session):
     boards = board_sets(session, CHANNELS)
     assert boards.fit is not None
@@ -104,6 +111,15 @@ def test_every_whiteboard_goes_to_what_takes_it(session):
     level = levels(session)
     assert seen.frame.mean_dn[0, 0] == level["turned-open-r0"]
     assert turned[1].references[0, "white"].mean_dn[0, 0] == level["turned-reference-r0"]
+
+
+def test_each_route_is_given_the_whiteboards_that_it_takes(session, monkeypatch):
+    monkeypatch.setattr(measured_psi, "calibrate", lambda *given, **_: given[2:])
+    assert whiteboards_of(session, None) == (("parametric", "mixed"), 1, 4, 2)
+    assert whiteboards_of(session, ("free", "combined")) == (("free", "combined"), 1, 4, 2)
+    assert whiteboards_of(session, ("free",)) == (("free",), 1, 0, 2)
+    with pytest.raises(AppError, match="the pinhole and no whiteboards held out"):
+        whiteboards_of(captured(TURNED), None)
 
 
 def test_checks_are_the_references_and_what_is_seen_again_above_its_dark(session):
