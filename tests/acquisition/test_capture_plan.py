@@ -120,15 +120,10 @@ def test_a_metered_exposure_comes_after_its_metering():
 def test_each_place_of_a_line_or_a_grid_is_one_step_from_the_one_before(shape):
     """Axes move at once: a step along a grid's diagonal is no longer than one along an axis."""
     places_um = 100.0 * np.random.default_rng(0).permutation(list(np.ndindex(shape)))
-    frames = [
-        PlannedFrame(
-            f"f{i}",
-            "shot",
-            Bench("scene", "white", 0, 0, True, {"mask_x": x_um, "mask_y": y_um}),
-            0.1,
-        )
-        for i, (x_um, y_um) in enumerate(places_um)
-    ]
+    frames = []
+    for place_um in places_um:
+        bench = Bench("scene", "white", 0, 0, True, dict(zip("xy", place_um, strict=True)))
+        frames.append(PlannedFrame(f"f{len(frames)}", "shot", bench, 0.1))
     assert travel_um(ordered(frames, "least-travel")) == 100 * (len(frames) - 1)
 
 

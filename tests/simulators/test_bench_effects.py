@@ -160,11 +160,7 @@ def test_a_blurred_edge_is_the_integral_of_a_normal_distribution():
 
 
 NOISE = SensorNoise(
-    electrons_per_s=1e5,
-    gain_dn_per_electron=0.5,
-    read_noise_electrons=2.0,
-    black_level_dn=100,
-    white_level_dn=65535,
+    electrons_per_s=1e5, gain_dn_per_electron=0.5, read_noise_electrons=2.0, black_level_dn=100
 )
 
 
