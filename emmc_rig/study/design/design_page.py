@@ -17,7 +17,6 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.study.design.comparison import Simulated
 from emmc_rig.study.design.search import Search, pareto
 
 CAVEATS = (
@@ -28,6 +27,8 @@ CAVEATS = (
 )
 SHOWN = 20
 """Masks in the table."""
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads of the columns, and rows."""
 
 
 def draw_pareto(found: Search, path: Path) -> Path:
@@ -49,7 +50,7 @@ def draw_pareto(found: Search, path: Path) -> Path:
 def design_page(
     about: Sequence[str],
     found: Search,
-    simulated: Sequence[Simulated],
+    simulated: Table,
     verdict: str,
     picture: Path,
     camera: Path,
@@ -57,7 +58,7 @@ def design_page(
 ) -> str:
     """Return the page of a design.
 
-    simulated: the chosen mask first, then the shipped cameras. camera: its file, as it will lie.
+    simulated: theory and simulation, a row a camera. camera: its file, as it will lie.
     """
     best = found.expected
     loss_db = found.ideal_db - best.psnr_db
@@ -65,11 +66,10 @@ def design_page(
         Card(
             "PSNR expected",
             f"{best.psnr_db:.2f} dB",
-            f"{found.held[0].worst_db:.2f} at worst; {found.bounds.known_db:.2f} were depth known",
+            f"{found.held[0].worst_db:.2f} where the maker misses most",
         ),
         Card("Light", f"{best.light:.0%}", "of the open camera's"),
         Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction costs {loss_db:.2f} dB"),
-        Card("Disparity", f"{found.bounds.disparity_px:.3f} px", "Ziv-Zakai bound"),
     )
     names = list(found.held[0].psnr_db)
     body = fragment(
@@ -84,7 +84,7 @@ def design_page(
                 for one in found.held
             ],
         ),
-        simulated=simulated_table(simulated),
+        simulated=simulated,
     )
     sections = [Section("design", found.winner.label, body, "Design")]
     sections.append(provenance_section(provenance))
@@ -100,10 +100,6 @@ def design_page(
     return framed("Which mask to order", about, CAVEATS, sections, head=head)
 
 
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]
-"""Heads of the columns, and rows."""
-
-
 def _tried(found: Search) -> Table:
     heads = ("Mask", "PSNR expected, dB", "Light", "Fresnel number")
     rows = [
@@ -111,13 +107,3 @@ def _tried(found: Search) -> Table:
         for one, what in found.tried[:SHOWN]
     ]
     return heads, rows
-
-
-def simulated_table(found: Sequence[Simulated]) -> Table:
-    """Return theory and simulation, a row a camera."""
-    scenes = list(found[0].psnr_db)
-    rows = [
-        [one.name, *(f"{db:.2f}" for db in (one.expected_db, one.mean_db, *one.psnr_db.values()))]
-        for one in found
-    ]
-    return ("Camera", "Theory", "Simulated, mean", *scenes), rows
