@@ -153,10 +153,6 @@ class Study(Generic[P]):
         """Return what points that are measured together have in common."""
         return point
 
-    def is_whole(self, point: P, result: dict) -> bool:
-        """Return whether all that belongs to a kept result, such as a picture, is there."""
-        return True
-
     def label(self, point: P) -> str:
         """Return a point in words."""
         return getattr(point, "label", str(point))
@@ -205,7 +201,7 @@ class Study(Generic[P]):
             missing: dict[str, P] = {}
             for point, digest in digests.items():
                 result = journal.get(digest)
-                if result is not None and self.is_whole(point, result):
+                if result is not None:
                     known[digest] = result
                 else:
                     missing.setdefault(digest, point)

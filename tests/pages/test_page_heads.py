@@ -29,7 +29,7 @@ def head_of(page):
     [
         lambda: tables_page([], {}, [], {}),
         lambda: chart_page(NOT_ASKED, [], {}, {}),
-        lambda: stability_page([], [], NOT_ASKED, []),
+        lambda: stability_page([], [], []),
     ],
     ids=["tables", "chart", "stability"],
 )

@@ -3,12 +3,10 @@
 import csv
 import json
 import os
-import re
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 from pages import Page
@@ -17,11 +15,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
-from emmc_rig.study.chart import chart_points, chart_study
+from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
-from emmc_rig.study.chart.chart_study import ChartStudy
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
-from emmc_rig.study.chart.measure import Job, Worker, measured
+from emmc_rig.study.chart.measure import ChartStudy, Job, Worker, measured
 from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.trial import Capture
 from reconstruction.methods import MethodSettings
@@ -45,7 +42,7 @@ def at_once(measure):
 def quick(monkeypatch):
     """Few settings of total variation alone, measured in this process."""
     monkeypatch.setattr(chart_points, "VARIATIONS", LEVELS)
-    monkeypatch.setattr(chart_study, "Worker", at_once(measured))
+    monkeypatch.setattr(measure, "Worker", at_once(measured))
 
 
 def settings(**more):
@@ -66,7 +63,7 @@ def command(run):
 
 
 @pytest.mark.slow
-def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
+def test_a_chart_holds_every_point(quick, tmp_path):
     measured_scene = tmp_path / "shed"
     save_views(measured_scene, render("near-planar", size=(30, 36)).light_field)
     chosen = settings(scenes=["dark", str(measured_scene)])
@@ -85,20 +82,8 @@ def test_a_chart_holds_every_point_with_its_picture(quick, tmp_path):
     page = Page(text)
     assert not page.foreign
     assert len(page.ids) == len(set(page.ids))
-    marks = [name for name in page.ids if name.startswith("mark-")]
-    assert len(marks) == 6
-    marked, pictures = (
-        json.loads(*re.findall(rf'id="{name}">(.*?)</script>', text))
-        for name in ("points", "pictures")
-    )
-    assert set(marked) == set(marks)
-    shown = {pair[key] for one in marked.values() for pair in one["pictures"]
-             for key in ("estimate", "truth")}  # fmt: skip
-    assert shown == set(pictures)
-    for name in shown:
-        picture = cv2.imread(str(folder / "pictures" / name))
-        assert picture is not None
-        assert picture.std() > 1
+    assert text.count('<th scope="row">tv') == 6
+    assert text.count("data:image/svg+xml") == 3
     for chart in outcome.charts:
         for ending in ("svg", "png"):
             assert (folder / "charts" / f"chart-{chart.key}.{ending}").stat().st_size > 5000
@@ -116,7 +101,7 @@ def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
             raise KeyboardInterrupt
         return measured(job)
 
-    monkeypatch.setattr(chart_study, "Worker", at_once(stopping))
+    monkeypatch.setattr(measure, "Worker", at_once(stopping))
     with pytest.raises(StudyStopped, match="1 of 2 points are kept"):
         run_chart(settings(), tmp_path / "out", Silent())
     run_chart(settings(), tmp_path / "out", Silent())
@@ -128,11 +113,11 @@ def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def job(tmp_path):
+def job():
     """Three steps of total variation on a small capture."""
     three = MethodSettings.model_validate({"tv": {"max_steps": 3}})
     point = Point(Capture("dark", "rgbw-bayer-1shot", SIZE), Configuration("tv", "3 steps", three))
-    return Job(point, tmp_path / "x.webp", tmp_path / "truth.webp", None, 2, 60.0)
+    return Job(point, None, 2, 60.0)
 
 
 @pytest.mark.slow
@@ -150,7 +135,6 @@ def test_a_worker_outlives_what_fails_and_says_each_jobs_peak(job, tmp_path):
     assert first["repeats"] == 2
     assert first["steps"] == 3
     assert 0 < first["fastest_s"] <= first["seconds"] <= first["slowest_s"]
-    assert job.truth_picture.is_file()
     # The light field and its dual variables take 5 x 5 x 96 x 160 x 3 x 6 numbers more.
     assert again["peak_mib"] < wide["peak_mib"] - 10
     assert again["psnr_db"] == first["psnr_db"]
@@ -179,7 +163,7 @@ def test_a_worker_that_is_killed_is_a_failure_that_may_pass(job):
 
 def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path):
     full = at_once(lambda _: {"failed": "no room", "keep": False})
-    monkeypatch.setattr(chart_study, "Worker", full)
+    monkeypatch.setattr(measure, "Worker", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*no room"):
         run_chart(settings(), tmp_path / "out", Silent())
     assert not (tmp_path / "out" / ChartStudy.journal).read_text()

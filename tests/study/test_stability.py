@@ -152,7 +152,7 @@ def test_a_full_sweep_is_of_all_faults():
 
 
 @pytest.mark.slow
-def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_path):
+def test_a_sweep_holds_every_point(few_steps, monkeypatch, tmp_path):
     monkeypatch.setattr(drawing, "PNG_DPI", 40)
     shed = tmp_path / "shed"
     save_views(shed, render("near-planar", size=(30, 36)).light_field)
@@ -169,11 +169,12 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
     quick_counts = [len(FAULTS[name].quick) for name in ("flicker", "disparity-range")]
     assert len(rows) == 2 * quick_counts[0] + quick_counts[1]
     assert len(breaks) == len(outcome.curves) == 3 + 2
-    page = Page((folder / "stability.html").read_text())
+    text = (folder / "stability.html").read_text()
+    page = Page(text)
     assert not page.foreign
     assert len(page.ids) == len(set(page.ids))
-    marks = [name for name in page.ids if name.startswith("mark-")]
-    assert len(marks) == sum(len(curve.levels) for curve in outcome.curves)
+    # Both kinds of faults of all scenes and of the dark one, flicker in the shed.
+    assert text.count("data:image/svg+xml") == 5
     metrics = json.loads((folder / METRICS).read_text())
     assert len(metrics["curves"]) == len(outcome.curves)
     for name in ("dark", "all-scenes-between-shots"):
@@ -207,7 +208,6 @@ def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undraw
     assert list(found[0]) == list(found[1])
     for point, one in found[0].items():
         assert found[1][point]["psnr_db"] == pytest.approx(one["psnr_db"], abs=1e-3)
-        assert sweep.is_whole(point, one)
 
 
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):

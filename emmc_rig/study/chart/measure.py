@@ -1,4 +1,4 @@
-"""A process that measures points one at a time: PSNR, seconds and memory of a reconstruction.
+"""The points of a chart, measured one at a time by a process: PSNR, seconds and memory.
 
 Order matters: frames, dictionary, a warm-up on a small window (which compiles and loads), the timed
 runs, the peak of memory; only then the light field is compared with the truth.
@@ -11,21 +11,22 @@ import os
 import signal
 import statistics
 import time
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from emmc_rig.processing.memory import forget_peak, peak_memory_mib
+from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_points import Point
-from emmc_rig.study.pictured import save_pair
+from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import available_cores, plain
 from emmc_rig.study.scores import scored
-from emmc_rig.study.trial import Trial, trial_of
+from emmc_rig.study.trial import Trial, method_inputs, trial_of
 from reconstruction.errors import ReconstructionError
 
 WARM_UP_PX = 27
@@ -35,14 +36,12 @@ EXPECTED_ERRORS = (AppError, ModelError, ReconstructionError, CalibrationError, 
 
 @dataclass(frozen=True)
 class Job:
-    """A point to measure. picture, truth_picture: thumbnails to write.
+    """A point to measure.
 
     dictionary: see `open_dictionary`. repeats: timed runs at most, until `enough_s` are spent.
     """
 
     point: Point
-    picture: Path
-    truth_picture: Path
     dictionary: str | None
     repeats: int
     enough_s: float
@@ -73,7 +72,6 @@ def measured(job: Job) -> dict:
     scores = scored(
         result.light_field, trial.truth, trial.disparity_px, result.maps.get("disparity")
     )
-    save_pair(job.picture, job.truth_picture, result.light_field, trial.truth)
     return plain(
         {
             **asdict(scores),
@@ -177,3 +175,41 @@ class Worker:
             process.kill()
             process.join()
             jobs.close()
+
+
+@dataclass
+class ChartStudy(Study[Point]):
+    """The points of a chart; settings: ChartSettings."""
+
+    revision = 4
+
+    def inputs(self, point: Point) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        settings = self.settings
+        return {
+            **method_inputs(point.configuration.method, settings.dictionary),
+            "capture": point.capture.identity(),
+            "settings": point.configuration.settings.model_dump(mode="json"),
+            "cores": available_cores(),
+            "repeats": settings.repeats,
+            "enough_s": settings.enough_s,
+            "limit_s": settings.limit_s,
+        }
+
+    def group(self, point: Point) -> Hashable:
+        """All points are measured by the same process."""
+        return None
+
+    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
+        """Yield the points' figures, those of one capture after the other."""
+        settings = self.settings
+        with Worker(settings.limit_s) as worker:
+            for point in points:
+                yield worker.measure(
+                    Job(point, settings.dictionary, settings.repeats, settings.enough_s)
+                )
+
+    def words(self, point: Point, result: dict) -> str:
+        """Return a measured point in words."""
+        took = f" (in {result['seconds']:.2f} s)" if "seconds" in result else ""
+        return super().words(point, result) + took

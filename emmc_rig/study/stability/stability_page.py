@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
-from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
-from emmc_rig.study.pictured import ShownMark, marks_data
+from emmc_rig.pages.page import Head, Section, embedded, fragment, framed
 from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, breaking_rows
-from emmc_rig.study.stability.faults import Point
-from emmc_rig.study.stability.stability_study import StabilityStudy
 
 PANEL_INCHES = (3.9, 2.75)
 FLOOR_DB = 6.0
@@ -27,10 +24,7 @@ FLOOR_DB = 6.0
 def draw_curves(
     curves: Sequence[Curve], colours: dict[str, str], path: Path, columns: int = 3
 ) -> Path:
-    """Write a panel for each fault of some curves as SVG and PNG; return the SVG's path.
-
-    Every measured point of the SVG has the name of `Curve.mark_name`.
-    """
+    """Write a panel for each fault of some curves as SVG and PNG; return the SVG's path."""
     faults = list(dict.fromkeys(curve.fault.name for curve in curves))
     panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
     figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(columns, len(panels)))
@@ -48,10 +42,7 @@ def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None
     for curve in curves:
         colour = colours[curve.method]
         places, levels = _known(curve.levels)
-        axes.plot(places, levels, "-", color=colour, linewidth=1.5, zorder=2)
-        for i, level in zip(places, levels, strict=True):
-            (dot,) = axes.plot(i, level, "o", markersize=3.6, color=colour, zorder=3)
-            dot.set_gid(curve.mark_name(i))
+        axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=2)
         place = curve.below_best()
         if place is not None and levels:
             level = max(float(np.interp(place, places, levels)), floor)
@@ -115,16 +106,11 @@ CAVEATS = (
 
 
 def stability_page(
-    about: Sequence[str],
-    sections: Sequence[Section],
-    study: StabilityStudy,
-    curves: Sequence[Curve],
+    about: Sequence[str], sections: Sequence[Section], curves: Sequence[Curve]
 ) -> str:
-    """Return the page. about: sentences under the title. curves: whose points show pictures."""
-    return framed(
-        "Where methods fail", about, CAVEATS, sections, ["chart.css", "stability.css"],
-        ["chart.js"], marks_data(_marks(study, curves)), head=_head(curves),
-    )  # fmt: skip
+    """Return the page. about: sentences under the title."""
+    head = _head(curves)
+    return framed("Where methods fail", about, CAVEATS, sections, ["stability.css"], head=head)
 
 
 def _head(curves: Sequence[Curve]) -> Head:
@@ -154,33 +140,8 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     return Section("breaking-" + scene.replace(" ", "-"), f"Breaking points, {scene}", body)
 
 
-def curves_section(scene: str, kind: str, curves: Sequence[Curve], svg: Path) -> Section:
-    """Return the small multiples of one kind of fault; points show their picture."""
-    key = f"{kind}-{scene}".lower().replace(" ", "-")
-    first = curves[0].mark_name(0)
-    body = fragment("stability_curves.html", drawing=inline_svg(svg, key), first=first)
-    return Section(key, f"{kind}, {scene}", body)
-
-
-def _marks(study: StabilityStudy, curves: Iterable[Curve]) -> dict[str, ShownMark]:
-    marks = {}
-    for curve in curves:
-        measured = zip(curve.strengths, curve.levels, curve.points, strict=True)
-        for index, (strength, level, points) in enumerate(measured):
-            if level is not None:
-                label = f"{curve.fault.title}, {shown(strength)} {curve.fault.unit}"
-                pairs = [
-                    (_words(study, point), study.picture(point), study.truth_picture(point))
-                    for point in points
-                ]
-                words = f"{curve.method}: {level:.2f} dB"
-                marks[curve.mark_name(index)] = ShownMark(label, words, pairs)
-    return marks
-
-
-def _words(study: StabilityStudy, point: Point) -> str:
-    result = study.results[point]
-    words = f"{point.scene_name}: {number(result['psnr_db'], '.2f')} dB"
-    if result["view_db"] is None:
-        return words
-    return f"{words}, copied centre view {result['view_db']:.2f} dB"
+def curves_section(scene: str, kind: str, svg: Path) -> Section:
+    """Return the small multiples of one kind of fault."""
+    title = f"{kind}, {scene}"
+    body = fragment("drawing.html", drawing=embedded(svg), title=title)
+    return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)

@@ -99,7 +99,7 @@ def _write(study: StabilityStudy, folder: Path, outcome: StabilityOutcome) -> No
     sources = provenance(settings, outcome.seconds, Machine=machine())
     sections = [*_sections(found, folder / DRAWN), provenance_section(sources)]
     breaks = [break_row(curve) for curve in found]
-    text = stability_page(_about(study, outcome.left_out), sections, study, found)
+    text = stability_page(_about(study, outcome.left_out), sections, found)
     rows = [_row(*pair) for pair in study.results.items()]
     write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS))
     write_text(folder / BREAKS_CSV, csv_text(breaks, BREAK_COLUMNS))
@@ -133,7 +133,7 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
             if some:
                 name = f"{slug}-{kind.lower().replace(' ', '-')}.svg"
                 svg = draw_curves(some, colours, drawn / name)
-                charts.append(curves_section(scene, kind, some, svg))
+                charts.append(curves_section(scene, kind, svg))
     return [*tables, *charts]
 
 
