@@ -32,7 +32,8 @@ def steps(
     """Return for every step its name, whether it is done, what to say, and the action that does it.
 
     figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
-    mask or opens the aperture; None: not homed. focus_um: where the focus axis stands. takes: what can be saved. hint: what to do next.
+    mask or opens the aperture; None: not homed. focus_um: where the focus axis stands. takes: what
+    can be saved. hint: what to do next.
     """
     return [
         _centre(off_um),
