@@ -1,4 +1,4 @@
-"""Views of a frame: figures, a preview, and a histogram for the terminal."""
+"""Views of a frame: figures, a histogram, and a preview."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.text import Text
 
 from drivers.raw import RawFrame
 from emmc_rig.model.srgb import codes_of, srgb_of
 
 BAYER = ("rggb", "bggr", "grbg", "gbrg")
 LETTERS = {"r": "red", "g": "green", "b": "blue"}
-STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
-BLOCKS = " ▁▂▃▄▅▆▇█"
 BINS = 64
 LONGEST_PREVIEW_PX = 1600
 SAMPLED_PIXELS = 1 << 16
@@ -75,17 +72,6 @@ def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]
         name: np.sum([np.histogram(part, bins, limits)[0] for part in parts], axis=0)
         for name, parts in colour_planes(frame).items()
     }
-
-
-def histogram_text(counts: dict[str, NDArray[np.int64]]) -> Text:
-    """Return a line of blocks for each colour, on a logarithmic scale: one pixel still shows."""
-    text = Text()
-    for name, row in counts.items():
-        heights = np.log1p(row) / max(1e-9, float(np.log1p(row.max())))
-        steps = np.ceil(heights * (len(BLOCKS) - 1)).astype(int)
-        line = "".join(BLOCKS[step] for step in steps)
-        text.append(f"{name:>6} ", "dim").append(line, STYLES[name]).append("|\n", "dim")
-    return text
 
 
 Balance = tuple[float, float, float]

@@ -6,7 +6,6 @@ import pytest
 from browsers import MARKS, complaints, open_browser
 from test_live import PatientCamera
 
-from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene

@@ -112,8 +112,8 @@ CAVEATS = (
     "Frames are made with the very Psi that reconstructs them; all methods have this advantage.",
     "Angular: 0 dB is what one picture copied to every view scores; below, parallax is worse than "
     "none. Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
-    "Seconds are the median of repeats after a warm-up, one point at a time in a process of their "
-    "own; the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
+    "Seconds are the median of repeats after a warm-up, one point at a time; "
+    "the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
     "dictionary.",
 )
 MEANS = {
