@@ -21,7 +21,7 @@ COLOURS = (
 LEGEND = {"fontsize": 8.5, "frameon": False, "labelcolor": INK}
 FONTS: dict[Any, Any] = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "emmc-rig"}
 """Journals want TrueType in a PDF. SVG cannot embed the font, so that its letters are outlines."""
-PNG_DPI, PUBLICATION_DPI, PAGE_DPI = 160, 300, 220
+PUBLICATION_DPI = 300
 
 
 def sheet(
@@ -95,13 +95,7 @@ def save_publication(figure: Figure, path: Path, about: str) -> None:
         figure.savefig(path, metadata=metadata[path.suffix], dpi=PUBLICATION_DPI)
 
 
-def save_svg(figure: Figure, path: Path) -> Path:
+def save_drawing(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG without date and random names; return its path."""
     path.write_bytes(svg_of(figure))
     return path
-
-
-def save_drawing(figure: Figure, path: Path) -> Path:
-    """Write a figure as SVG, and as PNG beside it; return the path of the SVG."""
-    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
-    return save_svg(figure, path)

@@ -32,7 +32,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
 def draw_pareto(found: Search, path: Path) -> Path:
-    """Write light against expected PSNR as SVG and PNG; return the SVG's path."""
+    """Write light against expected PSNR as SVG; return its path."""
     figure, (axes,) = sheet(1, 6.4, 3.8, "PSNR expected, dB")
     light = [100 * one.light for _, one in found.tried]
     axes.plot(light, [one.psnr_db for _, one in found.tried], "o", color=FAINT, markersize=4)

@@ -16,18 +16,16 @@ from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet
 from emmc_rig.pages.page import Head, Section, embedded, fragment, framed
 from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, breaking_rows
 
-PANEL_INCHES = (3.9, 2.75)
+PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
 """Below the least of the copied centre view: further down, a curve says nothing more."""
 
 
-def draw_curves(
-    curves: Sequence[Curve], colours: dict[str, str], path: Path, columns: int = 3
-) -> Path:
-    """Write a panel for each fault of some curves as SVG and PNG; return the SVG's path."""
+def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
+    """Write a panel for each fault of some curves as SVG; return its path."""
     faults = list(dict.fromkeys(curve.fault.name for curve in curves))
     panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
-    figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(columns, len(panels)))
+    figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(COLUMNS, len(panels)))
     for one, some in zip(axes, panels, strict=True):
         _panel(one, some, colours)
     _legend(figure, curves, colours)

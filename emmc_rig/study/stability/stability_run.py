@@ -127,7 +127,6 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
         of_scene = [curve for curve in found if curve.scene == scene]
         slug = scene.replace(" ", "-")
         tables.append(breaking_section(scene, of_scene))
-        draw_curves(of_scene, colours, drawn / f"{slug}.svg", columns=5)
         for kind in dict.fromkeys(fault.kind for fault in FAULTS.values()):
             some = [curve for curve in of_scene if curve.fault.kind == kind]
             if some:
