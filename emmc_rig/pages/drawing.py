@@ -57,9 +57,9 @@ def titled(axes: Axes, title: str, across: str = "") -> None:
         axes.set_xlabel(across, color=FAINT, fontsize=9)
 
 
-def plain_log_ticks(axes: Axes, which: str) -> None:
-    """Label the ticks of a logarithmic axis, "x" or "y", as 1, 2, 5, 10, ... without powers."""
-    axis = getattr(axes, f"{which}axis")
+def plain_log_ticks(axes: Axes) -> None:
+    """Label the ticks of a logarithmic x axis as 1, 2, 5, 10, ... without powers."""
+    axis = axes.xaxis
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -192,7 +192,7 @@ class Study(Generic[P]):
         """
         points = list(dict.fromkeys(points))
         self.results, self.left_out = {}, {}
-        digests = self._digests(points)
+        digests, unfit = self._digests(points)
         known: dict[str, dict] = {}
         with _stopped_with_words(
             self.folder, lambda: f"{len(known)} of {len(set(digests.values()))} {self.noun} are"
@@ -217,19 +217,19 @@ class Study(Generic[P]):
                 watcher.step(self.words(point, result))
         self.results = {p: known[d] for p, d in digests.items() if d in known}
         why = {digests[point]: reason for point, reason in self.left_out.items()}
-        self.left_out = {p: why[d] for p, d in digests.items() if d in why} | self._unfit
+        self.left_out = {p: why[d] for p, d in digests.items() if d in why} | unfit
         return self.results
 
-    def _digests(self, points: Iterable[P]) -> dict[P, str]:
-        """Return the digests of the points that can be measured; the others are unfit."""
-        found: dict[P, str] = {}
-        self._unfit: dict[P, str] = {}
+    def _digests(self, points: Iterable[P]) -> tuple[dict[P, str], dict[P, str]]:
+        """Return the digests of the points that can be measured, and why the others cannot be."""
+        digests: dict[P, str] = {}
+        unfit: dict[P, str] = {}
         for point in points:
             try:
-                found[point] = self.digest(point)
+                digests[point] = self.digest(point)
             except NotApplicableError as why:
-                self._unfit[point] = str(why)
-        return found
+                unfit[point] = str(why)
+        return digests, unfit
 
     def _all_measured(
         self, groups: list[list[P]], watcher: Watcher, pool: Pool | None

@@ -21,7 +21,6 @@ from emmc_rig.study.design.bench import DesignBench
 from emmc_rig.study.design.expected import (
     SIZE,
     Block,
-    Expected,
     SceneTexture,
     _shift,
     expected,
@@ -36,7 +35,7 @@ from emmc_rig.study.design.mask_file import (
     write_picture,
 )
 from emmc_rig.study.design.printed import Print, printed_psi
-from emmc_rig.study.design.search import MASK, Candidate, candidates, pareto
+from emmc_rig.study.design.search import MASK, Candidate, candidates
 
 RGBW = Candidate("random_rgbw", 0.5, 36.0, 0.12)
 SMALL = DesignBench(size=(48, 64), stage_travel_um=(200.0, 200.0))
@@ -119,14 +118,6 @@ def test_less_light_and_more_noise_is_a_larger_expected_error():
 
     assert expect(0.5, 0.05) > expect(0.5, 0.0005)
     assert expect(0.5, 0.05) > expect(0.1, 0.05)
-
-
-def test_the_pareto_front_holds_what_nothing_else_beats_in_both():
-    def one(name, light, psnr_db):
-        return replace(RGBW, cell_um=name), Expected(psnr_db, light, 1.0)
-
-    tried = [one(1, 0.2, 30.0), one(2, 0.5, 31.0), one(3, 0.4, 30.5), one(4, 0.7, 29.0)]
-    assert [candidate.cell_um for candidate, _ in pareto(tried)] == [2, 4]
 
 
 def test_shots_stay_within_the_stage_s_travel():

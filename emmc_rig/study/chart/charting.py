@@ -78,7 +78,7 @@ def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
         ha="right", va="bottom", transform=axes.get_yaxis_transform(),
     )  # fmt: skip
     axes.margins(x=0.14, y=0.16)
-    plain_log_ticks(axes, "x")
+    plain_log_ticks(axes)
     titled(axes, chart.title, "seconds")
     axes.legend(
         list(shown.values()), list(shown), loc="center left", bbox_to_anchor=(1.0, 0.5), **LEGEND

@@ -1,23 +1,21 @@
-"""The page of a design: the mask, light against error, what was tried."""
+"""The page of a design: the mask, what was tried, what the maker may miss, the comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from emmc_rig.pages.drawing import ACCENT, FAINT, INK, save_drawing, sheet, titled
 from emmc_rig.pages.page import (
     Card,
     Head,
     Section,
-    embedded,
     fragment,
     framed,
     number,
     provenance_section,
     typed,
 )
-from emmc_rig.study.design.search import Search, pareto
+from emmc_rig.study.design.search import Search
 
 CAVEATS = (
     "Theory knows textures on two planes half a sample of disparity apart, and noise; it knows no "
@@ -31,28 +29,11 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Heads of the columns, and rows."""
 
 
-def draw_pareto(found: Search, path: Path) -> Path:
-    """Write light against expected PSNR as SVG; return its path."""
-    figure, (axes,) = sheet(1, 6.4, 3.8, "PSNR expected, dB")
-    light = [100 * one.light for _, one in found.tried]
-    axes.plot(light, [one.psnr_db for _, one in found.tried], "o", color=FAINT, markersize=4)
-    front = pareto(found.tried)
-    axes.plot(
-        [100 * one.light for _, one in front], [one.psnr_db for _, one in front],
-        "-o", color=ACCENT, markersize=6,
-    )  # fmt: skip
-    best = found.expected
-    axes.plot([100 * best.light], [best.psnr_db], "o", color=INK, markersize=9, fillstyle="none")
-    titled(axes, "Light against error: none beats the line in both", "light that passes, %")
-    return save_drawing(figure, path)
-
-
 def design_page(
     about: Sequence[str],
     found: Search,
     simulated: Table,
     verdict: str,
-    picture: Path,
     camera: Path,
     provenance: Mapping[str, str],
 ) -> str:
@@ -75,7 +56,6 @@ def design_page(
     body = fragment(
         "design.html",
         cards=cards,
-        picture=embedded(picture),
         tried=_tried(found),
         held=(
             ["Mask", *names],

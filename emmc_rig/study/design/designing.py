@@ -16,7 +16,7 @@ from emmc_rig.model.camera import Camera, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.progress import Watcher
 from emmc_rig.study.design.bench import DesignBench, bench_text
-from emmc_rig.study.design.design_page import Table, design_page, draw_pareto
+from emmc_rig.study.design.design_page import Table, design_page
 from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.mask_file import (
     GDSII,
@@ -191,13 +191,12 @@ def run_design(
         with result_folder(folder, COMMAND, adds=True) as new:
             left_out = _write_mask(winner, bench, new)
             (new / "bench.yaml").write_text(bench_text(bench), encoding="utf-8")
-            picture = draw_pareto(searched, new / "light.svg")
             origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
             about = [
                 f"{len(searched.tried)} masks tried for {bench.shots} shot(s) by theory; {verdict}"
             ]
             shown = simulated_table(compared)
-            page = design_page(about, searched, shown, verdict, picture, folder / CAMERA, origin)
+            page = design_page(about, searched, shown, verdict, folder / CAMERA, origin)
             (new / PAGE).write_text(page, encoding="utf-8")
             write_metrics(new, _metrics(bench, searched, compared))
     return Designed(searched, tuple(compared), verdict, folder / PAGE, tuple(left_out))

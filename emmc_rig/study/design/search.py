@@ -1,8 +1,7 @@
 """The search: masks that a bench can mount and a maker can print, ordered by theory.
 
 Theory takes a second a candidate, so coordinate descent goes through every value of one property at
-a time until none is better; all that were tried make the chart of light against error. The best are
-then swept through what the maker misses.
+a time until none is better. The best are then swept through what the maker misses.
 """
 
 from __future__ import annotations
@@ -207,12 +206,3 @@ def prints(maker: Maker) -> dict[str, Print]:
         "all, over-etched": Print(maker.edge_um, off, maker.thickness_um),
         "all, under-etched": Print(maker.edge_um, -off, maker.thickness_um),
     }
-
-
-def pareto(tried: Sequence[tuple[Candidate, Expected]]) -> list[tuple[Candidate, Expected]]:
-    """Return those that no other beats in both light and PSNR, the darkest first."""
-    front: list[tuple[Candidate, Expected]] = []
-    for one in sorted(tried, key=lambda item: (-item[1].light, -item[1].psnr_db)):
-        if not front or one[1].psnr_db > front[-1][1].psnr_db:
-            front.append(one)
-    return front[::-1]
