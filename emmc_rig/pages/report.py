@@ -110,15 +110,13 @@ def _frames(frames: Array) -> dict[str, Any]:
 
 
 def _error(estimate: Array, truth: Array) -> dict[str, object]:
-    """Return the error averaged over views as a picture, and the PSNR of each view."""
-    difference = finite(estimate) - finite(truth)
-    absolute, squared = np.abs(difference).mean(axis=-1), np.square(difference).mean(axis=-1)
-    mean = reduced(absolute.mean(axis=(0, 1))[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
+    """Return the error averaged over views and colours as a picture, and its scale."""
+    absolute = np.abs(finite(estimate) - finite(truth)).mean(axis=(0, 1, -1))
+    mean = reduced(absolute[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
     scale = round_up(float(np.percentile(mean, 99.5)))
     return {
         "scale": scale,
         "picture": png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean))),
-        "views": _view_psnr(squared),
     }
 
 
@@ -225,21 +223,6 @@ def _warnings(content: ReportContent) -> list[str]:
     broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
     more = f"The estimate holds {broken} values that are not finite; drawn black."
     return [*content.warnings, *([more] if broken else [])]
-
-
-def _view_psnr(squared: Array) -> list[list[dict[str, str]]]:
-    """Return the PSNR of each view in words, and how light its cell is, row by row."""
-    with np.errstate(divide="ignore"):
-        psnr_db = -10 * np.log10(squared.mean(axis=(2, 3)))
-    known = psnr_db[np.isfinite(psnr_db)]
-    low, span = (float(known.min()), float(np.ptp(known))) if known.size else (0.0, 0.0)
-
-    def cell(value: float) -> dict[str, str]:
-        share = 1.0 if not math.isfinite(value) else (value - low) / span if span > 0 else 0.5
-        words = f"{value:.1f}" if math.isfinite(value) else "exact"
-        return {"words": words, "lightness": f"{96 - 26 * share:.0f}"}
-
-    return [[cell(value) for value in row] for row in psnr_db]
 
 
 def _timings(stage_s: Mapping[str, float]) -> list[tuple[str, str, str]]:

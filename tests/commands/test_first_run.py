@@ -1,4 +1,4 @@
-"""The first run on a machine: compiling is said once, and done by other processes first."""
+"""The first run on a machine: compiling is said once, and done by another process first."""
 
 import sys
 
@@ -28,7 +28,7 @@ class Recorder:
         self.seen.append("killed")
 
 
-def test_the_first_kernel_compiled_waits_for_other_processes(monkeypatch, capsys):
+def test_the_first_kernel_compiled_waits_for_another_process(monkeypatch, capsys):
     recorder, started = Recorder(), []
     monkeypatch.setattr(
         first_run.subprocess, "Popen", lambda typed, **_: started.append(typed) or recorder
@@ -42,13 +42,9 @@ def test_the_first_kernel_compiled_waits_for_other_processes(monkeypatch, capsys
         recorder.begin("scene", None)
         assert (twice(2), twice(2.5)) == (4, 5.0)
         recorder.begin("reconstruct", None)
-    assert started == [
-        [sys.executable, "-m", "emmc_rig.commands.first_run", part, "rgbw-mono", "2"]
-        for part in ("search", "fit")
-    ]
-    assert recorder.seen == [
-        "scene", "compile", *2 * ["waited"], *2 * ["killed", "waited"], "reconstruct",
-    ]  # fmt: skip
+    command = [sys.executable, "-m", "emmc_rig.commands.first_run", "adaptive", "rgbw-mono", "2"]
+    assert started == [command]
+    assert recorder.seen == ["scene", "compile", "waited", "killed", "waited", "reconstruct"]
     assert capsys.readouterr().err.count("compiling kernels for this machine, once") == 1
 
 
@@ -58,37 +54,14 @@ def test_a_run_that_compiles_nothing_starts_nothing(monkeypatch):
         pass
 
 
-def test_a_method_of_other_parts_is_compiled_by_one_process(monkeypatch):
-    started = []
-    monkeypatch.setattr(
-        first_run.subprocess, "Popen", lambda typed, **_: started.append(typed[3:]) or Recorder()
-    )
-
-    @njit
-    def half(x):
-        return x / 2
-
-    with first_run.compiled_first(Recorder(), "dict-omp", "rgbw-mono", None):
-        assert half(3.0) == 1.5
-    assert started == [["dict-omp", "rgbw-mono"]]
-
-
-def test_each_part_runs_the_kernels_that_it_is_named_after(monkeypatch):
-    ran = []
+def test_the_other_process_runs_the_kernels_of_search_and_fit(monkeypatch):
+    ran = set()
 
     def note(module, kernel):
         real = getattr(module, kernel)
-        monkeypatch.setattr(module, kernel, lambda *given: ran.append(kernel) or real(*given))
+        monkeypatch.setattr(module, kernel, lambda *given: ran.add(kernel) or real(*given))
 
-    for module, kernel in (
-        (evidence, "evidence"), (kernels, "_sweep_band"), (rays, "_render"),
-    ):  # fmt: skip
+    for module, kernel in ((evidence, "evidence"), (kernels, "_sweep_band"), (rays, "_render")):
         note(module, kernel)
-    done = {}
-    for part in first_run.PARTS["adaptive"]:
-        first_run.compile_for(part, "rgbw-bayer-3shots", 2)
-        done[part] = set(ran)
-        ran.clear()
-    assert done == {
-        "search": {"evidence", "_sweep_band"}, "fit": {"_render"},
-    }  # fmt: skip
+    first_run.compile_for("adaptive", "rgbw-bayer-3shots", 2)
+    assert ran == {"evidence", "_sweep_band", "_render"}
