@@ -16,7 +16,7 @@ from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
 from emmc_rig.study import trial
 from emmc_rig.study.points import StudyStopped
-from emmc_rig.study.stability import stability_page, stability_run
+from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
     below_best,
@@ -138,7 +138,7 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
         for (fault, method), row in levels.items()
         for strength, level in zip((0, 1, 4), row, strict=True)
     }
-    head = stability_page._head(curves(results))
+    head = stability_run._head(curves(results))
     assert head.level == "tv"
     assert "under 1 of 2 faults" in head.why
     assert any("compare dict-omp: under 2 of 2" in line for line in head.next)
