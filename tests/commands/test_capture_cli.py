@@ -256,8 +256,6 @@ def test_the_schema_is_printed(run):
         (["capture", "plan.yaml", *RIG, "--out", "plan.yaml"], "something else than a session"),
         (["session", "show", "occupied"], "no session"),
         (["session", "list", "occupied"], "holds no session"),
-        (["session", "list", "nowhere"], "nowhere: no such folder"),
-        (["session", "verify", "nowhere"], "nowhere: no such folder"),
         (["session", "export", "occupied", "--out", "x.h5"], "no session"),
     ],
 )

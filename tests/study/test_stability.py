@@ -10,7 +10,6 @@ from pages import Page
 from pools import Posting
 
 from emmc_rig import cli
-from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
@@ -298,10 +297,3 @@ def test_wrong_input_is_one_line_and_leaves_nothing_half_written(
     assert line in err
     assert "Traceback" not in err
     assert not (tmp_path / "emmc-stability" / "stability.html").exists()
-
-
-def test_another_folder_s_content_is_left_alone(few_steps, tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(AppError, match="holds something else than an earlier `emmc-rig stability`"):
-        run_stability(quick(), tmp_path / "mine", Silent())
