@@ -206,16 +206,15 @@ class MaskGauge:
 
 
 def _require_one_mask(camera: Camera) -> None:
-    """Raise CalibrationError unless one mask throws a shadow, and none shades the lens besides."""
-    near = [m for m in camera.masks.values() if m.distance_mm < camera.lens.distance_mm]
-    if not near and camera.masks:
+    """Raise CalibrationError unless the design has one mask, and that throws a shadow."""
+    masks = camera.masks.values()
+    if masks and all(mask.distance_mm >= camera.lens.distance_mm for mask in masks):
         raise CalibrationError(
             "this design's masks lie at the lens: they throw no shadow to measure"
         )
-    if len(near) != 1 or len(camera.masks) != 1:
+    if len(masks) != 1:
         raise CalibrationError(
-            f"this design has {len(near)} masks before the sensor and {len(camera.masks)} in all: "
-            "one alone can be measured"
+            f"this design has {len(masks)} masks: the shadow of one alone can be measured"
         )
 
 

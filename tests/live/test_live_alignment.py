@@ -128,7 +128,7 @@ def test_where_stripes_stand_along_themselves_is_not_stated():
 
 @pytest.mark.parametrize("name", WITHOUT_SHADOW)
 def test_cameras_without_one_mask_that_throws_a_shadow_say_so(name):
-    with pytest.raises(CalibrationError, match=r"lie at the lens|0 masks|2 in all"):
+    with pytest.raises(CalibrationError, match=r"lie at the lens|(0|2) masks"):
         MaskGauge(CAMERAS[name], SIZE)
 
 
