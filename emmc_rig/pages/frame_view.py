@@ -39,13 +39,11 @@ def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
 class FrameFigures:
     """Of one frame: per colour the level of its 99.9th percentile, 1 at white; and the whole's.
 
-    saturated: share of pixels at the white level. focus: energy of the differences between
-    neighbours of one colour over that of the picture; the larger, the sharper, for one scene.
+    saturated: share of pixels at the white level.
     """
 
     brightest: dict[str, float]
     saturated: float
-    focus: float
 
 
 def frame_figures(frame: RawFrame) -> FrameFigures:
@@ -57,11 +55,8 @@ def frame_figures(frame: RawFrame) -> FrameFigures:
         name: max((float(np.percentile(plane, 99.9)) - black) / span for plane in parts)
         for name, parts in planes.items()
     }
-    sharpest = planes.get("green", planes.get("grey", []))[0].astype(np.float32) - np.float32(black)
-    energy = float(np.mean(sharpest**2))
-    changes = float(np.mean(np.diff(sharpest, axis=0) ** 2) + np.mean(np.diff(sharpest) ** 2))
     saturated = float(np.mean(frame.mosaic >= frame.white_level_dn))
-    return FrameFigures(brightest, saturated, changes / energy if energy else 0.0)
+    return FrameFigures(brightest, saturated)
 
 
 def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]:
